@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING, Any
 
-from hilstar.version import __version__ as __version__
+from hilstar.basics.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from hilstar.bench.build import load
-    from hilstar.bench.frame import Bench, Drawn, Frame
-    from hilstar.errors import HilstarError, InputError, MachineError
-    from hilstar.run.sender import Sender
+    from hilstar.basics.errors import HilstarError, InputError, MachineError
+    from hilstar.server.bench.build import load
+    from hilstar.server.bench.frame import Bench, Drawn, Frame
+    from hilstar.server.sender import Sender
 
 __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
 
@@ -17,14 +17,14 @@ def __getattr__(name: str) -> Any:
     """The public names, imported at their first use: `hilstar doctor` needs no renderer to start."""
     if name not in __all__:
         raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
-    from hilstar import errors
+    from hilstar.basics import errors
 
     if hasattr(errors, name):
         return getattr(errors, name)
     if name == "Sender":  # a simulator draws nothing
-        from hilstar.run.sender import Sender
+        from hilstar.server.sender import Sender
 
         return Sender
-    from hilstar.bench import build, frame
+    from hilstar.server.bench import build, frame
 
     return getattr(build if name == "load" else frame, name)

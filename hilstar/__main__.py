@@ -25,8 +25,8 @@ def main() -> NoReturn:
 
 def import_and_run() -> NoReturn:
     """Import the commands and run them; Ctrl-C may come at any step."""
-    from hilstar.process import interrupts
-    from hilstar.process.interrupts import finish_stderr
+    from hilstar.basics.process import interrupts
+    from hilstar.basics.process.interrupts import finish_stderr
 
     try:
         gc.set_threshold(OBJECTS_BETWEEN_LOOKS)

@@ -9,11 +9,11 @@ import csv
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, value_bars
-from hilstar.study import codes, colour, timing
-from hilstar.study.sweep import Figure, Load, Trial, Trials
-from hilstar.study.tradeoff import run as tradeoff
-from hilstar.study.tradeoff.light import ROUNDING_MAG
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, value_bars
+from hilstar.instruments.study import codes, colour, timing
+from hilstar.instruments.study.sweep import Figure, Load, Trial, Trials
+from hilstar.instruments.study.tradeoff import run as tradeoff
+from hilstar.instruments.study.tradeoff.light import ROUNDING_MAG
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"

@@ -17,10 +17,10 @@ import re
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from hilstar.charts import two_digits
-from hilstar.study import limits
-from hilstar.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
-from hilstar.study.chain.measuring import CombinationRow, ErrorPart
+from hilstar.basics.charts import two_digits
+from hilstar.instruments.study import limits
+from hilstar.instruments.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
+from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent

@@ -1,4 +1,4 @@
-// After encode.frag, for `dither`: a mask decides between the two levels about a pixel's light (hilstar/monitor/quantise.py).
+// After encode.frag, for `dither`: a mask decides between the two levels about a pixel's light (hilstar/display/quantise.py).
 uniform sampler2D mask;  // thresholds between 0 and 1; its sides are powers of two
 uniform float shift;     // a turn of all of them, from 0 to under 1
 

@@ -1,9 +1,9 @@
 #version 430 core
 // `exact`: chooses, for each pixel of a star or of a stretch of a path, one of the two levels around its light.
-// hilstar/monitor/exact.py is the same method in NumPy and explains it; the ten sums are those of hilstar/monitor/balance.py.
+// hilstar/display/exact.py is the same method in NumPy and explains it; the ten sums are those of hilstar/display/balance.py.
 // The pass runs after the linear image and its nearest levels are drawn, and changes those levels. A pixel belongs to the star that
 // gives more than half of its light, so no pixel is written by two stars.
-// With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
+// With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/display/temporal.py).
 // With TOGETHER it begins with what it left in the planes that were chosen before.
 // Defined before this text: LEVELS_FORMAT and LINEAR; LEVEL_BITS and TEXEL; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.

@@ -1,7 +1,7 @@
 #version 430 core
 // Draws a frame's stars, one per lane, each within the ellipse that it lights. With LIGHT a star adds its light to the sums of its
 // pixels; of primaries, with LEVELS the sums become the nearest levels.
-// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py). Three quarters of
+// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/display/render/star_passes.py). Three quarters of
 // it are the sums' memory, lane by lane: the planes of an image are beside each other in sums and levels, TEXEL of LEVEL_BITS.
 // splat.frag repeats this arithmetic operation by operation, so that points make the same levels.
 // Defined before this text: FOOTPRINT, TEXEL, LEVEL_BITS. Primaries' stars (APART) are taken in an order, first those whose pixels no

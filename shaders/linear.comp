@@ -1,5 +1,5 @@
 #version 430 core
-// Adds up the linear image in a buffer (hilstar/render/host_image.py): the pixels of the last frame's stars become black, then this
+// Adds up the linear image in a buffer (hilstar/display/render/host_image.py): the pixels of the last frame's stars become black, then this
 // frame's stars add their light. A work group draws a band of rows, and each lane every eighth row of it. No two lanes write the
 // same pixel, and each takes the stars in their order, so the same stars give the same bits however many threads run. Lanes in rows
 // of their own wait for memory together: two columns and four rows of lanes take a seventh more time.

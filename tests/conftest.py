@@ -92,7 +92,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def without_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Charts are neither laid out nor drawn, which takes a third of a calibration's time: for tests that look at none."""
-    from hilstar import charts
+    from hilstar.basics import charts
 
     monkeypatch.setattr(charts, "finish", lambda figure: None)
     monkeypatch.setattr(charts, "svg", lambda figure: "<svg></svg>")

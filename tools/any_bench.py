@@ -16,7 +16,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, PURPLE, RED, TEAL, chart, write_csv
+from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, PURPLE, RED, TEAL, chart, write_csv
 from tests.support.any_bench.draw import DrawnBench, drawn_bench
 from tests.support.any_bench.judge import (
     FAILED,

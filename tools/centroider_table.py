@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.campaign.plan import Centroiding
-from hilstar.campaign.solvers import CentroidSolver
-from hilstar.optics.psf_file import glass_of, write_glass
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.twin.glass import split_errors
-from hilstar.twin.simulator import Simulator
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.campaign.plan import Centroiding
+from hilstar.instruments.campaign.solvers import CentroidSolver
+from hilstar.instruments.simulate.glass import split_errors
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.glass.psf_file import glass_of, write_glass
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.glass import SIDE_PX, stack
 

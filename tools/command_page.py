@@ -14,8 +14,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from typer import Typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 
+from hilstar.basics.errors import InputError, MachineError
 from hilstar.cli.app import application
-from hilstar.errors import InputError, MachineError
 
 MAX_BOUND = 1e6  # a larger limit only keeps arithmetic within its types; nobody meets it
 TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}

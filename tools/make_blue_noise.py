@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.monitor.quantise import MASK_FILE
+from hilstar.display.quantise import MASK_FILE
 
 SIDE = 64
 SIGMA_PX = 1.5  # Ulichney's choice

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import LETTERS, MISSING, PACKAGED_CATALOG, VARIABLE_TYPES, read_hip_main
 from hilstar.sky.facts import LETTER_FACTS, PACKAGED_FACTS, STEP_FACTS
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 
-DATA = Path(__file__).resolve().parents[1] / "hilstar" / "monitor" / "data"
+DATA = Path(__file__).resolve().parents[1] / "hilstar" / "display" / "data"
 SEED = 20260101
 BITS = 8
 WHITE_CD_M2 = {"r": 53.0, "g": 179.0, "b": 18.0}  # 250 cd/m2 in the proportions of Rec. 709

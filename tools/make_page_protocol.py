@@ -1,4 +1,4 @@
-"""Makes hilstar/console/page/protocol.js, the constants that the page shares with its server. Run without arguments."""
+"""Makes hilstar/server/console/page/protocol.js, the constants that the page shares with its server. Run without arguments."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 
-from hilstar.console import protocol
+from hilstar.server.console import protocol
 
-OUTPUT = Path(__file__).resolve().parents[1] / "hilstar" / "console" / "page" / "protocol.js"
+OUTPUT = Path(__file__).resolve().parents[1] / "hilstar" / "server" / "console" / "page" / "protocol.js"
 HEAD = "// What the page and its server share. Made from console/protocol.py by tools/make_page_protocol.py: edit it there.\n"
 
 

@@ -9,7 +9,7 @@ import api_page
 import command_page
 import drawings
 
-from hilstar.bench.config import reference
+from hilstar.server.bench.config import reference
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES: dict[str, Callable[[], str]] = {

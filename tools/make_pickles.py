@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
 from hilstar.sky.electrons import PACKAGED_LIBRARY, Library, Optics, Photometry, band_mean, library_electrons_per_s
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 

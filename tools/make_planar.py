@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.optics.prescription import Plate, traced
-from hilstar.optics.psf_file import write_glass
+from hilstar.optics.glass.prescription import Plate, traced
+from hilstar.optics.glass.psf_file import write_glass
 from hilstar.sky.spectrum import Curve
 
 # Radius of curvature and thickness behind it, mm, and the glass, for 49.389 mm of focal length.

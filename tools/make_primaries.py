@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from hilstar.study.colour import NM, PANELS, curve_of
+from hilstar.instruments.study.colour import NM, PANELS, curve_of
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 MEASURED = {

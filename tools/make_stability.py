@@ -1,4 +1,6 @@
-"""Writes hilstar/study/stability/*.csv: the figures of failing methods that no machine changes. Run without arguments.
+"""Writes hilstar/instruments/study/stability/*.csv: the figures of failing methods that no machine changes.
+
+Run without arguments.
 
 The cases and curves are those of tests/authority/failing_methods, which hold them with every commit.
 """
@@ -13,8 +15,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from hilstar.charts import write_csv  # noqa: E402
-from hilstar.study.stability import COLUMNS  # noqa: E402
+from hilstar.basics.charts import write_csv  # noqa: E402
+from hilstar.instruments.study.stability import COLUMNS  # noqa: E402
 from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETECTOR_AND_ATTITUDE  # noqa: E402
 
 OUTPUT = ROOT / "hilstar" / "study" / "stability"

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import STAR_NAMES, load_catalog
 
 SOURCE_SHA256 = "5b8baeef6ce873510ae95be967e18be3eb0559458c9566709eae613d917fe316"

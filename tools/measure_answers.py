@@ -13,12 +13,12 @@ from pathlib import Path
 
 from msgspec import structs
 
-from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.charts import write_csv, write_records
-from hilstar.resources import resource_path
-from hilstar.study.chain.choices import Parts, five_scenes
-from hilstar.study.chain.measuring import CombinationRow, ErrorPart, Rounds, SceneMeasurement, error_budget
-from hilstar.study.chain.tracker import StudyTracker
+from hilstar.basics.charts import write_csv, write_records
+from hilstar.basics.resources import resource_path
+from hilstar.instruments.study.chain.choices import Parts, five_scenes
+from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, Rounds, SceneMeasurement, error_budget
+from hilstar.instruments.study.chain.tracker import StudyTracker
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 
 RESULTS = Path(__file__).parents[1] / "results"
 BITS = (8, 10, 12)

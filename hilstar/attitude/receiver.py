@@ -20,10 +20,10 @@ from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
-from hilstar.running_statistics import RunningStatistics
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
+from hilstar.basics.running_statistics import RunningStatistics
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError
 from hilstar.cli import options
-from hilstar.console.terminal import print_json, say
-from hilstar.errors import InputError
+from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from hilstar.answers.answer import Answer
-    from hilstar.answers.formats import AnswerDecoder, RefusedAnswer
-    from hilstar.answers.reader import ReadPlan
-    from hilstar.arrays import FloatArray
-    from hilstar.bench.bench_file import BenchFile
+    from hilstar.basics.arrays import FloatArray
+    from hilstar.server.answers.answer import Answer
+    from hilstar.server.answers.formats import AnswerDecoder, RefusedAnswer
+    from hilstar.server.answers.reader import ReadPlan
+    from hilstar.server.bench.bench_file import BenchFile
 
 SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
 MAX_STATE_BYTES = 1_000_000
@@ -47,10 +47,10 @@ def answers(
     """
     from collections import Counter, deque
 
-    from hilstar.answers.explain import lines_of
-    from hilstar.answers.formats import RefusedAnswer
-    from hilstar.answers.reader import ReadPlan, recorded_answers
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.server.answers.explain import lines_of
+    from hilstar.server.answers.formats import RefusedAnswer
+    from hilstar.server.answers.reader import ReadPlan, recorded_answers
+    from hilstar.server.bench.bench_file import read_bench_file
 
     file = read_bench_file(bench)
     if file.config.answers is None:
@@ -92,7 +92,7 @@ def _shown_now(file: "BenchFile") -> "FloatArray | None":
 
     None without a page, where that road has room for one listener only or nobody sends.
     """
-    from hilstar.run.open_link import first_attitude, open_link
+    from hilstar.server.open_link import first_attitude, open_link
 
     settings = file.config.attitude
     if (shown := _shown_by_page()) is not None:
@@ -114,9 +114,9 @@ def _shown_by_page() -> "FloatArray | None":
     import msgspec
     import numpy as np
 
-    from hilstar.console.listener import HOST, PORT
-    from hilstar.console.protocol import ShownAttitude
-    from hilstar.reading import NOT_JSON
+    from hilstar.basics.reading import NOT_JSON
+    from hilstar.server.console.listener import HOST, PORT
+    from hilstar.server.console.protocol import ShownAttitude
 
     try:
         connection = http.client.HTTPConnection(HOST, PORT, timeout=PAGE_WITHIN_S)
@@ -133,9 +133,9 @@ def _shown_by_page() -> "FloatArray | None":
 def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
     import threading
 
-    from hilstar.answers.reader import live_answers
-    from hilstar.notices import Notices
-    from hilstar.process.interrupts import stop_on_signal
+    from hilstar.basics.notices import Notices
+    from hilstar.basics.process.interrupts import stop_on_signal
+    from hilstar.server.answers.reader import live_answers
 
     link = plan.open_first(Notices())
     decoder, stop = plan.decoder(link.messages), threading.Event()
@@ -154,7 +154,7 @@ def _row(found: "Answer") -> dict[str, Any]:
 
 
 def _line(found: "Answer") -> str:
-    from hilstar.rotation import to_radec_roll_deg, turn_text
+    from hilstar.basics.rotation import to_radec_roll_deg, turn_text
 
     words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
     if found.q_icrs_to_cam is not None:

@@ -8,8 +8,8 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
-from hilstar.errors import InputError
-from hilstar.version import __version__
+from hilstar.basics.errors import InputError
+from hilstar.basics.version import __version__
 
 # By their panels, each a file of this folder and its function.
 COMMANDS = {

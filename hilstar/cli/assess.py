@@ -5,10 +5,10 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json, RunFile, check_files
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_found, say
 
 MAX_LATENCY_MS = 1e7
 
@@ -42,8 +42,8 @@ def assess(
     as_json: Json = False,
 ) -> None:
     """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
-    from hilstar.assess.assessment import AssessSettings, assess_files
-    from hilstar.assess.report import budget_of, lines_of, write_page, write_tables
+    from hilstar.instruments.assess.assessment import AssessSettings, assess_files
+    from hilstar.instruments.assess.report import budget_of, lines_of, write_page, write_tables
 
     check_directory("-o", output)
     if not abs(latency_ms) < MAX_LATENCY_MS:

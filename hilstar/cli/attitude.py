@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.resources import resource_path
 from hilstar.cli import options
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError
-from hilstar.resources import resource_path
+from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.packet import AttitudeSample
     from hilstar.attitude.wire.source import Conventions
-    from hilstar.bench.bench_file import BenchFile
+    from hilstar.server.bench.bench_file import BenchFile
 
 SHOWN_STARS = 3
 
@@ -43,7 +43,7 @@ def attitude(
     as_json: options.Json = False,
 ) -> None:
     """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
-    from hilstar.bench.bench_file import dated, read_bench_file
+    from hilstar.server.bench.bench_file import dated, read_bench_file
 
     live = source.suffix.lower() == ".toml"
     first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
@@ -75,7 +75,7 @@ class _Found(NamedTuple):
 
 
 def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
-    from hilstar.run.open_link import first_attitude, open_link
+    from hilstar.server.open_link import first_attitude, open_link
 
     if at is not None:
         raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
@@ -106,9 +106,9 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
 def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
     import numpy as np
 
-    from hilstar.bench.build import brightest_seen
-    from hilstar.frame.view import View
-    from hilstar.rotation import to_radec_roll_deg
+    from hilstar.basics.rotation import to_radec_roll_deg
+    from hilstar.optics.layers.view import View
+    from hilstar.server.bench.build import brightest_seen
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
     stars = brightest_seen(file, View(sample.q_icrs_to_cam, t_ns=sample.t_ns), SHOWN_STARS)
@@ -126,7 +126,7 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
 
 def _lines(told: dict[str, Any]) -> list[str]:
-    from hilstar.rotation import turn_text
+    from hilstar.basics.rotation import turn_text
 
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]

@@ -6,10 +6,10 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
-from hilstar.console.terminal import print_found, progress
-from hilstar.errors import InputError
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_found, progress
 
 OwnBench = Annotated[Path | None, Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
 
@@ -28,9 +28,9 @@ def benchmark(
     """Time a whole frame and its stages, and the virtual tracker, beside NumPy, numba, GalSim, photutils and sep."""
     import numpy as np
 
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.study.speed import benchmark as speed
-    from hilstar.study.speed import report as speed_report
+    from hilstar.instruments.study.speed import benchmark as speed
+    from hilstar.instruments.study.speed import report as speed_report
+    from hilstar.server.bench.bench_file import read_bench_file
 
     plan = speed.QUICK if quick else speed.BenchmarkPlan()
     if stars is not None:

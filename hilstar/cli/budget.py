@@ -5,11 +5,11 @@ from typing import Annotated
 
 from typer import Option
 
+from hilstar.basics.errors import InputError, did_you_mean, shortened
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
 from hilstar.cli.running import say_optics
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError, did_you_mean, shortened
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_found, say
 
 
 def budget(
@@ -29,12 +29,12 @@ def budget(
     as_json: Json = False,
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
-    from hilstar.bench.build import load
-    from hilstar.bench.cameras import fields_of_view
-    from hilstar.bench.frame import colour_line, shares_line
+    from hilstar.instruments.simulate.budget import By, budget_lines, write_report
+    from hilstar.instruments.simulate.budget import budget as find_budget
+    from hilstar.server.bench.build import load
+    from hilstar.server.bench.cameras import fields_of_view
+    from hilstar.server.bench.frame import colour_line, shares_line
     from hilstar.tracker.centroiders import FAMILY
-    from hilstar.twin.budget import By, budget_lines, write_report
-    from hilstar.twin.budget import budget as find_budget
 
     check_directory("-o", output)
     if noise:
@@ -64,9 +64,9 @@ def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json
     """The noise of the tracker's own stars."""
     import numpy as np
 
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.instruments.simulate.noise import noise_budget, noise_lines, write_noise
+    from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.tracker.centroids import CentroidSettings
-    from hilstar.twin.noise import noise_budget, noise_lines, write_noise
 
     attitude = None if radec is None else parse_attitude("budget", radec, None)
     found = noise_budget(read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0))

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory, refuse_stdout
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_files, parse_numbers, parse_reading
 from hilstar.cli.running import Windowed
-from hilstar.console.terminal import print_found, print_json, say
-from hilstar.errors import InputError
-from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory, refuse_stdout
+from hilstar.server.console.terminal import print_found, print_json, say
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 NAMED = "in the bench file, under [collimator]: geometry = {!r}"
@@ -38,10 +38,10 @@ def dots(
     """
     import numpy as np
 
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.frame_files import write_codes_png
-    from hilstar.calibrate.geometric.calibration import seen_screen_of
-    from hilstar.calibrate.geometric.dots import dot_image, lit_for, plan_seen_dots, show_dots, write_plan
+    from hilstar.instruments.calibrate.geometric.calibration import seen_screen_of
+    from hilstar.instruments.calibrate.geometric.dots import dot_image, lit_for, plan_seen_dots, show_dots, write_plan
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.frame_files import write_codes_png
 
     check_directory("-o", output)
     file = read_bench_file(bench_file)
@@ -79,8 +79,8 @@ def geometric(
     as_json: Json = False,
 ) -> None:
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.geometric.calibration import calibrate_files, lines_of, summary_of, write_calibrated
+    from hilstar.instruments.calibrate.geometric.calibration import calibrate_files, lines_of, summary_of, write_calibrated
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
@@ -103,9 +103,9 @@ def psf(
     as_json: Json = False,
 ) -> None:
     """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate geometric`."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.effective_psf import draw_effective, effective_psf, lines_of, summary_of
-    from hilstar.optics.psf_file import write_glass
+    from hilstar.instruments.calibrate.effective_psf import draw_effective, effective_psf, lines_of, summary_of
+    from hilstar.optics.glass.psf_file import write_glass
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, FITS)
     check_ending("--plot", plot, PNG)
@@ -121,7 +121,7 @@ def psf(
 
 def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
     """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
-    from hilstar.monitor.window.this_monitor import identity_here
+    from hilstar.display.window.this_monitor import identity_here
 
     identity = identity_here(display)
     modes = () if sides_px is None else ("{}x{}@".format(*sides_px), "{1}x{0}@".format(*sides_px))
@@ -156,8 +156,8 @@ def alignment(
     as_json: Json = False,
 ) -> None:
     """Find how the tracker stands before the screen from the attitudes that it reports, for one that gives nothing else."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.alignment import align_files, lines_of, summary_of, write_alignment
+    from hilstar.instruments.calibrate.alignment import align_files, lines_of, summary_of, write_alignment
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, TOML)
     if offset_s is not None and ledger is None:
@@ -190,7 +190,14 @@ def plan(
     """Plan which codes to measure, in which order, and make their patches."""
     import numpy as np
 
-    from hilstar.calibrate.plan import PlanSettings, is_filled_in, plan_patches, show_patches, write_patches, write_plan
+    from hilstar.instruments.calibrate.plan import (
+        PlanSettings,
+        is_filled_in,
+        plan_patches,
+        show_patches,
+        write_patches,
+        write_plan,
+    )
 
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)
@@ -232,7 +239,7 @@ def photometric(
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
-    from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+    from hilstar.instruments.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 
     check_ending("-o", output, TOML)
     refuse_stdout("-o", output)
@@ -279,9 +286,9 @@ def scale(
     as_json: Json = False,
 ) -> None:
     """Scale the light by the tracker: what one pixel at white is worth, from its readings of stars shown."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.build import open_bench
-    from hilstar.calibrate.scale import UNSURE_MAG, scale_by_tracker, with_flux_at_white
+    from hilstar.instruments.calibrate.scale import UNSURE_MAG, scale_by_tracker, with_flux_at_white
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.build import open_bench
 
     check_ending("-o", output, TOML)
     file = read_bench_file(bench_file)

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory
 from hilstar.cli import running
 from hilstar.cli.options import Headless, Json, parse_memory
-from hilstar.console.terminal import print_found, progress, say
-from hilstar.errors import InputError
-from hilstar.files import check_directory
+from hilstar.server.console.terminal import print_found, progress, say
 
 if TYPE_CHECKING:
-    from hilstar.bench.bench_file import BenchFile
-    from hilstar.campaign.cluster import Scheduler
-    from hilstar.campaign.run import Campaign
-    from hilstar.campaign.store import Directory
-    from hilstar.console.listener import PageListener
+    from hilstar.instruments.campaign.cluster import Scheduler
+    from hilstar.instruments.campaign.run import Campaign
+    from hilstar.instruments.campaign.store import Directory
+    from hilstar.server.bench.bench_file import BenchFile
+    from hilstar.server.console.listener import PageListener
 
 CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
@@ -70,9 +70,9 @@ def campaign(
     as_json: Json = False,
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
-    from hilstar.campaign.cluster import Scheduler
-    from hilstar.campaign.run import Campaign
-    from hilstar.campaign.store import Directory
+    from hilstar.instruments.campaign.cluster import Scheduler
+    from hilstar.instruments.campaign.run import Campaign
+    from hilstar.instruments.campaign.store import Directory
 
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
@@ -98,18 +98,18 @@ def campaign(
                 show_cases(this, directory, shown_bench, frames, listener)
         elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
-        from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
+        from hilstar.instruments.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
         lines, not_met = lines_of(summary), False
         if this.on_bench:
-            from hilstar.campaign.bench_results import bench_lines, bench_summary
+            from hilstar.instruments.campaign.bench_results import bench_lines, bench_summary
 
             summary |= bench_summary(directory.table)
             lines += bench_lines(summary)
         if this.plan.require:
-            from hilstar.campaign.requirements import NOT_MET
-            from hilstar.campaign.requirements_page import summary_of, write_requirements
+            from hilstar.instruments.campaign.requirements import NOT_MET
+            from hilstar.instruments.campaign.requirements_page import summary_of, write_requirements
 
             verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
             not_met = any(each.verdict == NOT_MET for each in verdicts)
@@ -138,11 +138,11 @@ def show_cases(
     listener: "PageListener | None",
 ) -> None:
     """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
-    from hilstar.campaign.bench_run import OpenDisplay
-    from hilstar.console.publisher import RunDescription
-    from hilstar.console.run_status import RunSource, RunStatus
-    from hilstar.notices import Notices
-    from hilstar.run.record.ledger import LedgerSwitch
+    from hilstar.basics.notices import Notices
+    from hilstar.instruments.campaign.bench_run import OpenDisplay
+    from hilstar.server.console.publisher import RunDescription
+    from hilstar.server.console.run_status import RunSource, RunStatus
+    from hilstar.server.record.ledger import LedgerSwitch
 
     count, begun = 0, 0
     notices, started_s, said_s = Notices(), time.monotonic(), time.monotonic()
@@ -180,7 +180,7 @@ def run_cases(
     this: "Campaign", directory: "Directory", scheduler: "Scheduler | None", workers: int, memory_bytes: int | None
 ) -> None:
     """Run the missing cases on a cluster or on this machine's cores."""
-    from hilstar.campaign.pool import Pool
+    from hilstar.instruments.campaign.pool import Pool
 
     count = 0
     with telling(this.cases) as advance:
@@ -192,7 +192,7 @@ def run_cases(
 
         try:
             if scheduler is not None:
-                from hilstar.campaign.cluster import Cluster
+                from hilstar.instruments.campaign.cluster import Cluster
 
                 with Cluster(scheduler, this.job, this.identity, say) as cluster:
                     this.run(directory, cluster, on_done)

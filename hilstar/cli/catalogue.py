@@ -5,10 +5,10 @@ from typing import Annotated
 
 from typer import Option
 
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.files import STDOUT, check_outputs
 from hilstar.cli.options import BenchFile, Json
-from hilstar.console.terminal import print_found
-from hilstar.errors import InputError, shortened
-from hilstar.files import STDOUT, check_outputs
+from hilstar.server.console.terminal import print_found
 
 
 def catalogue(
@@ -26,8 +26,8 @@ def catalogue(
     as_json: Json = False,
 ) -> None:
     """Write the stars as the tracker sees them: places with errors, types, electrons per second, instrument magnitudes."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
 
     if output != STDOUT and output.suffix.lower() not in ENDINGS:
         raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for CSV on stdout")

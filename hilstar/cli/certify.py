@@ -9,16 +9,16 @@ import msgspec
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory, make_directory, write_whole
+from hilstar.basics.reading import exists
 from hilstar.cli.first_light import image_source, virtual_truth
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError
-from hilstar.files import check_directory, make_directory, write_whole
-from hilstar.reading import exists
+from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.bench import bench_file as files
-    from hilstar.certify.readings import Reader
+    from hilstar.instruments.certify.readings import Reader
+    from hilstar.server.bench import bench_file as files
 
 CERTIFICATE, REFERENCE, PAGE = "certificate.json", "reference.json", "index.html"
 
@@ -55,7 +55,7 @@ def certify(
 
     Without --grab and --virtual nothing is read, and the calibration files say it. DIR has index.html and certificate.json.
     """
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_directory("-o", output)
     file = read_bench_file(bench_file)
@@ -87,11 +87,11 @@ def _certify(
     warm_up: float,
     as_json: bool,
 ) -> None:
-    from hilstar.bench.certificate import read_certificate
-    from hilstar.certify.certificate import certify as certified
-    from hilstar.certify.check import largest_changes, watch
-    from hilstar.certify.page import text_lines, write_certificate_page
-    from hilstar.monitor.identity import sha256_of
+    from hilstar.display.identity import sha256_of
+    from hilstar.instruments.certify.certificate import certify as certified
+    from hilstar.instruments.certify.check import largest_changes, watch
+    from hilstar.instruments.certify.page import text_lines, write_certificate_page
+    from hilstar.server.bench.certificate import read_certificate
 
     path, replaces = output / CERTIFICATE, None
     if exists(path):
@@ -118,8 +118,8 @@ def _certify(
 def _check(
     file: "files.BenchFile", reader: "Reader", output: Path, now: datetime.datetime, warm_up: float, as_json: bool
 ) -> None:
-    from hilstar.bench.certificate import read_certificate
-    from hilstar.certify.check import by_bench_file, compare, read_reference, record, take_check, watch
+    from hilstar.instruments.certify.check import by_bench_file, compare, read_reference, record, take_check, watch
+    from hilstar.server.bench.certificate import read_certificate
 
     reference, since = read_reference(output / REFERENCE), "the bench file"
     if exists(output / CERTIFICATE):
@@ -155,10 +155,10 @@ def _reader(
     check: bool,
     again: bool,
 ) -> "Reader | None":
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.certify.check import checks_in
-    from hilstar.certify.readings import ImageReader, VirtualReader
-    from hilstar.files import temporary_folder
+    from hilstar.basics.files import temporary_folder
+    from hilstar.instruments.certify.check import checks_in
+    from hilstar.instruments.certify.readings import ImageReader, VirtualReader
+    from hilstar.server.bench.bench_file import read_bench_file
 
     truth = None if virtual is None else read_bench_file(virtual)
     if truth is None and grab is None:

@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json
-from hilstar.console.terminal import print_json
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_json
 
 MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
@@ -24,9 +24,9 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""
-    from hilstar.testing import compare as compare_files
-    from hilstar.testing.report import write_report
-    from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG, star_lines
+    from hilstar.instruments.compare import compare as compare_files
+    from hilstar.instruments.compare.report import write_report
+    from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, star_lines
 
     check_directory("-o", output)
     limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px

@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.files import check_directory
 from hilstar.cli.options import BenchFile, Json, QuaternionText, RadecText, check_files, parse_attitude
-from hilstar.console.terminal import print_found, say
-from hilstar.files import check_directory
+from hilstar.server.console.terminal import print_found, say
 
 
 def confront(
@@ -27,11 +27,11 @@ def confront(
     strict: Annotated[bool, Option("--strict", help="Exit with 1 where an image is beyond the limits.")] = False,
 ) -> None:
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts against them."""
-    from hilstar.bench.bench_file import BenchFile as ReadFile
-    from hilstar.confront.files import read_tracker_file
-    from hilstar.confront.images import parse_utc
-    from hilstar.confront.run import OUTPUTS
-    from hilstar.confront.run import confront as confront_files
+    from hilstar.instruments.confront.files import read_tracker_file
+    from hilstar.instruments.confront.images import parse_utc
+    from hilstar.instruments.confront.run import OUTPUTS
+    from hilstar.instruments.confront.run import confront as confront_files
+    from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
     start = None if radec is None and quaternion is None else parse_attitude("confront", radec, quaternion)

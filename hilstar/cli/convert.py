@@ -7,7 +7,7 @@ import typer
 from typer import Argument
 
 from hilstar.cli import options
-from hilstar.console.terminal import say
+from hilstar.server.console.terminal import say
 
 
 @options.log_statements

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.files import check_directory, make_directory, temporary_folder
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.interrupts import caught
 from hilstar.cli import running
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.console.run_status import RunSource, RunStatus
-from hilstar.console.terminal import progress, report, say
-from hilstar.errors import InputError, MachineError
-from hilstar.files import check_directory, make_directory, temporary_folder
-from hilstar.notices import Notices
-from hilstar.process.interrupts import caught
+from hilstar.server.console.run_status import RunSource, RunStatus
+from hilstar.server.console.terminal import progress, report, say
 
 if TYPE_CHECKING:
-    from hilstar.bench.frame import Bench
-    from hilstar.console.listener import PageListener
-    from hilstar.run.frame_feed import FrameFeed
-    from hilstar.run.pacer import FrameSink
-    from hilstar.run.serve import Outlet
+    from hilstar.server.bench.frame import Bench
+    from hilstar.server.console.listener import PageListener
+    from hilstar.server.frame_feed import FrameFeed
+    from hilstar.server.pacer import FrameSink
+    from hilstar.server.serve import Outlet
 
 HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
@@ -57,8 +57,8 @@ def demo(
     """
     import numpy as np
 
-    from hilstar.resources import resource_path
-    from hilstar.run.demo import Shows, run_demo, scan_samples, slew_samples, write_pictures
+    from hilstar.basics.resources import resource_path
+    from hilstar.server.demo import Shows, run_demo, scan_samples, slew_samples, write_pictures
 
     check_directory("-o", output)
     seconds = duration or (LOOP_S if loop else USUAL_S)
@@ -110,9 +110,9 @@ def _watching(
     advance: "FrameSink",
     tracker: "TrackerBeside | None",
 ) -> "Iterator[tuple[FrameSink, Outlet]]":
-    from hilstar.console.publisher import RunDescription
-    from hilstar.run.record.ledger import NO_SPLIT
-    from hilstar.run.serve import Outlet
+    from hilstar.server.console.publisher import RunDescription
+    from hilstar.server.record.ledger import NO_SPLIT
+    from hilstar.server.serve import Outlet
 
     notices = Notices()
     status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
@@ -173,10 +173,10 @@ class TrackerBeside:
 
     def report(self, live: object, as_json: bool) -> None:
         """Print the budget of the tracker's answers beside what was planted; `live` are the run's own figures."""
-        from hilstar.answers.judge import TrackerFigures
-        from hilstar.assess.assessment import AssessSettings, assess_files
-        from hilstar.assess.report import lines_of, write_page
-        from hilstar.twin.tracker_process import ROLL
+        from hilstar.instruments.assess.assessment import AssessSettings, assess_files
+        from hilstar.instruments.assess.report import lines_of, write_page
+        from hilstar.instruments.simulate.tracker_process import ROLL
+        from hilstar.server.answers.judge import TrackerFigures
 
         try:
             found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hilstar.cli.options import Json
 from hilstar.cli.running import say_units
-from hilstar.console.terminal import print_found
+from hilstar.server.console.terminal import print_found
 
 OwnBench = Annotated[
     Path | None,
@@ -26,7 +26,7 @@ Report = Annotated[
 
 def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = False) -> None:
     """Check this machine's OpenGL, displays, links and files, and say what is missing; of a bench file, what it means."""
-    from hilstar.run.doctor import examine, examine_bench, row, table
+    from hilstar.server.doctor import examine, examine_bench, row, table
 
     if report:
         cells = row()

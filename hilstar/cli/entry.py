@@ -13,13 +13,13 @@ from typing import Any, NoReturn
 
 import typer
 
+from hilstar.basics.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
+from hilstar.basics.process import interrupts
+from hilstar.basics.process.interrupts import finish_stderr, queue_stderr
+from hilstar.basics.reading import add_kinds, exists
 from hilstar.cli.app import EarlyEnd, run
 from hilstar.cli.options import with_values
-from hilstar.console.terminal import fail
-from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
-from hilstar.process import interrupts
-from hilstar.process.interrupts import finish_stderr, queue_stderr
-from hilstar.reading import add_kinds, exists
+from hilstar.server.console.terminal import fail
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"

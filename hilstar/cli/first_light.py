@@ -10,18 +10,18 @@ import msgspec
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError, did_you_mean
+from hilstar.basics.files import check_directory, make_directory
+from hilstar.basics.reading import exists
+from hilstar.basics.resources import resource_path
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_diode
 from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError, did_you_mean
-from hilstar.files import check_directory, make_directory
-from hilstar.reading import exists
-from hilstar.resources import resource_path
+from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.bench import bench_file as files
-    from hilstar.calibrate.first_light.image_sources import ImageSource, Pattern
-    from hilstar.console.listener import PageListener
+    from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern
+    from hilstar.server.bench import bench_file as files
+    from hilstar.server.console.listener import PageListener
 
 PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs
@@ -90,10 +90,10 @@ def first_light(
 
     Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
     """
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.page import write_page
-    from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
-    from hilstar.run.sync import beat_line
+    from hilstar.instruments.calibrate.first_light.page import write_page
+    from hilstar.instruments.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.sync import beat_line
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:
@@ -139,7 +139,7 @@ def _shown(
     if listener is None:
         yield say, lambda pattern: None
         return
-    from hilstar.console.publisher import session_page
+    from hilstar.server.console.publisher import session_page
 
     with session_page(listener, control, file) as feed:
 
@@ -161,9 +161,9 @@ def image_source(
     file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
 ) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench
-    from hilstar.calibrate.geometric.observed import read_image
+    from hilstar.instruments.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench
+    from hilstar.instruments.calibrate.geometric.observed import read_image
+    from hilstar.server.bench.bench_file import read_bench_file
 
     if virtual is not None:
         for name, given in (("grab", grab), ("dark", dark), ("diode", diode)):

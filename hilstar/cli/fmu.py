@@ -10,11 +10,11 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from hilstar import run
+from hilstar import server
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.files import check_ending, temporary_folder, written
 from hilstar.cli.options import BenchFile, check_files
-from hilstar.console.terminal import say
-from hilstar.errors import InputError, MachineError
-from hilstar.files import check_ending, temporary_folder, written
+from hilstar.server.console.terminal import say
 
 FMU = (".fmu",)
 MODEL = "star_display"  # the module in the FMU
@@ -25,7 +25,7 @@ def fmu(
     bench_file: BenchFile, output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")]
 ) -> None:
     """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and answered attitude out."""
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, FMU)
     file = read_bench_file(bench_file)
@@ -38,7 +38,7 @@ def fmu(
 
 
 def _address(path: Path, settings: object) -> str:
-    from hilstar.bench.config.attitude import AttitudeSettings, udp_road
+    from hilstar.server.bench.config.attitude import AttitudeSettings, udp_road
 
     assert isinstance(settings, AttitudeSettings)
     if settings.source != "udp":
@@ -60,7 +60,7 @@ def build(folder: Path, address: str) -> Path:
     except ImportError as error:
         raise MachineError(EXTRA) from error
     script = folder / f"{MODEL}.py"
-    shutil.copyfile(Path(run.__file__).with_name("fmu_model.py"), script)
+    shutil.copyfile(Path(server.__file__).with_name("fmu_model.py"), script)
     bench = folder / "bench.json"
     bench.write_text(json.dumps({"address": address}))
     path = list(sys.path)

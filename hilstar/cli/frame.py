@@ -5,11 +5,11 @@ from typing import Annotated, Any
 
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import CSV, FITS, PNG, check_ending
 from hilstar.cli import options
 from hilstar.cli.running import explain_bench, explained_effort, optional_scenario, say_optics
-from hilstar.console.terminal import print_found
-from hilstar.errors import InputError
-from hilstar.files import CSV, FITS, PNG, check_ending
+from hilstar.server.console.terminal import print_found
 
 
 def frame(
@@ -30,12 +30,12 @@ def frame(
     """Draw one frame and write it to files."""
     import numpy as np
 
-    from hilstar.bench import frame_files as files
-    from hilstar.bench.bench_file import at_moment, read_bench_file
-    from hilstar.bench.build import open_bench
-    from hilstar.bench.cameras import fields_of_view
-    from hilstar.bench.star_size import star_size
-    from hilstar.frame.truth import clipped_in
+    from hilstar.optics.layers.truth import clipped_in
+    from hilstar.server.bench import frame_files as files
+    from hilstar.server.bench.bench_file import at_moment, read_bench_file
+    from hilstar.server.bench.build import open_bench
+    from hilstar.server.bench.cameras import fields_of_view
+    from hilstar.server.bench.star_size import star_size
 
     file = read_bench_file(bench_file)
     q = options.parse_attitude("frame", radec, quaternion)
@@ -49,7 +49,7 @@ def frame(
             explain_bench(bench, t_ns)
         effects = None
         if wrong is not None:
-            from hilstar.bench.fault_views import faults_at  # takes 20 ms, with the random numbers of its light
+            from hilstar.server.bench.fault_views import faults_at  # takes 20 ms, with the random numbers of its light
 
             effects = faults_at(bench, wrong, t_ns or 0)
         shot = bench.frame(q, t_ns=t_ns, faults=effects)

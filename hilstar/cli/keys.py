@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from hilstar.console.terminal import say
-from hilstar.files import check_directory
+from hilstar.basics.files import check_directory
+from hilstar.server.console.terminal import say
 
 
 def keys(

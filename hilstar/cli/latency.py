@@ -6,10 +6,10 @@ from typing import Annotated
 
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import CSV, check_directory, check_ending
 from hilstar.cli.options import Json, Overwrite, RunFile, check_files, parse_diode
-from hilstar.console.terminal import print_found
-from hilstar.errors import InputError
-from hilstar.files import CSV, check_directory, check_ending
+from hilstar.server.console.terminal import print_found
 
 LEDGER_BEHIND_S = 0.5  # the newest part of a running ledger may not be on the disk yet
 
@@ -28,7 +28,7 @@ def latency(
     as_json: Json = False,
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
-    from hilstar.calibrate import latency as by_diode
+    from hilstar.instruments.calibrate import latency as by_diode
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import FITS, check_ending
 from hilstar.cli.options import Json, check_files, parse_numbers
-from hilstar.console.terminal import print_found, say
-from hilstar.errors import InputError
-from hilstar.files import FITS, check_ending
+from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.optics.psf_file import Glass
+    from hilstar.optics.glass.psf_file import Glass
 
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1024,1024"
 Output = Annotated[Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")]
@@ -32,7 +32,7 @@ def map_(
     as_json: Json = False,
 ) -> None:
     """Make a tracker's glass of measured or simulated PSF images at field points and wavelengths."""
-    from hilstar.optics.maps import glass_of_map
+    from hilstar.optics.glass.maps import glass_of_map
 
     check_ending("-o", output, FITS)
     check_files([stack, points], [output])
@@ -49,7 +49,7 @@ def zernike(
     as_json: Json = False,
 ) -> None:
     """Make a tracker's glass of an aperture and Zernike or Seidel coefficients, by diffraction (needs hilstar[optics])."""
-    from hilstar.optics.zernike import glass_of_pupil
+    from hilstar.optics.glass.zernike import glass_of_pupil
 
     check_ending("-o", output, FITS)
     check_files([pupil], [output])
@@ -84,8 +84,8 @@ def lens(
 
     Wavelengths and the field are the prescription's; pixel pitch and resolution those of --bench, or as given.
     """
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.optics.prescription import Plate, glass_of_prescription
+    from hilstar.optics.glass.prescription import Plate, glass_of_prescription
+    from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, FITS)
     check_files([prescription, bench], [output])
@@ -115,7 +115,7 @@ def lens(
 def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, Any] | None = None) -> None:
     import numpy as np
 
-    from hilstar.optics.psf_file import write_glass
+    from hilstar.optics.glass.psf_file import write_glass
 
     write_glass(output, glass)
     known = bool(np.isfinite(glass.wavelengths_nm[0]))

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from typer import Argument, Option
 
-from hilstar.errors import InputError, did_you_mean
-from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError, did_you_mean
+from hilstar.basics.files import check_outputs, files_named_in, refuse_existing, refuse_writer
+from hilstar.basics.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from hilstar.arrays import FloatArray
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench import bench_file
-    from hilstar.bench.config import BenchConfig
-    from hilstar.calibrate.scale import StarReading
-    from hilstar.run.record.ledger import SplitLimits
+    from hilstar.basics.arrays import FloatArray
+    from hilstar.instruments.calibrate.scale import StarReading
+    from hilstar.server.bench import bench_file
+    from hilstar.server.bench.config import BenchConfig
+    from hilstar.server.record.ledger import SplitLimits
 
 BenchFile = Annotated[Path, Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
@@ -116,8 +116,8 @@ def with_values(words: list[str]) -> list[str]:
 
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
     """The one attitude that the command line gives."""
-    from hilstar.bench.frame import checked_quaternion
-    from hilstar.rotation import from_radec_roll_deg
+    from hilstar.basics.rotation import from_radec_roll_deg
+    from hilstar.server.bench.frame import checked_quaternion
 
     if (radec is None) == (quaternion is None):
         raise InputError(f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z")
@@ -128,7 +128,7 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
 
 def parse_at(command: str, at_s: float | None, config: "BenchConfig", timed: bool = False) -> int | None:
     """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where nothing changes with time."""
-    from hilstar.bench.config.bench_config import has_observer
+    from hilstar.server.bench.config.bench_config import has_observer
 
     if at_s is None:
         return None
@@ -242,7 +242,7 @@ class LogStatements:
         """
         from hilstar.attitude.logs.entries import Stated
         from hilstar.attitude.wire.source import Convention
-        from hilstar.bench.bench_file import stated_in
+        from hilstar.server.bench.bench_file import stated_in
 
         by_file = Stated() if config is None else stated_in(config)
         stated = replace(by_file, kernels=tuple(self.kernel or ()), topic=self.topic, body=self.body)
@@ -332,7 +332,7 @@ def parse_speed(text: str) -> float:
 
 def parse_split(text: str | None) -> "SplitLimits":
     """The split of "1GB" or "1h". Raises InputError."""
-    from hilstar.run.record.ledger import NO_SPLIT, SplitLimits
+    from hilstar.server.record.ledger import NO_SPLIT, SplitLimits
 
     if text is None:
         return NO_SPLIT
@@ -353,7 +353,7 @@ def parse_memory(text: str) -> int:
 
 def parse_reading(text: str) -> "StarReading":
     """A reading from "HIP,DN" or "HIP,DN,SIGMA_DN". Raises InputError."""
-    from hilstar.calibrate.scale import StarReading
+    from hilstar.instruments.calibrate.scale import StarReading
 
     parts = text.split(",")
     try:

@@ -6,11 +6,11 @@ from typing import Annotated
 from msgspec.structs import replace as replaced
 from typer import Argument, Option
 
+from hilstar.basics.files import MCAP, check_directory, check_ending
+from hilstar.basics.notices import Notices
 from hilstar.cli import options, running
-from hilstar.console.run_status import RunSource, RunStatus, on_terminal
-from hilstar.console.terminal import say
-from hilstar.files import MCAP, check_directory, check_ending
-from hilstar.notices import Notices
+from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.server.console.terminal import say
 
 
 @options.log_statements
@@ -44,11 +44,11 @@ def replay(
     as_json: options.Json = False,
 ) -> None:
     """Show an attitude log on the monitor."""
-    from hilstar.bench.bench_file import dated, read_bench_file, with_codes_ms
-    from hilstar.console.publisher import RunDescription
-    from hilstar.run.replay import FrameImages, Wanted, plan_play
-    from hilstar.run.replay import replay as replay_log
-    from hilstar.run.serve import Outlet
+    from hilstar.server.bench.bench_file import dated, read_bench_file, with_codes_ms
+    from hilstar.server.console.publisher import RunDescription
+    from hilstar.server.replay import FrameImages, Wanted, plan_play
+    from hilstar.server.replay import replay as replay_log
+    from hilstar.server.serve import Outlet
 
     check_directory("-o", output)
     ledger = running.dated_ledger(ledger)

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from typer import Option
 
+from hilstar.basics.files import check_directory
 from hilstar.cli.options import Json, RunFile
-from hilstar.console.terminal import print_found
-from hilstar.files import check_directory
+from hilstar.server.console.terminal import print_found
 
 
 def report(
@@ -16,8 +16,8 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
-    from hilstar.console.report import report as write_report
-    from hilstar.run.record.report import table_rows
+    from hilstar.server.console.report import report as write_report
+    from hilstar.server.record.report import table_rows
 
     check_directory("-o", output)
     found = write_report(ledger, output)

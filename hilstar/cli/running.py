@@ -10,30 +10,30 @@ import msgspec
 import typer
 from typer import Option
 
-from hilstar.console.run_status import RunStatus
-from hilstar.console.terminal import report, say
-from hilstar.errors import InputError, MachineError
-from hilstar.notices import Notice, Notices
-from hilstar.process.programs import Service
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.notices import Notice, Notices
+from hilstar.basics.process.programs import Service
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.console.run_status import RunStatus
+from hilstar.server.console.terminal import report, say
 
 if TYPE_CHECKING:
-    from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.cameras import FieldsOfView
-    from hilstar.bench.scenario import Scenario
-    from hilstar.bench.star_size import StarSize
-    from hilstar.console.listener import PageListener
-    from hilstar.console.publisher import PageParts, RunDescription
-    from hilstar.run.faults import AnyFaults, Recording
-    from hilstar.run.frame_feed import FrameFeed
-    from hilstar.run.frame_pulse import FramePulse
-    from hilstar.run.live_answers import LiveAnswers
-    from hilstar.run.operator import SwitchRequests
-    from hilstar.run.pacer import FrameSink, Shown
-    from hilstar.run.record.ledger import LedgerSwitch
-    from hilstar.run.serve import Follower, Running
-    from hilstar.run.summary import RunSummary
-    from hilstar.run.sync import BeatSummary
+    from hilstar.server.bench.bench_file import BenchFile
+    from hilstar.server.bench.cameras import FieldsOfView
+    from hilstar.server.bench.scenario import Scenario
+    from hilstar.server.bench.star_size import StarSize
+    from hilstar.server.console.listener import PageListener
+    from hilstar.server.console.publisher import PageParts, RunDescription
+    from hilstar.server.faults import AnyFaults, Recording
+    from hilstar.server.frame_feed import FrameFeed
+    from hilstar.server.frame_pulse import FramePulse
+    from hilstar.server.live_answers import LiveAnswers
+    from hilstar.server.operator import SwitchRequests
+    from hilstar.server.pacer import FrameSink, Shown
+    from hilstar.server.record.ledger import LedgerSwitch
+    from hilstar.server.serve import Follower, Running
+    from hilstar.server.summary import RunSummary
+    from hilstar.server.sync import BeatSummary
 
 POINTED = ("serve", "replay")  # commands whose attitudes come from elsewhere
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
@@ -102,9 +102,9 @@ FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://1
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
     """Explain the attitudes' source, that of the stars, the choices within the tolerance, and bodies that are discs then."""
-    from hilstar.bench.effort_report import effort_lines
-    from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
-    from hilstar.frame.diffuse import DiffuseLayer
+    from hilstar.optics.layers.diffuse import DiffuseLayer
+    from hilstar.server.bench.effort_report import effort_lines
+    from hilstar.server.bench.moving import observer_lines, satellite_lines, wide_bodies
 
     moving = bench.moving
     for line in [
@@ -128,7 +128,7 @@ def effort_of_run(bench: Any, explain: bool, as_json: bool) -> dict[str, dict[st
 
 def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:
     """The key "effort" of a JSON object, if it is wanted; else {}."""
-    from hilstar.bench.effort_report import effort_keys
+    from hilstar.server.bench.effort_report import effort_keys
 
     return {"effort": effort_keys(bench)} if wanted else {}
 
@@ -137,13 +137,13 @@ def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:
 def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, *, timed: bool) -> Iterator[tuple[Any, Any]]:
     """The bench and its screen; None when headless. `timed` as in `open_bench`."""
     if headless:
-        from hilstar.bench.build import open_bench
-        from hilstar.render.context import create_context
+        from hilstar.display.render.context import create_context
+        from hilstar.server.bench.build import open_bench
 
         with open_bench(file, create_context(file.config.render.gpu), timed=timed) as bench:  # NumPy is too slow for a stream
             yield bench, None
         return
-    from hilstar.run.screen.gate import open_screen
+    from hilstar.server.screen.gate import open_screen
 
     with open_screen(file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed) as screen:
         yield screen.bench, screen
@@ -156,7 +156,7 @@ def forced_on(screen: Any) -> str:
 
 def say_of_light(bench: Any) -> None:
     """Name the stars that this bench shows too faint, and the assumption about its primaries."""
-    from hilstar.bench.frame import clipping_line, colour_line, drawn_line, shares_line
+    from hilstar.server.bench.frame import clipping_line, colour_line, drawn_line, shares_line
 
     for line in (clipping_line(bench), drawn_line(bench), shares_line(bench), colour_line(bench)):
         if line is not None:
@@ -174,8 +174,8 @@ def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
 
 def say_seen(bench: Any) -> dict[str, Any]:
     """Say what screen and tracker see and how wide a star is then, with what is wrong of it; both for the run's summary."""
-    from hilstar.bench.cameras import fields_of_view
-    from hilstar.bench.star_size import star_size
+    from hilstar.server.bench.cameras import fields_of_view
+    from hilstar.server.bench.star_size import star_size
 
     fields = fields_of_view(bench.config, bench.file.folder)
     star = star_size(bench.config, bench.file.folder, bench.camera)
@@ -187,7 +187,7 @@ def say_seen(bench: Any) -> dict[str, Any]:
 
 def say_units_of(file: "BenchFile") -> None:
     """Warn of a length of a bench file that is probably another quantity, or in another unit than its key."""
-    from hilstar.bench.cameras import fields_of_view
+    from hilstar.server.bench.cameras import fields_of_view
 
     say_units(fields_of_view(file.config, file.folder))
 
@@ -200,7 +200,7 @@ def say_units(fields: "FieldsOfView") -> None:
 
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
-    from hilstar.run.sync import beat_line, beat_of
+    from hilstar.server.sync import beat_line, beat_of
 
     measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
     found = beat_of(bench.config, measured_hz, () if screen is None else screen.window.modes_hz)
@@ -213,7 +213,7 @@ def say_beat(bench: Any, screen: Any) -> "BeatSummary":
 @contextmanager
 def optional_pulse(file: "BenchFile", notices: Notices) -> "Iterator[FramePulse | None]":
     """The bench file's pulse at each frame; None without one. Raises InputError where its port cannot be opened."""
-    from hilstar.run.frame_pulse import FramePulse
+    from hilstar.server.frame_pulse import FramePulse
 
     settings = file.config.sync
     if settings.port is None:
@@ -229,9 +229,9 @@ def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", scree
     if bench.config.answers is None:
         yield None
         return
-    from hilstar.answers.judge import AnswerRules
-    from hilstar.answers.reader import open_answers
-    from hilstar.run.live_answers import LiveAnswers
+    from hilstar.server.answers.judge import AnswerRules
+    from hilstar.server.answers.reader import open_answers
+    from hilstar.server.live_answers import LiveAnswers
 
     with open_answers(bench.config, bench.file.folder, notices) as source:
         answers = LiveAnswers(bench, AnswerRules.of(bench.config), source, notices, ledger, screen=screen)
@@ -247,7 +247,7 @@ def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> "Iterator[
         yield None
         return
     from hilstar.attitude.wire.shown_frames import FrameSender
-    from hilstar.run.frame_feed import FrameFeed
+    from hilstar.server.frame_feed import FrameFeed
 
     with FrameFeed(FrameSender(endpoint), bench, lambda: 0 if screen is None else screen.swap_to_light_ns) as feed:
         say(f"frames: {feed.endpoint}")
@@ -264,8 +264,8 @@ def dated_ledger(path: Path | None) -> Path | None:
 @contextmanager
 def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> "Iterator[LedgerSwitch]":
     """The run's ledger, which also keeps its events; without a path it starts switched off."""
-    from hilstar.bench.measured_on import SHOWN_ANYWAY
-    from hilstar.run.record.ledger import Ledger, LedgerSwitch
+    from hilstar.server.bench.measured_on import SHOWN_ANYWAY
+    from hilstar.server.record.ledger import Ledger, LedgerSwitch
 
     ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
     notices.listen(ledger.notice)
@@ -279,7 +279,7 @@ def optional_scenario(path: Path | None) -> "Scenario | None":
     """The scenario of `--scenario`, None without one. Raises InputError."""
     if path is None:
         return None
-    from hilstar.bench.scenario import read_scenario
+    from hilstar.server.bench.scenario import read_scenario
 
     return read_scenario(path)
 
@@ -289,8 +289,8 @@ def run_with_faults(
     bench: Any, scenario: "Scenario | None", notices: Notices, ledger: "LedgerSwitch", recording: "Recording | None" = None
 ) -> "Iterator[AnyFaults | None]":
     """The faults of a run, from its scenario and stream or from the run that is replayed; None for none."""
-    from hilstar.bench.scenario import NO_SCENARIO
-    from hilstar.run.faults import ReplayedFaults, RunFaults
+    from hilstar.server.bench.scenario import NO_SCENARIO
+    from hilstar.server.faults import ReplayedFaults, RunFaults
 
     if recording is not None and recording.faults:
         if scenario is not None:
@@ -336,7 +336,7 @@ def end_of_run(
 
 def refuse_lost_gpu(notices: Notices) -> None:
     """Raise MachineError where the GPU was lost in a run."""
-    from hilstar.run.watchdog import GPU_LOST
+    from hilstar.server.watchdog import GPU_LOST
 
     if lost := notices.lasting.get(GPU_LOST):
         raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
@@ -347,7 +347,7 @@ def page_listener(
     console: str | None, control: bool, token: str | None, names: list[str] | None
 ) -> "Iterator[PageListener | None]":
     """The page's listening socket; None without --console. Raises InputError."""
-    from hilstar.console.listener import PageListener, parse_address
+    from hilstar.server.console.listener import PageListener, parse_address
 
     if console is None:
         for option, given in (("--control", control), ("--console-name", bool(names))):
@@ -365,7 +365,7 @@ def scpi_listener(
     file: "BenchFile", scpi: str | None, page: "PageListener | None", token: str | None
 ) -> "Iterator[PageListener | None]":
     """SCPI's listening socket, with the page's token if that has one; None without --scpi. Raises InputError."""
-    from hilstar.console.listener import PageListener, parse_address
+    from hilstar.server.console.listener import PageListener, parse_address
 
     if scpi is None:
         if file.config.attitude.source == "scpi":
@@ -389,8 +389,8 @@ def page_parts(
     **split: Any,
 ) -> "PageParts":
     """The parts of a run for its page; a ledger that is begun there is split as `split` says."""
-    from hilstar.console.publisher import PageParts
-    from hilstar.run.record.ledger import Ledger
+    from hilstar.server.console.publisher import PageParts
+    from hilstar.server.record.ledger import Ledger
 
     schedule = getattr(faults, "schedule", None)  # nobody starts a fault in a run that is replayed
     return PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices, **split), screen, schedule, answers)
@@ -402,7 +402,7 @@ def optional_pointing(description: "RunDescription", parts: "PageParts", sinks: 
     if description.command not in POINTED:
         yield
         return
-    from hilstar.run.pointing import Pointing
+    from hilstar.server.pointing import Pointing
 
     with Pointing(parts.bench, parts.notices) as pointing:
         sinks.append(pointing.see)
@@ -428,8 +428,8 @@ def followed(
         if listener is None and scpi is None:
             yield _all_of(sinks), status.follow, None
             return
-        from hilstar.console.page_process import Listeners
-        from hilstar.console.publisher import opened_page
+        from hilstar.server.console.page_process import Listeners
+        from hilstar.server.console.publisher import opened_page
 
         with opened_page(Listeners(listener, scpi), control, description, parts) as (feed, requests):
 

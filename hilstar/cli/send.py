@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.process.interrupts import is_command, stop_on_signal
+from hilstar.basics.process.scheduling import PromptWhileLight
+from hilstar.basics.units import NS_PER_S
 from hilstar.cli import options
-from hilstar.console.terminal import print_json, progress, say
-from hilstar.errors import InputError
-from hilstar.process.interrupts import is_command, stop_on_signal
-from hilstar.process.scheduling import PromptWhileLight
-from hilstar.units import NS_PER_S
+from hilstar.server.console.terminal import print_json, progress, say
 
 LISTEN_SLICE_S = 0.1  # between checks for a signal
 Share = Annotated[str, Option(metavar="[SHARE]", help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.")]
@@ -56,9 +56,9 @@ def send(
     import numpy as np
 
     from hilstar.attitude.wire.keys import CurveKeys
-    from hilstar.run.send_log import BadCable, Faults
-    from hilstar.run.send_log import send as send_samples
-    from hilstar.run.sender import open_sender
+    from hilstar.server.send_log import BadCable, Faults
+    from hilstar.server.send_log import send as send_samples
+    from hilstar.server.sender import open_sender
 
     named = (("--lose", lose), ("--corrupt", corrupt), ("--reorder", reorder))
     lost, corrupted, reordered = (options.parse_share(text, option) for option, text in named)
@@ -97,7 +97,7 @@ def wanted_samples(
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
     from hilstar.attitude.logs.log_file import open_log
-    from hilstar.run.send_log import log_samples, spin_samples
+    from hilstar.server.send_log import log_samples, spin_samples
 
     if (log is None) == (spin is None):
         raise InputError("send: give either a LOG or --spin AXIS,DEG_PER_S")

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+from hilstar.basics.files import TOML, check_ending, refuse_stdout
 from hilstar.cli.options import Json, check_files
-from hilstar.console.terminal import print_found
-from hilstar.files import TOML, check_ending, refuse_stdout
+from hilstar.server.console.terminal import print_found
 
 if TYPE_CHECKING:
-    from hilstar.calibrate.sensor import SensorFile
+    from hilstar.instruments.calibrate.sensor import SensorFile
 
 Output = Annotated[Path, Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")]
 
@@ -21,7 +21,7 @@ def import_(
     as_json: Json = False,
 ) -> None:
     """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet, and its curves."""
-    from hilstar.calibrate.sensor import import_emva
+    from hilstar.instruments.calibrate.sensor import import_emva
 
     _check(output)
     check_files([data], [output])
@@ -37,7 +37,7 @@ def measure(
     as_json: Json = False,
 ) -> None:
     """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write [tracker.detector]."""
-    from hilstar.calibrate.sensor import measure_sensor
+    from hilstar.instruments.calibrate.sensor import measure_sensor
 
     _check(output)
     check_files([*flats, *darks], [output])
@@ -50,7 +50,7 @@ def _check(output: Path) -> None:
 
 
 def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> None:
-    from hilstar.calibrate.sensor import write_sensor
+    from hilstar.instruments.calibrate.sensor import write_sensor
 
     files = write_sensor(output, sensor, source)
     written = [str(file) for file in files]

@@ -11,23 +11,23 @@ from msgspec import UNSET
 from msgspec.structs import replace as replaced
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import MCAP, check_ending
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.interrupts import end_with_parent
 from hilstar.cli import running
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files, parse_split
-from hilstar.console.run_status import RunSource, RunStatus, on_terminal
-from hilstar.console.terminal import print_found, say, without_attitude
-from hilstar.errors import InputError
-from hilstar.files import MCAP, check_ending
-from hilstar.notices import Notices
-from hilstar.process.interrupts import end_with_parent
+from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.server.console.terminal import print_found, say, without_attitude
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
     from hilstar.attitude.wire.zmq_links import ZmqReceiver
-    from hilstar.bench.bench_file import BenchFile as ReadFile
-    from hilstar.bench.frame import Bench
-    from hilstar.console.publisher import RunDescription
-    from hilstar.run.heads import HeadsRun
-    from hilstar.run.open_link import AnyLink
+    from hilstar.server.bench.bench_file import BenchFile as ReadFile
+    from hilstar.server.bench.frame import Bench
+    from hilstar.server.console.publisher import RunDescription
+    from hilstar.server.heads import HeadsRun
+    from hilstar.server.open_link import AnyLink
 
 NO_ATTITUDE = 4
 # Options of a head's process: the file with `heads`, and the endpoint of the source's attitudes.
@@ -40,8 +40,8 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
     The page of head k is at the port of `console` plus k.
     """
-    from hilstar.run.heads import head_ledger, run_heads, source_config
-    from hilstar.run.open_link import open_link
+    from hilstar.server.heads import head_ledger, run_heads, source_config
+    from hilstar.server.open_link import open_link
 
     heads = asked.heads
     if asked.ledger is not None and not overwrite:
@@ -74,7 +74,7 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
 
 def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
-    from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
+    from hilstar.server.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if console is None:
         return ()
@@ -93,7 +93,7 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
     from hilstar.attitude.wire.source import Mounting, SentAttitudes
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
-    from hilstar.bench.config.attitude import PACKET_SOURCES
+    from hilstar.server.bench.config.attitude import PACKET_SOURCES
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))
@@ -130,12 +130,12 @@ def serve(
     fed_by: FedBy = None,
 ) -> None:
     """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of each."""
-    from hilstar.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
+    from hilstar.server.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
     count, watch = frames_of(frames, heads=isinstance(file, HeadsFile))
     if isinstance(file, HeadsFile):
-        from hilstar.run.heads import HeadsRun
+        from hilstar.server.heads import HeadsRun
 
         if scpi is not None:
             raise InputError(f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head")
@@ -148,9 +148,9 @@ def serve(
         serve_heads(asked, console, overwrite, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.run.loop import Limit
-    from hilstar.run.serve import Outlet
-    from hilstar.run.serve import serve as serve_stream
+    from hilstar.server.loop import Limit
+    from hilstar.server.serve import Outlet
+    from hilstar.server.serve import serve as serve_stream
 
     ledger = running.dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
@@ -213,7 +213,7 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
 
 def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
     """The run as its page says it; where SCPI steers, with the port of the link to which it sends."""
-    from hilstar.console.publisher import RunDescription
+    from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude
     steer_port = int(link.endpoint.rpartition(":")[2]) if source.source == "scpi" else 0
@@ -222,7 +222,7 @@ def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
 
 def _source(file: "ReadFile", fed_by: str | None, notices: Notices) -> "AnyLink":
     """The link to the bench's own source or, for a head, to the process that has it."""
-    from hilstar.run.open_link import open_link
+    from hilstar.server.open_link import open_link
 
     if fed_by is not None:
         return fed_link(file, fed_by, notices)
@@ -233,7 +233,7 @@ def tracker_pictures(link: "AnyLink", bench: "Bench", faults: Any = None) -> "Pi
     """The virtual tracker's pictures for a link whose other side asks for them."""
     if not link.asks_for_pictures:
         return None
-    from hilstar.twin.pictures import TrackerPictures  # 15 ms
+    from hilstar.instruments.simulate.pictures import TrackerPictures  # 15 ms
 
     if faults is None:
         return TrackerPictures(bench)

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError, cannot_write, shortened
+from hilstar.basics.files import refuse_existing, write_whole
 from hilstar.cli.options import BenchFile, Overwrite, with_values
 from hilstar.cli.running import UTC_MARK
 from hilstar.cli.serve import serve
-from hilstar.console.terminal import say
-from hilstar.errors import InputError, cannot_write, shortened
-from hilstar.files import refuse_existing, write_whole
+from hilstar.server.console.terminal import say
 
 if TYPE_CHECKING:
-    from hilstar.console.listener import ListenAddress
+    from hilstar.server.console.listener import ListenAddress
 
 TOKEN_BYTES = 32
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -86,7 +86,7 @@ def install(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.server.bench.bench_file import read_bench_file
 
     read_bench_file(bench_file)
     words, console = _checked(bench_file, options or [])
@@ -151,7 +151,7 @@ def _systemctl(*words: str) -> bool:
 
 
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
-    from hilstar.console.listener import parse_address
+    from hilstar.server.console.listener import parse_address
 
     words = with_values(options)
     alone = typer.Typer()

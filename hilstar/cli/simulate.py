@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.cli import options
 from hilstar.cli.running import optional_scenario, say_units_of
-from hilstar.console.terminal import print_found, progress, say
-from hilstar.errors import InputError
-from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
+from hilstar.server.console.terminal import print_found, progress, say
 
 if TYPE_CHECKING:
-    from hilstar.twin.simulator import FrameNoise
+    from hilstar.instruments.simulate.simulator import FrameNoise
 
 
 @options.log_statements
@@ -42,11 +42,11 @@ def simulate(
     """Simulate the virtual tracker's image of the sky, with noise."""
     import numpy as np
 
-    from hilstar.bench.bench_file import at_moment, read_bench_file
-    from hilstar.frame.truth import clipped_in
-    from hilstar.twin import pictures as files
-    from hilstar.twin.batch import faulty_exposure
-    from hilstar.twin.simulator import FrameNoise, Simulator
+    from hilstar.instruments.simulate import pictures as files
+    from hilstar.instruments.simulate.batch import faulty_exposure
+    from hilstar.instruments.simulate.simulator import FrameNoise, Simulator
+    from hilstar.optics.layers.truth import clipped_in
+    from hilstar.server.bench.bench_file import at_moment, read_bench_file
 
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png or at is not None:
@@ -105,8 +105,8 @@ def simulate_log(
 ) -> None:
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.log_file import open_log
-    from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.twin.batch import LogFaults, log_views, simulate_views
+    from hilstar.instruments.simulate.batch import LogFaults, log_views, simulate_views
+    from hilstar.server.bench.bench_file import dated, read_bench_file
 
     wrong = optional_scenario(scenario)
     file = read_bench_file(bench_file)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json, check_files, parse_radec
-from hilstar.console.terminal import print_found, progress
-from hilstar.errors import InputError
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_found, progress
 
 if TYPE_CHECKING:
-    from hilstar.study.chain.run import ChainStudy
+    from hilstar.instruments.study.chain.run import ChainStudy
 
 Study = Literal[
     "models",
@@ -69,7 +69,7 @@ def study(
     steps = CHAIN_SCENES if what == "chain" else math.inf
     with progress(f"study {what}", steps) as advance:
         if images is not None:
-            from hilstar.study.confront import run as confront_set
+            from hilstar.instruments.study.confront import run as confront_set
 
             make_directory(output)
             lines, right = confront_set(output, images, quick), None
@@ -103,8 +103,8 @@ def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path
 
 def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> "ChainStudy":
     """Run the study of a bench's whole chain."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.study.chain.run import OUTPUTS, run
+    from hilstar.instruments.study.chain.run import OUTPUTS, run
+    from hilstar.server.bench.bench_file import read_bench_file
 
     file = read_bench_file(bench)
     check_files([bench], [output / name for name in OUTPUTS], file)
@@ -113,9 +113,9 @@ def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int],
 
 def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float, float] | None) -> list[str]:
     """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a place; what it found."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.study import outputs, rapp
-    from hilstar.study.fields import fields_of
+    from hilstar.instruments.study import outputs, rapp
+    from hilstar.instruments.study.fields import fields_of
+    from hilstar.server.bench.bench_file import read_bench_file
 
     file = read_bench_file(bench)
     names = rapp.BENCH_FILES if what == "models" else outputs.output_files(fields_of(place))
@@ -129,7 +129,7 @@ def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
     """Run a study; what it found, and whether everything was right (None: its times cannot be judged)."""
     make_directory(output)
-    study_of = import_module(f"hilstar.study.{what}{'.run' if what in ROOMS else ''}")
+    study_of = import_module(f"hilstar.instruments.study.{what}{'.run' if what in ROOMS else ''}")
     if what in TIMED:
         lines, right = study_of.run(output, quick)
         return lines, right

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.cli import options
-from hilstar.console.terminal import print_json, say
-from hilstar.errors import InputError
-from hilstar.process.interrupts import is_command, stop_on_signal
+from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
-    from hilstar.answers.answer import Answer
-    from hilstar.twin.live_exposure import LiveTracker, Solve
+    from hilstar.instruments.simulate.live_exposure import LiveTracker, Solve
+    from hilstar.server.answers.answer import Answer
 
 SOLVER_S = 10.0  # for a command
 NICE = 5
@@ -86,10 +86,10 @@ def tracker(
     import numpy as np
 
     from hilstar.attitude.wire.shown_frames import FrameWatch
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.twin.answer_link import FORMATS, AnswerLink
-    from hilstar.twin.live_exposure import LiveTracker
-    from hilstar.twin.tracker_process import Planted, TrackerProcess
+    from hilstar.instruments.simulate.answer_link import FORMATS, AnswerLink
+    from hilstar.instruments.simulate.live_exposure import LiveTracker
+    from hilstar.instruments.simulate.tracker_process import Planted, TrackerProcess
+    from hilstar.server.bench.bench_file import read_bench_file
 
     if form not in FORMATS:
         raise InputError(f"--format {form}: write {' or '.join(FORMATS)}")
@@ -154,7 +154,7 @@ def tell(told: dict[str, Any], as_json: bool) -> None:
 
 def parse_silent(text: str | None) -> tuple[float, float]:
     """Length and beginning, s, of --silent. Raises InputError."""
-    from hilstar.twin.tracker_process import SILENT_AFTER_S
+    from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S
 
     if text is None:
         return 0.0, SILENT_AFTER_S
@@ -204,10 +204,10 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
     """A campaign's solver of images: a command, or a function. Raises InputError."""
     import numpy as np
 
-    from hilstar.campaign.plan import Centroiding
-    from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
-    from hilstar.frame.view import View
-    from hilstar.twin.simulator import EXPOSURE_DTYPE, Exposure
+    from hilstar.instruments.campaign.plan import Centroiding
+    from hilstar.instruments.campaign.solvers import CENTROIDS, SolverFault, choose_solver
+    from hilstar.instruments.simulate.simulator import EXPOSURE_DTYPE, Exposure
+    from hilstar.optics.layers.view import View
 
     if text == CENTROIDS:
         raise InputError("--solver centroids: is a campaign's; write truth, which identifies its stars by the true attitude")

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
 from hilstar.cli.running import optional_scenario, say_units_of
-from hilstar.console.terminal import print_found, print_json, progress
-from hilstar.errors import InputError
-from hilstar.files import check_directory, make_directory
+from hilstar.server.console.terminal import print_found, print_json, progress
 
 if TYPE_CHECKING:
-    from hilstar.bench.bench_file import BenchFile as Bench
-    from hilstar.bench.bench_file import HeadsFile
-    from hilstar.twin.verify.verdict import Verdict
+    from hilstar.instruments.verify.verdict import Verdict
+    from hilstar.server.bench.bench_file import BenchFile as Bench
+    from hilstar.server.bench.bench_file import HeadsFile
 
 
 def verify(
@@ -35,10 +35,10 @@ def verify(
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
     import numpy as np
 
-    from hilstar.bench.bench_file import HeadsFile, read_bench_or_heads
-    from hilstar.twin.verify.proposals import check_writable
-    from hilstar.twin.verify.summary import summarise, summary_lines, write_report
-    from hilstar.twin.verify.summary import verify as run_twin
+    from hilstar.instruments.verify.proposals import check_writable
+    from hilstar.instruments.verify.summary import summarise, summary_lines, write_report
+    from hilstar.instruments.verify.summary import verify as run_twin
+    from hilstar.server.bench.bench_file import HeadsFile, read_bench_or_heads
 
     check_directory("-o", output)
     file = read_bench_or_heads(bench_file)
@@ -70,7 +70,7 @@ def verify(
 def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> None:
     import numpy as np
 
-    from hilstar.twin.heads import verify_heads
+    from hilstar.instruments.simulate.heads import verify_heads
 
     with progress("verifying", fields) as advance:
         pairs = [pair.summary() for pair in verify_heads(heads, fields, np.random.default_rng(seed), advance)]
@@ -90,7 +90,7 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
 
 def _proposed(file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool) -> dict[str, Any]:
     """The keys of --propose and --write in the JSON object; the lines are printed unless that is wanted."""
-    from hilstar.twin.verify.proposals import proposal_lines, propose, write_proposal
+    from hilstar.instruments.verify.proposals import proposal_lines, propose, write_proposal
 
     if verdict.passed:
         return {"proposal": None, "written": False}

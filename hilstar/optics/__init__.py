@@ -1,0 +1,1 @@
+"""Stars through a lens: cameras, PSFs, motion, glass and layers make the light of a frame."""

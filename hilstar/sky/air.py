@@ -12,11 +12,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.units import NS_PER_S, flux_ratio
 from hilstar.sky.electrons import Optics, Photometry, electron_response, reference_mean_w_m2_m
 from hilstar.sky.spectrum import DATA_DIR, Curve, integration_nodes, load_curve
 from hilstar.sky.stars import AirAbove, Stars, tell
-from hilstar.units import NS_PER_S, flux_ratio
 
 AIR_MASSES = np.array([0.0, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0])
 EXTINCTION, NIGHT_SKY = DATA_DIR / "extinction.csv", DATA_DIR / "night_sky.csv"

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
-from hilstar.errors import InputError, cannot_read, shortened
-from hilstar.reading import open_lines
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
+from hilstar.basics.errors import InputError, cannot_read, shortened
+from hilstar.basics.reading import open_lines
 
 HIPPARCOS_EPOCH_JYEAR = 1991.25
 PACKAGED_CATALOG = Path(__file__).resolve().parent / "data" / "hipparcos.npz"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 
 ZONES = Path(__file__).resolve().parent / "data" / "constellations.csv"
 # ICRS components into those of the mean equator and equinox B1875, in which the boundaries were drawn (Delporte 1930):

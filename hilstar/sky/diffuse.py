@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray
-from hilstar.errors import InputError, MachineError, cannot_read
-from hilstar.image_files import ImageSizeError, opened_fits, unpacked
-from hilstar.reading import read_bytes
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.errors import InputError, MachineError, cannot_read
+from hilstar.basics.image_files import ImageSizeError, opened_fits, unpacked
+from hilstar.basics.reading import read_bytes
 from hilstar.sky.electrons import VEGA_V0_W_M2_M
 
 MAP_ADVICE = "give a FITS image with a WCS, or a HEALPix map in FITS"

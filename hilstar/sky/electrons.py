@@ -19,8 +19,9 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import LIGHT_M_S, flux_ratio
 from hilstar.sky.spectrum import (
     PLANCK_J_S,
     STEFAN_BOLTZMANN_W_M2_K4,
@@ -30,7 +31,6 @@ from hilstar.sky.spectrum import (
     integration_nodes,
     load_curve,
 )
-from hilstar.units import LIGHT_M_S, flux_ratio
 
 VEGA_V0_W_M2_M = 3.631e-2  # Bessell 1998, A&A 333, 231, table A2: 3.631e-9 erg/s/cm2/A at 545 nm
 BOLOMETRIC_0_W_M2 = 2.518021002e-8  # IAU 2015 Resolution B2

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, PACKAGED_CATALOG, Catalog
 from hilstar.sky.stars import RAD_PER_MAS
 

@@ -11,12 +11,12 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import flux_ratio, magnitude
 from hilstar.sky import electrons
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
-from hilstar.units import flux_ratio, magnitude
 
 LETTERS = "OBAFGKM"
 TYPE = re.compile(rf"([{LETTERS}])(\d(?:\.\d)?)?(?:[/-]?([{LETTERS}]?)(\d(?:\.\d)?))?")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, did_you_mean, shortened
-from hilstar.reading import exists
-from hilstar.text_tables import Chosen, Column, TextTable, finite_numbers, open_table
-from hilstar.units import LIGHT_M_S, factor
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, did_you_mean, shortened
+from hilstar.basics.reading import exists
+from hilstar.basics.text_tables import Chosen, Column, TextTable, finite_numbers, open_table
+from hilstar.basics.units import LIGHT_M_S, factor
 
 PLANCK_J_S = 6.62607015e-34  # SI 2019, exact
 BOLTZMANN_J_K = 1.380649e-23

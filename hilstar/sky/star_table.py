@@ -26,14 +26,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.errors import HilstarError, InputError
-from hilstar.files import make_directory, whole_file
-from hilstar.reading import open_regular
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import HilstarError, InputError
+from hilstar.basics.files import make_directory, whole_file
+from hilstar.basics.reading import open_regular
+from hilstar.basics.units import plain_unit
 from hilstar.sky import table_reader
 from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
-from hilstar.units import plain_unit
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
 EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.units import LIGHT_KM_S
 from hilstar.sky.catalog import Catalog
-from hilstar.units import LIGHT_KM_S
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
 from hilstar.sky import electrons
 from hilstar.sky.spectral_types import bare_and_dusty, fit_types
 from hilstar.sky.spectrum import (
@@ -19,7 +20,6 @@ from hilstar.sky.spectrum import (
     read_curve_csv,
     torres2010_k,
 )
-from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
 
 # F_lambda of magnitude 0, W/m2/m: Bessell, Castelli and Plez 1998, A&A 333, 231, table A2 (thesis table 2.5).
 ZERO_W_M2_M = {"u": 4.175e-2, "b": 6.32e-2, "v": electrons.VEGA_V0_W_M2_M, "r": 2.177e-2, "i": 1.126e-2}

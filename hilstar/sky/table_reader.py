@@ -20,13 +20,13 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial.polynomial import polyval
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, cannot_read, shortened
-from hilstar.image_files import ImageSizeError, is_fits, unpacked
-from hilstar.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, read_bytes, size_text
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, cannot_read, shortened
+from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
+from hilstar.basics.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, read_bytes, size_text
+from hilstar.basics.text_tables import TextTable, open_table
+from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.sky.catalog import load_catalog
-from hilstar.text_tables import TextTable, open_table
-from hilstar.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 
 # BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
 # appendix C, with the sign of the erratum (2006, AJ 131, 2360). For -0.25 < BT - VT < 2; beyond, the offsets of the ends.

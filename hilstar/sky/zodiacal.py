@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import BoolArray, FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.sky.electrons import SUN_TEMPERATURE_K, Optics, electron_response
 from hilstar.sky.spectrum import DATA_DIR, blackbody_exitance_w_m2_m, read_curve_csv
 

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray, IntArray
 
 Kind = Literal["moment", "window", "wide", "fit", "box3", "box5"]
 Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian

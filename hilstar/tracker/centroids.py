@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.errors import InputError
-from hilstar.units import MAD_TO_SIGMA
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import MAD_TO_SIGMA
 
 Window = Literal["gaussian", "plain"]
 BoolArray = npt.NDArray[np.bool_]

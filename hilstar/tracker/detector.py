@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.errors import InputError
 from hilstar.tracker.frame_noise import Word64Array, draw_blocks, normal_pairs, poisson
 from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_value
 

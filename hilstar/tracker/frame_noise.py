@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, IntArray
+from hilstar.basics.arrays import Float32Array, IntArray
 
 Word64Array = npt.NDArray[np.int64]
 

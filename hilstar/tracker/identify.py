@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.errors import InputError
-from hilstar.rotation import from_matrix, normalise, to_matrix
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_matrix, normalise, to_matrix
 
 MIN_STARS = 4  # identified, for an answer: three confirm a fourth
 MIN_SHARE = 0.5  # part of the stars found that have to be the catalogue's

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.tracker.settings import DetectorSettings
 
 CHANNELS = "rgb"

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 
 VARIANCE_DN2 = 1 / 12  # of the reading of a level that noise spreads over the steps, beside that noise
 STEP_PHASES = 16  # places of a dark level between two steps

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018
 ELECTRON_C = 1.602176634e-19

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import magnitude
 from hilstar.tracker.centroiders import BOX_SHARE, FAMILY, Centroider, Pixels, Sigma, brightest, star_places
-from hilstar.units import magnitude
 
 SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
 REACH_SIGMAS = 5.0

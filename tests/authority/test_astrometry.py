@@ -10,11 +10,11 @@ from astropy.coordinates import SkyCoord
 from astropy.time import Time
 from astropy.wcs import WCS
 
-from hilstar.bench.frame_files import world_coordinates
-from hilstar.rotation import from_radec_roll_deg, to_matrix
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.basics.units import LIGHT_KM_S
+from hilstar.server.bench.frame_files import world_coordinates
 from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
 from hilstar.sky.stars import aberrate, unit_vectors_icrs
-from hilstar.units import LIGHT_KM_S
 
 MAS = np.pi / (180 * 3600 * 1000)
 ARCSEC = 1000 * MAS

@@ -6,12 +6,12 @@ import erfa
 import numpy as np
 import pytest
 
+from hilstar.basics.units import flux_ratio
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.facts import MOTION, facts_of, motion_at
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from hilstar.sky.synthetic import ab_electrons_per_s, colours, vega_electrons_per_s
-from hilstar.units import flux_ratio
 
 EPOCHS_JYEAR = (1950.0, 2000.0, 2026.0)
 STARS = 300

@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import norm
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
 from hilstar.tracker.centroids import CentroidSettings, LocalBackground, estimate_background, find_stars, s_curves
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings

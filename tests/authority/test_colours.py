@@ -9,10 +9,10 @@ import pytest
 from scipy.integrate import trapezoid
 
 from hilstar import load
-from hilstar.optics.psf_file import Stack, glass_of, write_glass
+from hilstar.optics.glass.psf_file import Stack, glass_of, write_glass
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
-from tests.unit.monitor.test_primaries import NM, PANELS, bump, written
+from tests.unit.display.test_primaries import NM, PANELS, bump, written
 
 GRID_NM = np.arange(350.0, 1000.01, 0.5)
 SENSOR_NM = np.arange(350.0, 1001.0, 10.0)

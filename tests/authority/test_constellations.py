@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from astropy.coordinates import SkyCoord, get_constellation
 
-from hilstar.rotation import direction_of
+from hilstar.basics.rotation import direction_of
 from hilstar.sky.constellations import constellation_of
 
 PLACES = 3000

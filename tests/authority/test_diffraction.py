@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from hilstar.errors import InputError
-from hilstar.optics.glass_psf import NodeSpline, glass_psf
-from hilstar.optics.psf_file import glass_of
-from hilstar.optics.zernike import Pupil, PupilField, Term, diffracted, psf_of
+from hilstar.basics.errors import InputError
+from hilstar.optics.glass.glass_psf import NodeSpline, glass_psf
+from hilstar.optics.glass.psf_file import glass_of
+from hilstar.optics.glass.zernike import Pupil, PupilField, Term, diffracted, psf_of
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 
 poppy = pytest.importorskip("poppy")

@@ -13,14 +13,14 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import open_bench, star_rates
-from hilstar.errors import InputError
-from hilstar.frame.diffuse import DiffuseLayer
-from hilstar.rotation import direction_of, from_radec_roll_deg, to_matrix
-from hilstar.scene.extended import LightMap
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import direction_of, from_radec_roll_deg, to_matrix
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.extended import LightMap
+from hilstar.optics.layers.diffuse import DiffuseLayer
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench, star_rates
 from hilstar.sky.diffuse import read_diffuse_map
-from hilstar.twin.simulator import Simulator
 from tests.support.benches import SMALL_BENCH
 
 RA_DEG, DEC_DEG, RADIUS_DEG, V_MAG_ARCSEC2 = 84.057, -1.2, 2.0, 18.0

@@ -21,8 +21,8 @@ from hilstar.attitude.logs.earth import (
     q_icrs_to_ned,
     utc_ns_of,
 )
-from hilstar.errors import InputError
-from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 
 MAS = np.radians(1 / 3.6e6)
 # Astropy interpolates the same table: s' (0.01 mas), the hour's interpolation and the rounding of a Time are left.

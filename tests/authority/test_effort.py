@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.bench.build import load
-from hilstar.scene.sprites import pack_sprites
+from hilstar.optics.sprites import pack_sprites
+from hilstar.server.bench.build import load
 from tests.support.benches import bench_text
 
 SIZE_PX, STEP_PX, HALF_PX = (960, 540), 30, 12

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import direction_of
-from hilstar.scene.camera import Camera
+from hilstar.basics.rotation import direction_of
+from hilstar.instruments.study import stability
+from hilstar.instruments.study.stability import recorded
+from hilstar.optics.camera import Camera
 from hilstar.sky.electrons import tabulate
-from hilstar.study import stability
-from hilstar.study.stability import recorded
 from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETECTOR_AND_ATTITUDE, field, sky
 
 CASES = (*CATALOGUE_AND_GEOMETRY, *DETECTOR_AND_ATTITUDE)

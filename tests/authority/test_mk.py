@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import bench_stars
+from hilstar.basics.units import magnitude
+from hilstar.instruments.study.settings import held_out_by_type, held_out_errors
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import bench_stars
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import VEGA_V0_W_M2_M, Photometry, band_mean, library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectral_types import bare_and_dusty, fit_types, read_types, star_types, tabulate_types
 from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
 from hilstar.sky.synthetic import ZERO_W_M2_M
-from hilstar.study.settings import held_out_by_type, held_out_errors
-from hilstar.units import magnitude
 from tests.authority.test_pickles import BARE, REDDEST_VI_MAG, SENSORS
 from tests.support.benches import bench_text
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
 

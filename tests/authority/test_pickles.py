@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import (
     MAX_BV_FIT_VI_MAG,

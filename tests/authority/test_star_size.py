@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.bench.bench_file import bench_file_of
-from hilstar.bench.cameras import bench_camera
-from hilstar.bench.star_size import star_size
+from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.cameras import bench_camera
+from hilstar.server.bench.star_size import star_size
 from tests.support.benches import ROOT, bench_text
 
 SPRITE_PX = 0.85
 STEPS_A_PX = 200  # of the grid: the midpoint rule is off by a 24th of its squared step times curvatures of under 10 / px^2
 GRID_ERROR = 1e-4
-# `square_points` stands for the squares: Gaussians that ripple by 1e-3 (hilstar/scene/psf.py).
+# `square_points` stands for the squares: Gaussians that ripple by 1e-3 (hilstar/optics/psf.py).
 POINTS_ERROR = 2e-3
 NEWCOMER = bench_text(
     {

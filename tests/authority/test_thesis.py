@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.resources import resource_path
-from hilstar.scene.psf import GaussianPsf
+from hilstar.basics.resources import resource_path
+from hilstar.basics.units import flux_ratio
+from hilstar.instruments.study.rapp import rapp_ratios
+from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, v_band_mean_w_m2_m
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectrum import DATA_DIR, Curve, blackbody_exitance_w_m2_m, load_curve, read_curve_csv
 from hilstar.sky.synthetic import curve_mean, vega, vega_electrons_per_s
-from hilstar.study.rapp import rapp_ratios
 from hilstar.tracker.settings import DetectorSettings
-from hilstar.units import flux_ratio
 
 PRINTED = 0.006  # half of the last digit of a figure with two decimals, and rounding
 # Table 2.3: medians of stars to V = 9, mas and mas/yr; there to Hp = 9, which is 0.1 mag off, and moves them by 0.02.

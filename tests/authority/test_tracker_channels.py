@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import bench_channels, bench_stars
-from hilstar.monitor.primaries import reddest_nm
+from hilstar.display.primaries import reddest_nm
+from hilstar.instruments.simulate.budget import red_shares
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import bench_channels, bench_stars
 from hilstar.sky.spectrum import DATA_DIR, Curve
-from hilstar.twin.budget import red_shares
-from hilstar.twin.simulator import Simulator
 from tests.authority.integrals import read
 from tests.support.benches import ORION_Q, bench_text
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.constants import c, h, k
 from scipy.integrate import quad
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.render.reference import linear_image
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.exposure_motion import smeared_sprites
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.display.render.reference import linear_image
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.exposure_motion import smeared_sprites
+from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.spectrum import Curve
-from hilstar.twin.simulator import Simulator
 from tests.authority.integrals import read, v_mean
 from tests.support.benches import ROOT, SMALL_BENCH
 

@@ -12,15 +12,15 @@ from astropy.time import Time
 from astropy.utils import iers
 from astropy.wcs import WCS
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import bench_optics
-from hilstar.bench.cameras import tracker_camera
-from hilstar.errors import InputError
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import bench_optics
+from hilstar.server.bench.cameras import tracker_camera
 from hilstar.sky.electrons import VEGA_V0_W_M2_M, Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.spectrum import Curve, load_curve
 from hilstar.sky.zodiacal import FAR_SLOPES, NEAR_SLOPES, Sunward, ZodiacalLight, relative_spectrum, sunward, tabled_light
-from hilstar.twin.simulator import Simulator, TrackerBackground
 from tests.authority.integrals import integral, read, v_mean
 from tests.support.benches import SMALL_BENCH
 

@@ -30,12 +30,12 @@ import numpy as np
 import zmq
 
 from hilstar.attitude.wire.packet import AttitudeSample, encode
-from hilstar.bench.build import load
-from hilstar.process.scheduling import PromptWhileLight
-from hilstar.run.loop import Limit
-from hilstar.run.open_link import open_link
-from hilstar.run.record.ledger import LedgerSwitch
-from hilstar.run.serve import Outlet, serve
+from hilstar.basics.process.scheduling import PromptWhileLight
+from hilstar.server.bench.build import load
+from hilstar.server.loop import Limit
+from hilstar.server.open_link import open_link
+from hilstar.server.record.ledger import LedgerSwitch
+from hilstar.server.serve import Outlet, serve
 from tests.support.benches import ROOT
 
 RATE_HZ = 100

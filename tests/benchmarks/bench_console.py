@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.run.record.ledger_records import FrameRecord, frame_records
+from hilstar.server.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import attitude_table, bench_text
 from tests.support.pages import PageAddress, children, live, page_of
 from tests.support.senders import connected, free_port, talking
@@ -117,7 +117,7 @@ def measure(screen: Screen, folder: Path, seconds: float) -> tuple[list[FrameRec
     ) as process:
         served = Served(process, port)
         page = page_of(served)
-        pids = (process.pid, children(process.pid, "hilstar.console.server")[0])
+        pids = (process.pid, children(process.pid, "hilstar.server.console.server")[0])
         with connected(port) as sender, talking(sender, 100.0):
             time.sleep(3.0)
             while len(turns) < len(KINDS) * max(round(seconds / TURN_S), 1):

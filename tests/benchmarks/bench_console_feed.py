@@ -10,11 +10,11 @@ import numpy as np
 import hilstar
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
-from hilstar.console.messages import PictureRequest, SharedMemory
-from hilstar.console.publisher import FramePublisher
-from hilstar.resources import resource_path
-from hilstar.run.pacer import Shown
-from hilstar.run.summary import RunTally
+from hilstar.basics.resources import resource_path
+from hilstar.server.console.messages import PictureRequest, SharedMemory
+from hilstar.server.console.publisher import FramePublisher
+from hilstar.server.pacer import Shown
+from hilstar.server.summary import RunTally
 from tests.support.benches import ORION_Q
 
 FRAMES, PICTURES = 20_000, 300

@@ -9,8 +9,8 @@ import argparse
 
 import numpy as np
 
-from hilstar.study.speed.benchmark import BenchmarkPlan, run
-from hilstar.study.speed.report import REFERENCE_PX, lines
+from hilstar.instruments.study.speed.benchmark import BenchmarkPlan, run
+from hilstar.instruments.study.speed.report import REFERENCE_PX, lines
 
 
 def main() -> None:

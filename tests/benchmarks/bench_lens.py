@@ -14,13 +14,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.bench.build import open_bench
-from hilstar.bench.frame import Bench
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.camera import Lens, ResidualField, bounded
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file, scene
-from hilstar.study.speed.report import REFERENCE_PX
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file, scene
+from hilstar.instruments.study.speed.report import REFERENCE_PX
+from hilstar.optics.camera import Lens, ResidualField, bounded
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.frame import Bench
 
 DEGREE, TERMS = 6, 28
 MARGIN_PX = 10.0

@@ -12,10 +12,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.bench.build import open_bench
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file, scene
-from hilstar.study.speed.report import REFERENCE_PX
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file, scene
+from hilstar.instruments.study.speed.report import REFERENCE_PX
+from hilstar.server.bench.build import open_bench
 
 RATES_RAD_S = (0.0, 0.002, 0.0087, 0.035, 0.1, 0.35, 1.0, 10.0, 57.0, 900.0, 1e6)
 

@@ -22,14 +22,14 @@ from unittest.mock import patch
 import numpy as np
 
 from hilstar.attitude.wire.packet import AttitudeSample, encode
-from hilstar.bench.build import open_bench
-from hilstar.charts import write_csv
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.run.record.report import figures_of
-from hilstar.study.speed.benchmark import FRESH, RADEC_ROLL_DEG, own_bench_file, scene
-from hilstar.study.speed.tracker import tracker_rows
+from hilstar.basics.charts import write_csv
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.study.speed.benchmark import FRESH, RADEC_ROLL_DEG, own_bench_file, scene
+from hilstar.instruments.study.speed.tracker import tracker_rows
+from hilstar.server.bench.build import open_bench
+from hilstar.server.record.ledger import Ledger
+from hilstar.server.record.ledger_records import FrameRecord
+from hilstar.server.record.report import figures_of
 from tests.support.benches import ROOT
 
 HILSTAR = (sys.executable, "-m", "hilstar")
@@ -101,7 +101,7 @@ def write_ledger(path: Path, seconds: float) -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         open_bench(own_bench_file(Path(folder) / "bench.toml", FULL_HD)) as bench,
-        patch("hilstar.run.record.ledger.time", clock),
+        patch("hilstar.server.record.ledger.time", clock),
         StepLedger(path, bench) as ledger,
     ):
         for k, (late_ns, age_ns) in enumerate(noise_ns):

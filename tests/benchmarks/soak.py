@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from mcap.reader import make_reader
 
-from hilstar.run.record.ledger_records import ProcessRecord, run_records
+from hilstar.server.record.ledger_records import ProcessRecord, run_records
 from tests.support.benches import ROOT
 
 HILSTAR = (sys.executable, "-m", "hilstar")

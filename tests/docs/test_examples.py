@@ -16,11 +16,11 @@ from typing import Any
 
 import pytest
 
-from hilstar.bench.config import read_config
-from hilstar.bench.scenario import parse_scenario
-from hilstar.campaign.plan import parse_plan
 from hilstar.cli.app import run
 from hilstar.cli.options import with_values
+from hilstar.instruments.campaign.plan import parse_plan
+from hilstar.server.bench.config import read_config
+from hilstar.server.bench.scenario import parse_scenario
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.forks import Started

@@ -14,7 +14,7 @@ import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.rotation import propagate
+from hilstar.basics.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.servers import interrupted, listening
 from tests.support.waiting import PATIENCE_S

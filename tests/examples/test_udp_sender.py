@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, decode
-from hilstar.rotation import propagate
+from hilstar.basics.rotation import propagate
 from tests.examples.support import commands
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 
 GOLDEN = Path(__file__).with_name("belt.png")
 # Another driver's erf may put a pixel that stands at a threshold on its other side: one code.

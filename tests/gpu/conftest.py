@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.render.context import gpus
-from hilstar.render.star_passes import LightUnits
+from hilstar.display.render.context import gpus
+from hilstar.display.render.star_passes import LightUnits
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def on_llvmpipe() -> None:
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are rasterised and blended."""
-    monkeypatch.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
+    monkeypatch.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
 
 
 @pytest.fixture

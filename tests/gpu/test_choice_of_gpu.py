@@ -7,9 +7,9 @@ import os
 
 import pytest
 
-from hilstar.bench.build import load
-from hilstar.errors import MachineError
-from hilstar.render.context import create_context, gpus
+from hilstar.basics.errors import MachineError
+from hilstar.display.render.context import create_context, gpus
+from hilstar.server.bench.build import load
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 

@@ -13,7 +13,7 @@ LOOK = """
 import json, os, time
 from pathlib import Path
 {before}
-from hilstar.render.context import create_context
+from hilstar.display.render.context import create_context
 create_context()
 def tasks():
     found = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != os.getpid()]
@@ -28,7 +28,7 @@ print(json.dumps(tasks()))
 """
 # On a busy machine a thread that has begun has no name of its own for some time: here for the first fifty looks at it.
 NAMED_LATE = """
-from hilstar.process import scheduling as cores
+from hilstar.basics.process import scheduling as cores
 threads, looks = cores._threads, iter(range(10**9))
 cores._threads = lambda: {each: name if next(looks) > 50 * len(threads()) else "python" for each, name in threads().items()}
 """

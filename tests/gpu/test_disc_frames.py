@@ -10,28 +10,28 @@ import numpy as np
 import pytest
 from skyfield.api import Star
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import load
-from hilstar.bench.frame import Bench
-from hilstar.frame.bodies import BodyLayer
-from hilstar.frame.layers import light_of, sky_layers
-from hilstar.frame.truth import brightest_in_view
-from hilstar.frame.view import Canvas, View
-from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.disc_tiles import disc_tiles
-from hilstar.render.extended import ExtendedLayer
-from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.camera import Camera, Lens
-from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
-from hilstar.scene.frame_motion import Scan
-from hilstar.scene.psf import GaussianPsf
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.display.quantise import dither_levels, mask_turn, round_levels
+from hilstar.display.render.backend import Target
+from hilstar.display.render.disc_tiles import disc_tiles
+from hilstar.display.render.extended import ExtendedLayer
+from hilstar.display.render.reference import linear_image
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import srgb_response
+from hilstar.instruments.simulate.twin import Twin
+from hilstar.instruments.verify.measure import Comparison
+from hilstar.optics.camera import Camera, Lens
+from hilstar.optics.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
+from hilstar.optics.frame_motion import Scan
+from hilstar.optics.layers.bodies import BodyLayer
+from hilstar.optics.layers.layers import light_of, sky_layers
+from hilstar.optics.layers.truth import brightest_in_view
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import load
+from hilstar.server.bench.frame import Bench
 from hilstar.sky.bodies.disc import Disc
-from hilstar.twin.verify.measure import Comparison
-from hilstar.twin.verify.twin import Twin
 from tests.support.benches import TWIN, bench_text
 from tests.support.skies import skyfield
 from tests.support.stars import sprites_at

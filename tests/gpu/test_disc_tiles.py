@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import hilstar.render.extended as layer
-from hilstar.monitor.quantise import dither_levels, round_levels
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
-from hilstar.render.renderer import Renderer
-from hilstar.scene.camera import Camera, Lens
-from hilstar.scene.extended import DiscLight, Shear
-from hilstar.scene.psf import GaussianPsf
+import hilstar.display.render.extended as layer
+from hilstar.display.quantise import dither_levels, round_levels
+from hilstar.display.render.backend import Target
+from hilstar.display.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import srgb_response
+from hilstar.optics.camera import Camera, Lens
+from hilstar.optics.extended import DiscLight, Shear
+from hilstar.optics.psf import GaussianPsf
 from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.stars import sprites_at

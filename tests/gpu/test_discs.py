@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from hilstar.render.backend import Target
-from hilstar.render.renderer import Renderer
-from hilstar.scene.camera import Camera, Lens
-from hilstar.scene.extended import DiscView, LightMap, Pose, disc_lights
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.optics.camera import Camera, Lens
+from hilstar.optics.extended import DiscView, LightMap, Pose, disc_lights
+from hilstar.optics.psf import GaussianPsf
 from hilstar.sky.bodies.disc import Air, Disc
 from tests.support.ray_traced.bodies import Body, lambert, limb, lunar_lambert
 from tests.support.ray_traced.image import edge_px, spread_image

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.assess.bench_effects import display_errors
-from hilstar.bench.bench_file import bench_file_of
-from hilstar.rotation import from_radec_roll_deg, from_rotation_vector
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.assess.bench_effects import display_errors
+from hilstar.server.bench.bench_file import bench_file_of
 from tests.support.benches import TWIN, bench_text
 
 TURN_ARCSEC = np.array([60.0, -40.0, 200.0])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.monitor.response import gamma_response
-from hilstar.render.backend import Target
-from hilstar.render.context import create_context
-from hilstar.render.driver import Driver
-from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.render.backend import Target
+from hilstar.display.render.context import create_context
+from hilstar.display.render.driver import Driver
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import gamma_response
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 NO_SUCH_CAPABILITY = 0x1234

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.render.backend import Target
-from hilstar.render.renderer import Renderer
-from hilstar.scene.camera import Camera
-from hilstar.scene.extended import DiscView, Pose, disc_lights
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import DiscView, Pose, disc_lights
+from hilstar.optics.psf import GaussianPsf
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.ray_traced.bodies import Body, lambert, limb

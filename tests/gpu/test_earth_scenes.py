@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hilstar.bench.build import load
-from hilstar.bench.frame import Bench
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.server.bench.build import load
+from hilstar.server.bench.frame import Bench
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, POLAR_KM
 from tests.support.benches import bench_text
 from tests.support.ray_traced.bodies import Body, lambert, traced

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import shown_light
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import pack_sprites
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.quantise import shown_light
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import srgb_response
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
 from tests.support.exact_scenes import (
     FRAMES,
     NARROW,

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels, shown_light
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.renderer import Renderer
-from hilstar.scene.camera import Camera, Lens
-from hilstar.scene.extended import GlowLight, LightMap
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.quantise import dither_levels, mask_turn, round_levels, shown_light
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import srgb_response
+from hilstar.optics.camera import Camera, Lens
+from hilstar.optics.extended import GlowLight, LightMap
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6

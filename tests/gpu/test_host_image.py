@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.render import context, host_image
-from hilstar.render.backend import Target
-from hilstar.render.renderer import Renderer
-from hilstar.render.variants import SplatVariant, VariantRenderer
-from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.render import context, host_image
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.variants import SplatVariant, VariantRenderer
+from hilstar.optics.extended import LightMap
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA = (256, 192), (0.85, 0.85)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame, frame_parts, read_frame
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import open_bench
-from hilstar.campaign.display_tracker import DisplayTracker
-from hilstar.frame.view import View
-from hilstar.rotation import normalise
-from hilstar.run.frame_feed import lit_pixels
-from hilstar.twin.live_exposure import LiveTracker
+from hilstar.basics.rotation import normalise
+from hilstar.instruments.campaign.display_tracker import DisplayTracker
+from hilstar.instruments.simulate.live_exposure import LiveTracker
+from hilstar.optics.layers.view import View
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
+from hilstar.server.frame_feed import lit_pixels
 from tests.support.benches import ORION_Q, TWIN, bench_text
 
 ORION = normalise(np.array(ORION_Q))

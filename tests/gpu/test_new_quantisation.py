@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.arrays import Float32Array
-from hilstar.bench.config import RenderSettings
-from hilstar.bench.effort import Light, plan_effort
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.footprints import PixelOrder
-from hilstar.monitor.quantise import Panel, PixelQuantiser, level_dtype
-from hilstar.monitor.quantisers import QUANTISERS
-from hilstar.monitor.response import Levels, srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.numpy_backend import NumpyBackend
-from hilstar.render.renderer import Renderer
-from hilstar.run.replay import OTHER_CODES_BY_NUMPY
-from hilstar.scene.psf import GaussianPsf
+from hilstar.basics.arrays import Float32Array
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.footprints import PixelOrder
+from hilstar.display.quantise import Panel, PixelQuantiser, level_dtype
+from hilstar.display.quantisers import QUANTISERS
+from hilstar.display.render.backend import Target
+from hilstar.display.render.numpy_backend import NumpyBackend
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import Levels, srgb_response
+from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.config import RenderSettings
+from hilstar.server.bench.effort import Light, plan_effort
+from hilstar.server.replay import OTHER_CODES_BY_NUMPY
 from tests.support.stars import sprites_at
 
 SIZE = (256, 192)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import hilstar
-from hilstar.monitor.quantise import shown_light
-from hilstar.render.numpy_backend import NumpyBackend
-from hilstar.units import NS_PER_S
+from hilstar.basics.units import NS_PER_S
+from hilstar.display.quantise import shown_light
+from hilstar.display.render.numpy_backend import NumpyBackend
 from tools import same_codes
 
 EVERY, FRAMES = 4, 3  # of a log of ten attitudes: of bodies one before each of three

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, dither_levels, round_levels, shown_light, turned_mask
-from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.encoder import CUT_WINGS
-from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import GaussianPsf
+from hilstar.basics.errors import InputError
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.quantise import Panel, dither_levels, round_levels, shown_light, turned_mask
+from hilstar.display.render.backend import Target
+from hilstar.display.render.encoder import CUT_WINGS
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import bit_stealing_response, gamma_response, srgb_response
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE = (256, 192)
@@ -230,7 +230,7 @@ def block_sums(image, side=16):
 
 
 def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
-    monkeypatch.setattr("hilstar.monitor.exact.COMPUTE_VERSION", 999)
+    monkeypatch.setattr("hilstar.display.exact.COMPUTE_VERSION", 999)
     target = target_of(RESPONSES["srgb8"], "exact")
     with Renderer(target) as gl:
         for count in (300, 20):

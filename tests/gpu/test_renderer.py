@@ -8,14 +8,14 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError, MachineError
-from hilstar.monitor.response import encode, srgb_response
-from hilstar.render import context as context_module
-from hilstar.render.backend import Target
-from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import MAX_CUT, GaussianPsf
-from hilstar.scene.sprites import Sprites
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.display.render import context as context_module
+from hilstar.display.render.backend import Target
+from hilstar.display.render.reference import linear_image
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import encode, srgb_response
+from hilstar.optics.psf import MAX_CUT, GaussianPsf
+from hilstar.optics.sprites import Sprites
 from tests.support.stars import sprites_at
 
 # The limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut (1e-6) the most of both.

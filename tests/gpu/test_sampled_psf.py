@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.numpy_backend import NumpyBackend
-from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import SampledPsf
+from hilstar.display.render.backend import Target
+from hilstar.display.render.numpy_backend import NumpyBackend
+from hilstar.display.render.reference import linear_image
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import srgb_response
+from hilstar.optics.psf import SampledPsf
 from tests.support.psfs import airy, coma, sampled
 from tests.support.stars import sprites_at
 

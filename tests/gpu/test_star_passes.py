@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.monitor.quantise import round_levels
-from hilstar.monitor.response import gamma_response, srgb_response
-from hilstar.render.backend import SpriteSide, Target
-from hilstar.render.renderer import Renderer
-from hilstar.render.star_passes import MAX_UNIT, WINGS
-from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import GaussianPsf, pixel_shares
+from hilstar.display.quantise import round_levels
+from hilstar.display.render.backend import SpriteSide, Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.star_passes import MAX_UNIT, WINGS
+from hilstar.display.response import gamma_response, srgb_response
+from hilstar.optics.extended import LightMap
+from hilstar.optics.psf import GaussianPsf, pixel_shares
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.monitor.quantise import Panel, shown_light
-from hilstar.monitor.response import gamma_response, srgb_response, table_response
-from hilstar.monitor.temporal import TemporalQuantiser
-from hilstar.render.backend import Target
-from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer
-from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import pack_sprites
+from hilstar.display.quantise import Panel, shown_light
+from hilstar.display.render.backend import Target
+from hilstar.display.render.reference import linear_image
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import gamma_response, srgb_response, table_response
+from hilstar.display.temporal import TemporalQuantiser
+from hilstar.optics.extended import LightMap
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px
 
 WHITE = 1e6
@@ -24,7 +24,7 @@ TILE, SIDE = 22, 12
 SIZE = (TILE * SIDE, TILE * SIDE)
 SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / GaussianPsf(SIGMA).peak_share
 FRAMES = 6
-AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/monitor/test_temporal.py
+AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/display/test_temporal.py
 # The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
 OTHER_PIXELS = 0.03
 LEFT = 0.02
@@ -94,7 +94,7 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
 
 
 def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
-    monkeypatch.setattr("hilstar.monitor.exact.COMPUTE_VERSION", 999)
+    monkeypatch.setattr("hilstar.display.exact.COMPUTE_VERSION", 999)
     target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), WHITE, "temporal")
     oracle, sprites = TemporalQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)), stars(*places(), SIX_MAG)
     with Renderer(target) as gl:

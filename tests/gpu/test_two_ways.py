@@ -11,20 +11,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.bench.build import load
-from hilstar.monitor.quantise import Panel
-from hilstar.monitor.quantisers import QUANTISERS
-from hilstar.monitor.response import gamma_response, srgb_response
-from hilstar.notices import Notices
-from hilstar.render.backend import SpriteSide, Target
-from hilstar.render.context import computes_in_software
-from hilstar.render.renderer import Renderer
-from hilstar.run.record.ledger import Ledger, LedgerSwitch
-from hilstar.run.replay import DrawnBy, Wanted, plan_play, replay
-from hilstar.run.serve import Outlet
-from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.basics.notices import Notices
+from hilstar.display.quantise import Panel
+from hilstar.display.quantisers import QUANTISERS
+from hilstar.display.render.backend import SpriteSide, Target
+from hilstar.display.render.context import computes_in_software
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import gamma_response, srgb_response
+from hilstar.optics.extended import LightMap
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.server.bench.build import load
+from hilstar.server.record.ledger import Ledger, LedgerSwitch
+from hilstar.server.replay import DrawnBy, Wanted, plan_play, replay
+from hilstar.server.serve import Outlet
 from tests.support.benches import bench_text
 from tests.support.waiting import PATIENCE_S
 
@@ -65,7 +65,7 @@ def both_ways(target: Target, frames: list[Sprites], monkeypatch) -> tuple[list[
         assert gl.path == "compute shaders"
     star_by_star = drawn(target, frames)
     with monkeypatch.context() as patched:
-        patched.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
+        patched.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
         with Renderer(target) as gl:
             assert gl.path.startswith("points")
         return star_by_star, drawn(target, frames)
@@ -187,7 +187,7 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     assert all(np.array_equal(first[number], again[number]) for number in first)
     if before.path != "compute shaders":
         pytest.skip(f"{before} draws one way only")
-    monkeypatch.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
+    monkeypatch.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
     by_points, told, now = replayed(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
     assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes
@@ -201,8 +201,8 @@ ZINK = {"MESA_LOADER_DRIVER_OVERRIDE": "zink", "LIBGL_ALWAYS_SOFTWARE": "1"}  # 
 DRAW = """
 import sys
 import hilstar, numpy as np
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.psf import GaussianPsf
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.optics.psf import GaussianPsf
 found = {}
 for codes in sys.argv[2:]:
     with hilstar.load(f"{codes}.toml") as bench:

@@ -16,7 +16,7 @@ from tests.support.waiting import PATIENCE_S
 
 LOOK = """
 import hilstar, json, pathlib, sys
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 found = {}
 for codes in ("round", "dither", "exact", "temporal", "auto"):
     pathlib.Path("bench.toml").write_text(sys.argv[1] + f'\\n[render]\\nquantisation = "{codes}"\\n')
@@ -57,11 +57,11 @@ APART = """
 import json
 import numpy as np
 from dataclasses import replace
-from hilstar.monitor.quantise import Panel
-from hilstar.monitor.response import srgb_response
-from hilstar.render.backend import Target
-from hilstar.render.numpy_backend import NumpyBackend, headless_context, open_backend
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.quantise import Panel
+from hilstar.display.response import srgb_response
+from hilstar.display.render.backend import Target
+from hilstar.display.render.numpy_backend import NumpyBackend, headless_context, open_backend
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 rng, psf, grey = np.random.default_rng(36), GaussianPsf((0.85, 0.85)), srgb_response(8)
 places = np.stack(np.meshgrid(np.arange(12, 308, 24), np.arange(12, 230, 24)), -1).reshape(-1, 2)

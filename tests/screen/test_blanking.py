@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.monitor.window.awake import _Server
+from hilstar.display.window.awake import _Server
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for

@@ -11,8 +11,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.image_sources import Pattern, PatternDisplay
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern, PatternDisplay
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import run_hilstar

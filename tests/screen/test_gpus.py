@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.render.context import gpus
+from hilstar.display.render.context import gpus
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
 from tests.support.ledgers import read_run

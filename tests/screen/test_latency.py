@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.calibrate.latency import Edges, read_edges, save_edges
-from hilstar.run.screen.screen import CODE, CODE_BITS, marker_light
+from hilstar.instruments.calibrate.latency import Edges, read_edges, save_edges
+from hilstar.server.screen.screen import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilstar.console.run_status import RunSource, RunStatus
-from hilstar.monitor.calibration import CalibrationHead, NotesTable, write_calibration
-from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, monitor_camera, write_geometry
-from hilstar.monitor.identity import MonitorIdentity
-from hilstar.monitor.response import gamma_response
-from hilstar.monitor.window.this_monitor import edid_of_drm, identity_here
-from hilstar.run.record.ledger_records import EventRecord, run_records
+from hilstar.display.calibration import CalibrationHead, NotesTable, write_calibration
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, monitor_camera, write_geometry
+from hilstar.display.identity import MonitorIdentity
+from hilstar.display.response import gamma_response
+from hilstar.display.window.this_monitor import edid_of_drm, identity_here
+from hilstar.server.console.run_status import RunSource, RunStatus
+from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import bench
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
@@ -27,7 +27,7 @@ from tests.support.ledgers import read_run
 from tests.support.pages import ADDRESS, PageAddress
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.xorg import Xorg
-from tests.unit.run.test_machine_row import edid
+from tests.unit.server.test_machine_row import edid
 
 TODAY = datetime.datetime.now(datetime.UTC).date()
 NAMED = 'display = "DUMMY0"\ncalibration = "response.toml"'

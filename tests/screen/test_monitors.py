@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.monitor.window.x11 import sync_control
+from hilstar.display.window.x11 import sync_control
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import assert_refused, run_hilstar
 from tests.support.forks import HILSTAR, Started

@@ -16,7 +16,7 @@ import zmq
 
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.protocol import HEALTH_BLANK, HEALTH_HIDDEN, HEALTH_NO_ATTITUDE, HEALTH_OPERATOR_OVERRIDE
-from hilstar.run.record.ledger_records import EventRecord, FrameRecord, frame_records
+from hilstar.server.record.ledger_records import EventRecord, FrameRecord, frame_records
 from tests.support.benches import ORION_Q, SCREEN_BENCH
 from tests.support.forks import HILSTAR, Started
 from tests.support.senders import connected, free_port, packet

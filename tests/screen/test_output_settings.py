@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.monitor.window.output_settings import OutputState, findings
-from hilstar.monitor.window.randr import Randr, lit_outputs
-from hilstar.monitor.window.watch import PresentEvents, is_straight, presented_as
-from hilstar.run.record.ledger_records import EventRecord, run_records
+from hilstar.display.window.output_settings import OutputState, findings
+from hilstar.display.window.randr import Randr, lit_outputs
+from hilstar.display.window.watch import PresentEvents, is_straight, presented_as
+from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import bench, showing
 from tests.support.commands import run_hilstar
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.unit.monitor.test_output_settings import HALF, edid
+from tests.unit.display.test_output_settings import HALF, edid
 
 
 def dummy0() -> OutputState:
@@ -90,7 +90,7 @@ def test_nvidia_s_settings_are_asked_of_its_tool_where_its_driver_runs(here, mon
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     assert "nvidia-settings: CurrentDithering" not in dummy0().properties
-    monkeypatch.setattr("hilstar.monitor.window.randr.has_extension", lambda display, name: True)
+    monkeypatch.setattr("hilstar.display.window.randr.has_extension", lambda display, name: True)
     (finding,) = findings(dummy0(), 8)
     assert finding.refused and 'nvidia-settings -a "[DPY:DUMMY0]/Dithering=2"' in finding.text
 

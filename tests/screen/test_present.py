@@ -9,16 +9,16 @@ from tests.support.waiting import PATIENCE_S
 
 RUN = """
 import numpy as np
-from hilstar.monitor.quantise import Panel
-from hilstar.monitor.response import bit_stealing_response, srgb_response
-from hilstar.monitor.window.window import Window, WindowSettings
-from hilstar.render.backend import ScreenView, Target
+from hilstar.display.quantise import Panel
+from hilstar.display.response import bit_stealing_response, srgb_response
+from hilstar.display.window.window import Window, WindowSettings
+from hilstar.display.render.backend import ScreenView, Target
 from dataclasses import replace
-from hilstar.render.numpy_backend import NumpyBackend, open_backend
-from hilstar.render.presenter import window_context
-from hilstar.render.renderer import Renderer
-from hilstar.scene.frame_motion import Orientation
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.render.numpy_backend import NumpyBackend, open_backend
+from hilstar.display.render.presenter import window_context
+from hilstar.display.render.renderer import Renderer
+from hilstar.optics.frame_motion import Orientation
+from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, PSF, WHITE = (320, 240), GaussianPsf((0.85, 0.85)), 1e6

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.resources import resource_path
-from hilstar.rotation import angle_between_rad, propagate
+from hilstar.basics.resources import resource_path
+from hilstar.basics.rotation import angle_between_rad, propagate
 from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
@@ -139,11 +139,11 @@ def test_the_frame_path_makes_no_cycles_for_the_collector():
 import gc, sys
 from pathlib import Path
 import numpy as np
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.build import load
-from hilstar.run.loop import FrameLoop
-from hilstar.resources import resource_path
+from hilstar.server.bench.build import load
+from hilstar.server.loop import FrameLoop
+from hilstar.basics.resources import resource_path
 with load(resource_path("configs", "demo.toml")) as bench:
     loop = FrameLoop(bench, moving=True)
     turning = Attitude(from_radec_roll_deg(84, 0, 0), 0, False, rate_cam_rad_s=np.array([0.001, 0.01, 0.0]))

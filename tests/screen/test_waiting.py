@@ -12,9 +12,9 @@ from tests.support.waiting import PATIENCE_S
 FRAME = """
 import json, threading, time
 import moderngl, numpy as np
-from hilstar.monitor.window.window import Window, WindowSettings
-from hilstar.render.backend import ScreenView
-from hilstar.render.presenter import Presenter, level_texture, window_context
+from hilstar.display.window.window import Window, WindowSettings
+from hilstar.display.render.backend import ScreenView
+from hilstar.display.render.presenter import Presenter, level_texture, window_context
 
 TRIANGLE = "void main() { gl_Position = vec4(gl_VertexID / 2 * 4.0 - 1.0, gl_VertexID % 2 * 4.0 - 1.0, 0.0, 1.0); }"
 SINES = "float x = gl_FragCoord.x; for (int i = 0; i < 400; i++) x = sin(x) + 1.1;"

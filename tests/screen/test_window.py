@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.rotation import propagate
-from hilstar.run.record.ledger_records import frame_records
+from hilstar.basics.rotation import propagate
+from hilstar.server.record.ledger_records import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
 from tests.support.forks import Started

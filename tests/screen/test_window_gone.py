@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.record.ledger_records import frame_records
+from hilstar.server.record.ledger_records import frame_records
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from hilstar import charts
-from hilstar.study.sweep import Load, OtherWork
+from hilstar.basics import charts
+from hilstar.instruments.study.sweep import Load, OtherWork
 
 
 @pytest.fixture(scope="package", autouse=True)

@@ -11,11 +11,11 @@ from typing import get_args
 
 import pytest
 
-from hilstar import charts
+from hilstar.basics import charts
 from hilstar.cli import study as study_command
-from hilstar.study import bodies, colour, economy, sweep
-from hilstar.study.sweep import NOT_JUDGED, Load, OtherWork
-from hilstar.study.tradeoff import run as tradeoff
+from hilstar.instruments.study import bodies, colour, economy, sweep
+from hilstar.instruments.study.sweep import NOT_JUDGED, Load, OtherWork
+from hilstar.instruments.study.tradeoff import run as tradeoff
 
 BUSY = Load(float(os.cpu_count() or 1))
 STUDIES = get_args(study_command.Study)
@@ -110,5 +110,5 @@ def test_an_idle_machine_names_its_winners():
 
 def test_a_study_of_times_says_what_it_found_through_load():
     for study in study_command.TIMED:
-        run = import_module(f"hilstar.study.{study}{'.run' if study in study_command.ROOMS else ''}").run
+        run = import_module(f"hilstar.instruments.study.{study}{'.run' if study in study_command.ROOMS else ''}").run
         assert run.__annotations__["return"] in ("Judged", sweep.Judged)

@@ -6,9 +6,9 @@ import os
 import subprocess
 import sys
 
-from hilstar.study.chain.run import headline
-from hilstar.study.speed.report import Aim, Machine, Result, lines
-from hilstar.study.sweep import BUSY_SHARE, NOT_JUDGED, Load, OtherWork
+from hilstar.instruments.study.chain.run import headline
+from hilstar.instruments.study.speed.report import Aim, Machine, Result, lines
+from hilstar.instruments.study.sweep import BUSY_SHARE, NOT_JUDGED, Load, OtherWork
 from tests.support.waiting import wait_for
 
 CORES = os.cpu_count() or 1

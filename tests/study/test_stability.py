@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from hilstar.study.stability import FailureCase, Figures, image, recorded
-from hilstar.study.stability import run as stability
+from hilstar.instruments.study.stability import FailureCase, Figures, image, recorded
+from hilstar.instruments.study.stability import run as stability
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn, table
 

@@ -6,8 +6,8 @@ import csv
 
 import pytest
 
-from hilstar.study import bodies
-from hilstar.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES, run
+from hilstar.instruments.study import bodies
+from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES, run
 
 
 @pytest.fixture(scope="module")

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar import charts
-from hilstar.bench.bench_file import bench_file_of
-from hilstar.optics.psf_file import glass_of, write_glass
-from hilstar.study import predictors
-from hilstar.study.chain import answers, choices, measuring, run
-from hilstar.study.chain import glass as chain_glass
-from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
-from hilstar.study.chain.glass import draw_glass, glass_rows
-from hilstar.study.chain.measuring import Rounds, SceneMeasurement, error_budget
-from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
-from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, off
-from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
+from hilstar.basics import charts
+from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
+from hilstar.instruments.study import predictors
+from hilstar.instruments.study.chain import answers, choices, measuring, run
+from hilstar.instruments.study.chain import glass as chain_glass
+from hilstar.instruments.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
+from hilstar.instruments.study.chain.glass import draw_glass, glass_rows
+from hilstar.instruments.study.chain.measuring import Rounds, SceneMeasurement, error_budget
+from hilstar.instruments.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
+from hilstar.instruments.study.chain.tracker import MATCH_PX, StudyTracker, off
+from hilstar.optics.glass.psf_file import glass_of, write_glass
+from hilstar.server.bench.bench_file import bench_file_of
 from tests.support.benches import ORION_Q
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible

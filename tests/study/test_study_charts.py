@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from hilstar import charts
-from hilstar.study.economy import EffortComparison, EffortOutcome, economy_finding
-from hilstar.study.speed import report as benchmark_report
-from hilstar.study.speed.report import Machine, MethodTiming, Result, Spread
+from hilstar.basics import charts
+from hilstar.instruments.simulate.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
+from hilstar.instruments.study.economy import EffortComparison, EffortOutcome, economy_finding
+from hilstar.instruments.study.speed import report as benchmark_report
+from hilstar.instruments.study.speed.report import Machine, MethodTiming, Result, Spread
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
 from tests.support.figures import assert_legible, assert_title_is_drawn
 from tests.support.pictures import assert_drawn
 

@@ -6,8 +6,8 @@ import csv
 
 import pytest
 
-from hilstar.study import colour
-from hilstar.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
+from hilstar.instruments.study import colour
+from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 

@@ -6,8 +6,8 @@ import csv
 
 import pytest
 
-from hilstar.study import economy
-from hilstar.study.economy import BITS, SCENES, TOLERANCES, run
+from hilstar.instruments.study import economy
+from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES, run
 from hilstar.tracker.centroiders import FAMILY
 
 

@@ -6,9 +6,9 @@ import csv
 
 import pytest
 
-from hilstar.frame.fault_kinds import KINDS
-from hilstar.study import faults
-from hilstar.study.faults import CASES, NOWHERE, QUANTISATIONS
+from hilstar.instruments.study import faults
+from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
+from hilstar.optics.layers.fault_kinds import KINDS
 from tests.support.pictures import assert_drawn
 
 pytestmark = pytest.mark.study

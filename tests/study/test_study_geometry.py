@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from hilstar.study.geometry import FAIL_ARCSEC, MODELS, ideal_arcsec, run
+from hilstar.instruments.study.geometry import FAIL_ARCSEC, MODELS, ideal_arcsec, run
 
 
 @pytest.fixture(scope="module")

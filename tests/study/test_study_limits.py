@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.study import limits
-from hilstar.study.limits import Limit, limits_finding, run
+from hilstar.instruments.study import limits
+from hilstar.instruments.study.limits import Limit, limits_finding, run
 from tests.support.pictures import assert_drawn, table
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.

@@ -10,14 +10,14 @@ import pytest
 from astropy.wcs import WCS
 from PIL import Image
 
-from hilstar.charts import TITLE_COLUMNS, title_lines
+from hilstar.basics.charts import TITLE_COLUMNS, title_lines
+from hilstar.instruments.study.models import choices_finding, running_percentiles, torres2010_k, zero_points
+from hilstar.instruments.study.rapp import rapp_ratios
+from hilstar.instruments.study.settings import held_out_errors, study_optics
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from hilstar.study.models import choices_finding, running_percentiles, torres2010_k, zero_points
-from hilstar.study.rapp import rapp_ratios
-from hilstar.study.settings import held_out_errors, study_optics
 from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
@@ -328,7 +328,7 @@ def test_a_title_is_whole_in_even_lines():
 
 def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
     code = (
-        "import sys, tempfile; from pathlib import Path; from hilstar.study import models;"
+        "import sys, tempfile; from pathlib import Path; from hilstar.instruments.study import models;"
         "assert 'matplotlib' not in sys.modules;"
         "models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
     )

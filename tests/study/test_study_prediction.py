@@ -8,8 +8,17 @@ from typing import get_type_hints
 
 import pytest
 
-from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, PredictionOutcome, Shaken, crossing_hz, run
-from hilstar.study.predictors import SLEW_DEG, SLEW_S
+from hilstar.instruments.study.prediction import (
+    LATENCIES_MS,
+    RATES_HZ,
+    USUAL_HZ,
+    USUAL_MS,
+    PredictionOutcome,
+    Shaken,
+    crossing_hz,
+    run,
+)
+from hilstar.instruments.study.predictors import SLEW_DEG, SLEW_S
 from tests.support.pictures import assert_drawn
 
 

@@ -7,10 +7,10 @@ import csv
 import numpy as np
 import pytest
 
-from hilstar.monitor.phases import USUAL_PSF, fainter, measure, phase_grid
-from hilstar.render.reference import linear_image
-from hilstar.study.codes import AIMS, BITS, WAYS
-from hilstar.study.quantisation import run
+from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
+from hilstar.display.render.reference import linear_image
+from hilstar.instruments.study.codes import AIMS, BITS, WAYS
+from hilstar.instruments.study.quantisation import run
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.pictures import assert_drawn
 

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, seen_at
-from hilstar.scene.frame_motion import Scan
-from hilstar.study import timing
-from hilstar.study.timing import (
+from hilstar.instruments.study import timing
+from hilstar.instruments.study.timing import (
     QUICK_CASES,
     QUICK_RATES_DEG_S,
     WAYS,
@@ -21,6 +19,8 @@ from hilstar.study.timing import (
     measure,
     slew,
 )
+from hilstar.optics.frame_motion import Scan
+from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.pictures import assert_drawn, table
 
 GAIN = 20  # compensated against not: the issue's own figure

@@ -8,21 +8,21 @@ import itertools
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
-from hilstar.render.backend import Target
-from hilstar.render.reference import linear_image
-from hilstar.render.variants import SplatVariant, VariantRenderer
-from hilstar.scene.psf import MAX_CUT
+from hilstar.basics.errors import InputError
+from hilstar.display.render.backend import Target
+from hilstar.display.render.reference import linear_image
+from hilstar.display.render.variants import SplatVariant, VariantRenderer
+from hilstar.instruments.study import sweep
+from hilstar.instruments.study.codes import star_field
+from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Figure, Trial, Trials, in_turn, measured, pareto_front
+from hilstar.instruments.study.tradeoff import run as tradeoff
+from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, trapezoid
+from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
+from hilstar.instruments.study.tradeoff.run import STEPS, draw, table_lines
+from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
-from hilstar.study import sweep
-from hilstar.study.codes import star_field
-from hilstar.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Figure, Trial, Trials, in_turn, measured, pareto_front
-from hilstar.study.tradeoff import run as tradeoff
-from hilstar.study.tradeoff.light import LIMITS_V_MAG, trapezoid
-from hilstar.study.tradeoff.places import SPRITE_PSF
-from hilstar.study.tradeoff.run import STEPS, draw, table_lines
 from tests.support.pictures import assert_drawn
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.bench.frame import Bench
-from hilstar.rotation import from_matrix
-from hilstar.twin.optics import BenchGeometry
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import from_matrix
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.server.bench.frame import Bench
 
 HEADER = "qw,qx,qy,qz,tw,tx,ty,tz"
 

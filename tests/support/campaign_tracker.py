@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.rotation import from_rotation_vector, multiply, propagate, to_matrix
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import from_rotation_vector, multiply, propagate, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
 
 FOCAL_PX = 2000.0
 WAVE_PX = 100.0  # of the field-of-view error

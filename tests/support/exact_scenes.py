@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.monitor.quantise import Panel, round_levels, shown_light
-from hilstar.monitor.response import Response, gamma_response, srgb_response
-from hilstar.render.reference import linear_image
-from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.display.quantise import Panel, round_levels, shown_light
+from hilstar.display.render.reference import linear_image
+from hilstar.display.response import Response, gamma_response, srgb_response
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import Sprites, pack_sprites
 from tests.support.centroiders import family_errors_px
 
 WHITE = 1e6  # e-/s of a pixel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from hilstar.process.scheduling import HostClock
+from hilstar.basics.process.scheduling import HostClock
 
 
 class FakeClock(HostClock):

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from hilstar import charts
+from hilstar.basics import charts
 
 PAGE_PX = 700  # the narrowest column of the documentation that a figure is read in
 MIN_TEXT_PX = 11.0  # at that width

@@ -29,22 +29,34 @@ from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
 
-from hilstar.process.interrupts import leave
+from hilstar.basics.process.interrupts import leave
 from tests.support.benches import LIVE_BENCH, SCREEN_BENCH, SMALL_BENCH
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
 # What a bench imports before its first frame, and the commands that tests start most; no window, no browser, no thread.
-MODULES = ("bench.build", "console.publisher", "render.renderer", "run.loop", "run.open_link", "run.record.ledger", "run.serve")
+MODULES = (
+    "server.bench.build",
+    "server.console.publisher",
+    "display.render.renderer",
+    "server.loop",
+    "server.open_link",
+    "server.record.ledger",
+    "server.serve",
+)
 COMMANDS = (["serve", "none.toml"], ["replay", "none.toml", "none.csv"], ["frame", "none.toml"], ["--version"])
 # What these commands import as they go; each takes 0.2 s to a second.
 LATER = {
-    "campaign": ("hilstar.campaign.results", "hilstar.campaign.requirements_page", "hilstar.campaign.bench_run"),
-    "first-light": ("hilstar.calibrate.first_light.session", "scipy.optimize"),
+    "campaign": (
+        "hilstar.instruments.campaign.results",
+        "hilstar.instruments.campaign.requirements_page",
+        "hilstar.instruments.campaign.bench_run",
+    ),
+    "first-light": ("hilstar.instruments.calibrate.first_light.session", "scipy.optimize"),
     "frame": ("astropy.io.fits",),
-    "pytest": ("pytest", "hilstar.testing", "astropy.io.fits"),
+    "pytest": ("pytest", "hilstar.instruments.compare", "astropy.io.fits"),
     "scheduler": ("distributed.cli.dask_scheduler",),
-    "simulate": ("astropy.io.fits", "astropy.table", "hilstar.twin.batch"),
-    "worker": ("distributed.cli.dask_worker", "hilstar.campaign.pool"),
+    "simulate": ("astropy.io.fits", "astropy.table", "hilstar.instruments.simulate.batch"),
+    "worker": ("distributed.cli.dask_worker", "hilstar.instruments.campaign.pool"),
 }
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
 MAX_REQUEST_BYTES = 1 << 20
@@ -125,11 +137,11 @@ def prepare() -> None:
     """Import and compute what every command would."""
     for module in MODULES:
         importlib.import_module(f"hilstar.{module}")
-    from hilstar.bench.bench_file import bench_file_of
-    from hilstar.bench.build import open_bench
     from hilstar.cli import run_command
+    from hilstar.server.bench.bench_file import bench_file_of
+    from hilstar.server.bench.build import open_bench
 
-    with mock.patch("hilstar.bench.build.headless_context", return_value=None):  # each fork makes its own
+    with mock.patch("hilstar.server.bench.build.headless_context", return_value=None):  # each fork makes its own
         for text in (SMALL_BENCH, LIVE_BENCH, SCREEN_BENCH):  # what a process computes once: stars, effort, paths
             open_bench(bench_file_of(Path("none.toml"), text)).warm_up()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.optics.psf_file import FACTS, Stack
+from hilstar.optics.glass.psf_file import FACTS, Stack
 from tests.support.psfs import in_pixels
 
 SIDE_PX = 256

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.config import AttitudeSettings
-from hilstar.bench.frame import Bench
-from hilstar.run.loop import Limit
-from hilstar.run.open_link import AnyLink
-from hilstar.run.pacer import Shown
-from hilstar.run.serve import Outlet, Running, serve
-from hilstar.run.summary import RunSummary
-from hilstar.units import NS_PER_MS
+from hilstar.basics.units import NS_PER_MS
+from hilstar.server.bench.config import AttitudeSettings
+from hilstar.server.bench.frame import Bench
+from hilstar.server.loop import Limit
+from hilstar.server.open_link import AnyLink
+from hilstar.server.pacer import Shown
+from hilstar.server.serve import Outlet, Running, serve
+from hilstar.server.summary import RunSummary
 from tests.support.waiting import PATIENCE_S
 
 MAX_EXTRAPOLATION_NS = round(AttitudeSettings().max_extrapolation_ms * NS_PER_MS)

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
-from hilstar.bench.build import scan_of
-from hilstar.bench.config import parse_config
-from hilstar.frame.view import View
-from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
-from hilstar.run.screen.screen import Screen
+from hilstar.display.window.x11 import BackBuffer, SwapStamps
+from hilstar.optics.layers.view import View
+from hilstar.server.bench.build import scan_of
+from hilstar.server.bench.config import parse_config
+from hilstar.server.screen.screen import Screen
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
 

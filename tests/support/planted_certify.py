@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.image_sources import VirtualBench
-from hilstar.certify import assembly, certificate
-from hilstar.certify.budget import BATCH
-from hilstar.certify.readings import ImageReader
+from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
+from hilstar.instruments.certify import assembly, certificate
+from hilstar.instruments.certify.budget import BATCH
+from hilstar.instruments.certify.readings import ImageReader
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.planted_readings import (
     ARCSEC,
     DELAY_MS,
@@ -32,7 +32,7 @@ from tests.support.planted_readings import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hilstar.bench.certificate import Certificate
+    from hilstar.server.bench.certificate import Certificate
 
 NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.certify.readings import DotReadings, LightReadings
+from hilstar.instruments.certify.readings import DotReadings, LightReadings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hilstar.certify.model import ReferenceStar
+    from hilstar.instruments.certify.model import ReferenceStar
 
 ARCSEC = 180 / math.pi * 3600
 SIZE_PX = (1920, 1080)

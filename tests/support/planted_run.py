@@ -8,10 +8,10 @@ from pathlib import Path
 
 import msgspec
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.mcap_log import RUN_METADATA, McapWriter
-from hilstar.run.record.ledger import TOPICS
-from hilstar.run.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
+from hilstar.basics.arrays import FloatArray
+from hilstar.server.record.ledger import TOPICS
+from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from tests.support.benches import SMALL_BENCH
 from tests.support.planted_tracker import Planted
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.places import Scale
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.instruments.assess.places import Scale
 
 ARCSEC_PER_RAD = 180 * 3600 / np.pi
 SCALE = Scale(5384.6, (1024, 1024))  # 70 mm and 13 um: the demo's tracker, 38 arcsec a pixel

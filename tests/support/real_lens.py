@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 from tests.support.benches import bench_text
 
 SIZE = (1920, 1080)

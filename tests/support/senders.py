@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 import zmq
 
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.waiting import PATIENCE_S, repeating
 
 ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))

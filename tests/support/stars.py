@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+from hilstar.optics.sprites import SPRITE_DTYPE, Sprites
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import Stars, make_stars
 

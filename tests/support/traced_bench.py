@@ -1,4 +1,4 @@
-"""What a tracker sees of dots on a bench of traced rays (hilstar.study.geometry), in any pose, with any loss."""
+"""What a tracker sees of dots on a bench of traced rays (hilstar.instruments.study.geometry), in any pose, with any loss."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.calibrate.geometric.dots import DotPlan
-from hilstar.calibrate.geometric.observed import Observed
-from hilstar.scene.camera import Camera
-from hilstar.study.geometry import DotFaults, TracedBench, turned
-from hilstar.study.geometry import observed_dots as dots_seen
+from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.calibrate.geometric.dots import DotPlan
+from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.instruments.study.geometry import DotFaults, TracedBench, turned
+from hilstar.instruments.study.geometry import observed_dots as dots_seen
+from hilstar.optics.camera import Camera
 
 __all__ = ["TracedBench", "observed_dots", "turned"]
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilstar.process.scheduling import FIFO_PRIORITY
-from hilstar.units import NS_PER_S
+from hilstar.basics.process.scheduling import FIFO_PRIORITY
+from hilstar.basics.units import NS_PER_S
 
 # Ten times what anything here takes on an idle machine, for one that has ten times the work of its cores to do; what never
 # comes costs a failing test this long.

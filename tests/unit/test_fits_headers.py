@@ -11,11 +11,11 @@ import pytest
 from astropy.io import fits
 from astropy.time import Time
 
-from hilstar.calibrate.geometric.observed import read_exposed
-from hilstar.confront.images import read_photographs
-from hilstar.errors import InputError
-from hilstar.fits_headers import read_fits_image, utc_ns
-from hilstar.image_files import ImageSizeError
+from hilstar.basics.errors import InputError
+from hilstar.basics.fits_headers import read_fits_image, utc_ns
+from hilstar.basics.image_files import ImageSizeError
+from hilstar.instruments.calibrate.geometric.observed import read_exposed
+from hilstar.instruments.confront.images import read_photographs
 
 SIDE_PX = 64
 EIGHT_PM = "2024-03-01T20:00:00"

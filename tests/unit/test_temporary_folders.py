@@ -12,11 +12,11 @@ import threading
 
 import pytest
 
-from hilstar.files import OWNER, clear_left, temporary_folder
+from hilstar.basics.files import OWNER, clear_left, temporary_folder
 
 KILLED = """
 import os, signal
-from hilstar.files import temporary_folder
+from hilstar.basics.files import temporary_folder
 with temporary_folder("test") as folder:
     (folder / "deep").mkdir()
     (folder / "deep" / "file").write_text("x")

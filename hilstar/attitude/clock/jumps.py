@@ -20,9 +20,9 @@ import numpy as np
 from hilstar.attitude.clock.sender_clock import SenderClock, Slots
 from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_MS, NS_PER_S
-from hilstar.wrong_sky import CLOCK, ENDS
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import CLOCK, ENDS
 
 PACE_SLOTS = 9
 MIN_ODD_PACE = 0.004  # twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast

@@ -10,8 +10,8 @@ Laws of the count:
 from collections import deque
 
 from hilstar.attitude.wire.packet import U32
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
 
 RECENT = 256
 MAX_GAP = 100_000

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import BoolArray, FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Conventions, Mounting
-from hilstar.rotation import conjugate, multiply, rotate, to_rotation_vector
-from hilstar.units import NS_PER_S
-from hilstar.wrong_sky import CONVENTION, RATES
+from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.rotation import conjugate, multiply, rotate, to_rotation_vector
+from hilstar.basics.units import NS_PER_S
+from hilstar.basics.wrong_sky import CONVENTION, RATES
 
 MIN_INTERVALS = 5
 MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES = 4, 6, 12

@@ -40,9 +40,9 @@ from hilstar.attitude.clock.rate_causes import (
     stretch_of,
 )
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_MS, NS_PER_S
-from hilstar.wrong_sky import ENDS, RATES
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import ENDS, RATES
 
 WrongRates = Literal["use-quaternions", "warn", "off"]
 WRONG, RIGHT = RATES, ENDS[RATES]

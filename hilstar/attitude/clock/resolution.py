@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.units import ARCSEC_PER_RAD
 
 COARSE = "coarse-quaternions"
 LOOKED_AT = 60  # samples; a sender does not change its format later

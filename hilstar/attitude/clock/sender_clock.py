@@ -17,9 +17,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.process.scheduling import UnixOffset
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.process.scheduling import UnixOffset
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 WINDOW_NS = 30 * NS_PER_S
 SLOT_NS = NS_PER_S // 4

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 SECOND, FROZEN = "second-sender", "source-frozen"
 MIN_REPEATS = 10  # and

@@ -16,10 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, rate_refusal
-from hilstar.rotation import angle_between_rad, propagate, rate_between_rad_s, slerp
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import angle_between_rad, propagate, rate_between_rad_s, slerp
+from hilstar.basics.units import NS_PER_S
 
 STEADY_S = 0.3  # time constant of the steady part
 MEMORY_S = 0.5  # time constant of the regression: a second-old sample counts an eighth

@@ -36,7 +36,6 @@ from typing import IO, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs import aem_blocks as ccsds
 from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogEntry, LogReading, Stated, log_joins
@@ -44,10 +43,11 @@ from hilstar.attitude.logs.log_formats import LogFormat, LogHead, Writing
 from hilstar.attitude.logs.log_times import FIRST_DATE_NS
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
-from hilstar.errors import InputError
-from hilstar.reading import read_text
-from hilstar.rotation import conjugate, direction_of, frame_turns, multiply, rotate
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import read_text
+from hilstar.basics.rotation import conjugate, direction_of, frame_turns, multiply, rotate
+from hilstar.basics.units import NS_PER_S
 
 MAX_OVERLAPPING = 1000
 MAX_BYTES = 50_000_000

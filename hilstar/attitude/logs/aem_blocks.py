@@ -18,8 +18,8 @@ from xml.parsers import expat
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import NS_PER_S
 
 VERSION_KEY = "CCSDS_AEM_VERS"
 HEADER = (VERSION_KEY, "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")

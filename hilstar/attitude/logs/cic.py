@@ -26,8 +26,8 @@ from hilstar.attitude.logs.aem_blocks import AemFaultError
 from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogReading, Stated
 from hilstar.attitude.logs.log_formats import LogFormat, LogHead
 from hilstar.attitude.logs.log_times import ns_of_seconds
-from hilstar.reading import read_text
-from hilstar.units import NS_PER_S
+from hilstar.basics.reading import read_text
+from hilstar.basics.units import NS_PER_S
 
 VERSION_KEY = "CIC_AEM_VERS"
 VERSIONS = frozenset({"1.0", "2.0"})

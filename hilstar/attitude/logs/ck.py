@@ -29,8 +29,8 @@ from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
 from hilstar.attitude.logs.log_formats import LogFormat, require
 from hilstar.attitude.wire.packet import checked_sample
 from hilstar.attitude.wire.source import Conventions, components
-from hilstar.errors import InputError
-from hilstar.reading import by_number
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import by_number
 
 BESIDE = (".tls", ".tsc", ".tf")  # leap seconds, clocks and frames, as NAIF ends their names
 MAX_BESIDE = 30

@@ -29,15 +29,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.entries import GAP_INTERVALS, MAX_SAMPLES, log_joins
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.errors import InputError, shortened
-from hilstar.reading import HEAD_BYTES, open_regular
-from hilstar.rotation import angle_between_rad, from_matrix, rate_between_rad_s
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.reading import HEAD_BYTES, open_regular
+from hilstar.basics.rotation import angle_between_rad, from_matrix, rate_between_rad_s
+from hilstar.basics.units import NS_PER_S
 
 WORD_BYTES = 8
 MAX_SUMMARY_WORDS = 125  # SPICE's own limit of a summary

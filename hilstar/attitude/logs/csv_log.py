@@ -20,9 +20,9 @@ from hilstar.attitude.logs.log_times import ns_of_seconds
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import HILSTARS
-from hilstar.errors import InputError
-from hilstar.text_tables import CUT, Chosen, TextTable, is_valid, number_fault, open_table, plain_name
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.text_tables import CUT, Chosen, TextTable, is_valid, number_fault, open_table, plain_name
+from hilstar.basics.units import NS_PER_S
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")

@@ -26,14 +26,14 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.logs.log_times import FIRST_DATE_NS
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError, shortened
-from hilstar.rotation import frame_turns, from_matrix, multiply, normalise, rotate
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.rotation import frame_turns, from_matrix, multiply, normalise, rotate
+from hilstar.basics.units import NS_PER_S
 
 IntArray = npt.NDArray[np.int64]
 HOUR_NS = 3600 * NS_PER_S

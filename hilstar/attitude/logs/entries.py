@@ -22,15 +22,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.rate_causes import AS_PACKETS, Cause, ReadAs
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
 from hilstar.attitude.logs.log_times import TIMES
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import Convention, Conventions, Mounting
-from hilstar.rotation import conjugate, multiply
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import conjugate, multiply
+from hilstar.basics.units import NS_PER_S
 
 MAX_QUOTED_CHARACTERS = 80
 SORT_ADVICE = "sort the log by time"

@@ -12,7 +12,7 @@ from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
 from hilstar.attitude.logs.log_formats import MAX_LOG_BYTES, LogFormat, Writing, readable
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
-from hilstar.reading import open_lines
+from hilstar.basics.reading import open_lines
 
 JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
 VALID_KEY = '"valid"'

@@ -30,9 +30,9 @@ from hilstar.attitude.logs.log_formats import NOTHING_STATED, Writing, check_sta
 from hilstar.attitude.logs.log_times import time_notices
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import HILSTARS, Mounting
-from hilstar.errors import InputError
-from hilstar.files import whole_file
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import whole_file
+from hilstar.basics.units import NS_PER_S
 
 YEAR_NS = 31_557_600 * NS_PER_S
 SECONDS_FORM = "write seconds after its first sample"

@@ -25,8 +25,8 @@ from typing import IO, NamedTuple
 
 from hilstar.attitude.logs.entries import OPTIONS, LogReading, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError, MachineError, shortened
-from hilstar.reading import HEAD_BYTES, open_lines, open_regular
+from hilstar.basics.errors import InputError, MachineError, shortened
+from hilstar.basics.reading import HEAD_BYTES, open_lines, open_regular
 
 GROUP = "hilstar.log_formats"
 PACKAGE = "hilstar"

@@ -12,10 +12,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import conjugate, multiply, to_rotation_vector
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.basics.units import NS_PER_S
 
 # Times before 2000 are those of a simulated clock that began at 0, not dates.
 FIRST_DATE_NS = 946_684_800 * NS_PER_S

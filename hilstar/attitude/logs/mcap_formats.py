@@ -14,8 +14,8 @@ from hilstar.attitude.logs.log_formats import LogFormat, LogHead, Writing
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import PACKETS
-from hilstar.errors import InputError
-from hilstar.files import MCAP_MAGIC
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import MCAP_MAGIC
 
 RESTARTED = "the sender restarted here; give a log of one run"
 MAX_NAMED_TOPICS = 12

@@ -19,12 +19,12 @@ from hilstar.attitude.wire.source import (
     components,
     packet_conventions,
 )
-from hilstar.rotation import conjugate, multiply
-from hilstar.units import NS_PER_S
+from hilstar.basics.rotation import conjugate, multiply
+from hilstar.basics.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from hilstar.arrays import FloatArray
     from hilstar.attitude.logs.earth import Reference
+    from hilstar.basics.arrays import FloatArray
 
 # The statements that say where a level frame is, and those that all of these logs use.
 LEVEL = frozenset({"reference", "place", "epoch_utc"})

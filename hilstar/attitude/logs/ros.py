@@ -29,7 +29,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.earth import (
     AXES,
     EXACT,
@@ -48,9 +47,10 @@ from hilstar.attitude.logs.ros_bags import ENDINGS, OLD_TF, TF, Bag, BagTopic, i
 from hilstar.attitude.wire.packet import Refusal, checked_sample, is_unset
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.source import Conventions, components
-from hilstar.errors import InputError, shortened
-from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
+from hilstar.basics.units import NS_PER_S
 
 TF_TYPES = frozenset({TF, OLD_TF})
 TRANSFORM, IMU, ODOMETRY = "geometry_msgs/msg/TransformStamped", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"

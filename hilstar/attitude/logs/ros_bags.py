@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hilstar.attitude.logs.log_formats import LogHead
-from hilstar.errors import InputError, shortened
-from hilstar.files import MCAP_MAGIC, temporary_folder
-from hilstar.reading import HEAD_BYTES, open_regular, size_text
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.files import MCAP_MAGIC, temporary_folder
+from hilstar.basics.reading import HEAD_BYTES, open_regular, size_text
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -24,7 +24,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.logs import aem_blocks as ccsds
 from hilstar.attitude.logs.aem import faults_named, read_blocks
 from hilstar.attitude.logs.aem_blocks import AemFaultError
@@ -32,8 +31,9 @@ from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogReading, Sta
 from hilstar.attitude.logs.log_formats import LogFormat
 from hilstar.attitude.logs.log_times import ns_of_seconds
 from hilstar.attitude.wire.source import Conventions
-from hilstar.reading import read_text
-from hilstar.rotation import conjugate, from_matrix
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.reading import read_text
+from hilstar.basics.rotation import conjugate, from_matrix
 
 VERSION = "stk.v."
 BEGIN, END = "BEGIN ATTITUDE", "END ATTITUDE"

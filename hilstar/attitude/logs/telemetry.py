@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.log_formats import format_of
 from hilstar.attitude.logs.log_times import ns_of_seconds
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.errors import InputError, shortened
-from hilstar.rotation import normalise
-from hilstar.text_tables import finite_numbers, is_valid, read_rows
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.rotation import normalise
+from hilstar.basics.text_tables import finite_numbers, is_valid, read_rows
+from hilstar.basics.units import NS_PER_S
 
 COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 ADVICE = f"write a CSV with the columns {','.join(COLUMNS)} and, where known, valid (1 or 0); or give an AEM or an MCAP file"

@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_formats import ALL_STATEMENTS, LogFormat
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 RECIPE = (
     "pip install pyulog; ulog2csv FILE; of the CSV of vehicle_attitude, write timestamp / 1e6 as"

@@ -27,9 +27,9 @@ from typing import NamedTuple, Protocol
 import msgspec
 
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
+from hilstar.basics.units import NS_PER_S
 
 CHILD = "hilstar.attitude.wire.apart_child"
 LENGTH = struct.Struct("<I")  # bytes of the record that follows

@@ -15,10 +15,10 @@ from typing import NoReturn
 
 from hilstar.attitude.wire.apart import RawLink, ReadOrder, Record, pack
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
-from hilstar.errors import HilstarError, one_line
-from hilstar.notices import Notices
-from hilstar.process.interrupts import ENDING, end_with_parent
-from hilstar.process.scheduling import HOST_CLOCK, HostClock, PromptWhileLight
+from hilstar.basics.errors import HilstarError, one_line
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.interrupts import ENDING, end_with_parent
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock, PromptWhileLight
 
 WANTED_BUFFER_BYTES = 1 << 20  # for some hundred unread messages; the kernel may give less
 MAX_ORDER_BYTES = 65_536

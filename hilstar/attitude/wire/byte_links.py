@@ -1,6 +1,6 @@
 """Bytes as they come: serial lines, UDP, TCP, ZeroMQ and growing files, each reopened where it is lost; what asks is sent.
 
-For the process that reads a tracker's answers (see `hilstar.answers.reader`). What comes is not looked at here.
+For the process that reads a tracker's answers (see `hilstar.server.answers.reader`). What comes is not looked at here.
 """
 
 import contextlib
@@ -19,10 +19,10 @@ from hilstar.attitude.wire.links import LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import LOST, open_port, opening_refusal
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
-from hilstar.errors import InputError, one_line
-from hilstar.notices import Notices
-from hilstar.process.closing import Closing
-from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
+from hilstar.basics.errors import InputError, one_line
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
 
 MAX_READ_BYTES = 65_536
 MAX_DATAGRAMS = 200

@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilstar.errors import InputError, shortened
+from hilstar.basics.errors import InputError, shortened
 
 ENDPOINT_FORM = "write tcp://HOST:PORT, such as tcp://127.0.0.1:5560"
 PATH_FORM = "write the absolute path of a socket, such as ipc:///run/user/1000/attitude"

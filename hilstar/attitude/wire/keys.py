@@ -16,8 +16,8 @@ import zmq.auth
 from zmq.utils import z85
 
 from hilstar.attitude.wire.endpoint import Endpoint
-from hilstar.errors import InputError, cannot_write, one_line
-from hilstar.reading import exists, read_bytes
+from hilstar.basics.errors import InputError, cannot_write, one_line
+from hilstar.basics.reading import exists, read_bytes
 
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
 MAX_KEY_FILE_BYTES = 16_384

@@ -18,7 +18,7 @@ from cobs import cobs, cobsr
 
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE, VERSION
-from hilstar.errors import printable
+from hilstar.basics.errors import printable
 
 MAX_LOOKED_AT = 512
 SHOWN_CHARACTERS = 32

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, T
 
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
 from hilstar.attitude.wire.source import PACKETS, Conventions
-from hilstar.notices import Notices
-from hilstar.process.closing import Closing
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from hilstar.arrays import FloatArray
+    from hilstar.basics.arrays import FloatArray
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped

@@ -21,16 +21,16 @@ from datetime import date
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.endpoint import AllowedSenders, check_use, parse_endpoint
 from hilstar.attitude.wire.links import Arrival, Link, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting, components
 from hilstar.attitude.wire.udp import ANCILLARY_BYTES, KernelStamps
-from hilstar.errors import InputError, shortened
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.units import NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.units import NS_PER_S
 
 MAX_MESSAGE_BYTES = 65_536  # 42's own buffer holds 16 384
 TOO_LONG = b""

@@ -35,7 +35,7 @@ from hilstar.attitude.wire.likeness import Likeness, frame_likeness, likeness, n
 from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
 if TYPE_CHECKING:
-    from hilstar.arrays import FloatArray
+    from hilstar.basics.arrays import FloatArray
 
 CRC = struct.Struct("<I")
 ATTITUDE_HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])

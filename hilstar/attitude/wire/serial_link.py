@@ -18,10 +18,10 @@ from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
-from hilstar.errors import HilstarError, InputError, NotThereError, one_line
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import HilstarError, InputError, NotThereError, one_line
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
+from hilstar.basics.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
 MIN_BACK_OFF_S = 0.05

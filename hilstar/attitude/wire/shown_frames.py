@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
-from hilstar.errors import one_line
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import one_line
 
 KEPT_FRAMES = 8  # at the sender for each watcher, an eighth of a second at 60 Hz
 WAITING_FRAMES = 64  # at the watcher, which reads between two answers

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from hilstar.toml_tables import Table
+from hilstar.basics.toml_tables import Table
 
 if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no packets
-    from hilstar.arrays import FloatArray
     from hilstar.attitude.wire.packet import AttitudeSample, Event
+    from hilstar.basics.arrays import FloatArray
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
@@ -57,14 +57,14 @@ class Convention(Table, frozen=True):
         """The Hamilton quaternion (4,), scalar first, of a unit quaternion (4,) in the order in
         which it was sent.
         """
-        from hilstar.rotation import conjugate
+        from hilstar.basics.rotation import conjugate
 
         q = sent if self.scalar == "first" else sent[SCALAR_FROM_LAST]
         return conjugate(q) if self.direction == "cam_to_icrs" else q
 
     def as_sent(self, q_icrs_to_frame: FloatArray) -> FloatArray:
         """What a sender of this convention sends for an attitude (4,) of its frame."""
-        from hilstar.rotation import conjugate
+        from hilstar.basics.rotation import conjugate
 
         q = conjugate(q_icrs_to_frame) if self.direction == "cam_to_icrs" else q_icrs_to_frame
         return q if self.scalar == "first" else q[SCALAR_TO_LAST]
@@ -92,7 +92,7 @@ class Mounting:
     def __init__(self, q_body_to_cam: Components | None = None, *, by_option: bool = False) -> None:
         import numpy as np
 
-        from hilstar.rotation import normalise, to_matrix
+        from hilstar.basics.rotation import normalise, to_matrix
 
         self.q_body_to_cam = normalise(np.array(q_body_to_cam or IDENTITY, dtype=np.float64))
         self.told = [] if q_body_to_cam else [("mounting", UNSTATED)]
@@ -104,7 +104,7 @@ class Mounting:
         """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body, rate in body components."""
         if self.is_identity:
             return body
-        from hilstar.rotation import multiply
+        from hilstar.basics.rotation import multiply
 
         rate, acceleration = body.rate_cam_rad_s, body.acceleration_cam_rad_s2
         return replace(
@@ -120,7 +120,7 @@ class Mounting:
 
     def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """The body's attitude of the camera's."""
-        from hilstar.rotation import conjugate, multiply
+        from hilstar.basics.rotation import conjugate, multiply
 
         return multiply(conjugate(self.q_body_to_cam), q_icrs_to_cam)
 
@@ -156,7 +156,7 @@ class Conventions:
 
     def lines(self, mounting: Mounting) -> list[str]:
         """The conventions, and the self-check, for a person."""
-        from hilstar.rotation import from_radec_roll_deg
+        from hilstar.basics.rotation import from_radec_roll_deg
 
         q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
         own = mounting.q_icrs_to_body(q) if self.of_body else q
@@ -191,7 +191,7 @@ class SentAttitudes:
 
     def q_icrs_to_cam(self, sent: FloatArray) -> FloatArray:
         """The camera's attitude of a unit quaternion (4,) in the order in which it was sent."""
-        from hilstar.rotation import multiply
+        from hilstar.basics.rotation import multiply
 
         q = self.convention.q_icrs_to_frame(sent)
         return q if self._mounting is None else multiply(self._mounting.q_body_to_cam, q)

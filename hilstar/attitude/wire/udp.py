@@ -24,10 +24,10 @@ from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
 from hilstar.attitude.wire.links import PAUSE_S, Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
-from hilstar.errors import InputError
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.units import NS_PER_S
 
 SO_ATTACH_FILTER = 26  # asm-generic/socket.h
 SKF_NET_OFF = 0xFFF00000

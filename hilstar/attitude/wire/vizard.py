@@ -20,7 +20,6 @@ from typing import Literal, Unpack
 import numpy as np
 import zmq
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.endpoint import parse_endpoint
 from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
@@ -28,11 +27,12 @@ from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard_message import Components, SimUpdate, VizBody, VizCamera, WireFormatError, decode_update
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqSocket
-from hilstar.errors import InputError, printable, shortened
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.rotation import angle_between_rad, conjugate, multiply, rate_between_rad_s
-from hilstar.units import ARCSEC_PER_RAD, MAX_SPEED_KM_S, NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, printable, shortened
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.rotation import angle_between_rad, conjugate, multiply, rate_between_rad_s
+from hilstar.basics.units import ARCSEC_PER_RAD, MAX_SPEED_KM_S, NS_PER_S
 
 SIM_UPDATE = b"SIM_UPDATE"
 MAX_UPDATE_BYTES = 1 << 22  # settings, models and maps of a large scenario go along with its spacecraft

@@ -16,10 +16,10 @@ from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, SocketOptions, ZmqSocket
-from hilstar.notices import Notices
-from hilstar.process.closing import Closing
-from hilstar.process.interrupts import caught
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.interrupts import caught
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 
 MAX_TAKEN_BYTES = 8_000_000  # in one go
 SEND_QUEUE_MESSAGES = 10_000

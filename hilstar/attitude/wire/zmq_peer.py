@@ -10,7 +10,7 @@ import socket
 import threading
 
 from hilstar.attitude.wire.likeness import likeness
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 
 GREETING_BYTES = 64
 SIGNATURE = b"\xff" + bytes(8) + b"\x7f"

@@ -23,10 +23,10 @@ from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, 
 from hilstar.attitude.wire.keys import NO_KEYS, AllowList, CurveKeys, check_reach, load_public, load_secret
 from hilstar.attitude.wire.links import PAUSE_S, WRONG_PEER, Link, LinkCounts
 from hilstar.attitude.wire.zmq_peer import PeerLook
-from hilstar.errors import InputError
-from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.units import NS_PER_MS
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.basics.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator

@@ -26,10 +26,10 @@ from typing import Literal
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.rotation import direction_of
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import direction_of
+from hilstar.basics.units import LIGHT_KM_S, flux_ratio
 from hilstar.sky.bodies.light import EARTH_CURVE_DEG, KM_PER_AU, body_v_mag, phase_angle_deg
-from hilstar.units import LIGHT_KM_S, flux_ratio
 
 Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
 SOLAR_LIMB = (0.30, 0.93, -0.23)

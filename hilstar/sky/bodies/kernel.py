@@ -12,11 +12,11 @@ from typing import Any
 import erfa
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import MachineError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import MachineError
+from hilstar.basics.units import LIGHT_KM_S
 from hilstar.sky.bodies.light import KM_PER_AU
 from hilstar.sky.stars import aberrate
-from hilstar.units import LIGHT_KM_S
 
 DAY_S = 86_400.0
 UNIX_JD = 2_440_587.5

@@ -22,11 +22,11 @@ between the bands, constant beyond them. Sunlight: G2V of the library.
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from hilstar.arrays import FloatArray
-from hilstar.rotation import direction_of
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import direction_of
+from hilstar.basics.units import magnitude
 from hilstar.sky import electrons
 from hilstar.sky.spectrum import load_curve
-from hilstar.units import magnitude
 
 KM_PER_AU = 149_597_870.7
 SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47

@@ -12,8 +12,9 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 from hilstar.sky.air import SiteAir
 from hilstar.sky.bodies.disc import (
     DARK_V_MAG,
@@ -35,7 +36,6 @@ from hilstar.sky.bodies.light import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
 from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, SkyAt
 from hilstar.sky.stars import Stars, aberrate, with_bodies
-from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hilstar.errors import InputError, shortened
+from hilstar.basics.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from sgp4.api import Satrec

@@ -21,11 +21,11 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, MachineError
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.units import NS_PER_S
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
 from hilstar.sky.bodies.omm import is_omm, read_omm
-from hilstar.units import NS_PER_S
 
 LINE_LENGTH = 69
 TLE_ADVICE = "give a file with one two-line element set, or one OMM in JSON, XML or CSV"

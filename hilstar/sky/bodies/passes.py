@@ -7,7 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.units import LIGHT_KM_S, NS_PER_S, magnitude
 from hilstar.sky.air import SiteAir
 from hilstar.sky.bodies.kernel import NS_PER_DAY
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
@@ -23,7 +24,6 @@ from hilstar.sky.bodies.satellites import (
     sunlit_share,
 )
 from hilstar.sky.stars import Stars, aberrate
-from hilstar.units import LIGHT_KM_S, NS_PER_S, magnitude
 
 log = logging.getLogger(__name__)
 

@@ -26,13 +26,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.errors import InputError, MachineError, printable, shortened
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError, MachineError, printable, shortened
+from hilstar.basics.text_tables import Chosen, TextTable, table_of
+from hilstar.basics.units import NS_PER_S, flux_ratio
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD
 from hilstar.sky.bodies.omm import is_omm, read_omm
 from hilstar.sky.bodies.orbit import TURN_NS, icrs_from_teme
-from hilstar.text_tables import Chosen, TextTable, table_of
-from hilstar.units import NS_PER_S, flux_ratio
 
 if TYPE_CHECKING:
     from sgp4.api import Satrec

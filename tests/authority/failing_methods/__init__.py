@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hilstar.study.stability import FailureCase
+from hilstar.instruments.study.stability import FailureCase
 from tests.authority.failing_methods import field, sky
 
 # In the order of the light's way. The cases that a machine draws come between the two groups.

@@ -13,12 +13,11 @@ from itertools import product
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, decode, encode
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.monitor.geometry import monitor_camera
-from hilstar.rotation import (
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import (
     angle_between_rad,
     direction_of,
     from_radec_roll_deg,
@@ -27,12 +26,13 @@ from hilstar.rotation import (
     to_matrix,
     to_radec_roll_deg,
 )
-from hilstar.scene.camera import Camera
-from hilstar.scene.sprites import pack_sprites
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.optics.camera import Camera
+from hilstar.optics.sprites import pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.stars import RAD_PER_MAS, cell_grid, unit_vectors_icrs
-from hilstar.study.stability import FailureCase, Figures
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 # float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
 DIRECTION_MAS = 1e-5

@@ -8,10 +8,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.errors import InputError
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.basics.units import LIGHT_M_S, magnitude
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.instruments.study.settings import Table, bench_text, held_out_errors, study_optics
+from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.electrons import (
     TABLE_DEGREE,
     Photometry,
@@ -24,13 +28,9 @@ from hilstar.sky.electrons import (
     tabulate_pickles,
 )
 from hilstar.sky.spectrum import BOLTZMANN_J_K, PLANCK_J_S, TEMPERATURE_SCALES, blackbody_exitance_w_m2_m, constant_curve
-from hilstar.study.settings import Table, bench_text, held_out_errors, study_optics
-from hilstar.study.stability import FailureCase, Figures
 from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
-from hilstar.twin.simulator import Simulator
-from hilstar.units import LIGHT_M_S, magnitude
 
 # Each star of the library held out in turn (README.md): 95 % of the stars with V-I < 2.5 are within 2.4 %, of the redder 25 %.
 BLUE_ERROR, RED_ERROR = 0.024, 0.25

@@ -19,7 +19,7 @@ from selenium.webdriver.common.keys import Keys
 
 import hilstar
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.run.record.ledger_records import EventRecord
+from hilstar.server.record.ledger_records import EventRecord
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.senders import ORION, connected, packet
 from tests.support.servers import Served, bound
@@ -136,7 +136,7 @@ def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
     assert any(pictures_in_a_second(live) >= MIN_PICTURES_HZ for _ in range(CHANCES))
     assert frame_of(live) > first and pixels(live, "picture") != shown
     run.stand_still()
-    wanted = hilstar.rotation.to_radec_roll_deg(np.array(run.q()))
+    wanted = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))
     # Four decimals are shown.
     live.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {wanted[0]}) < 1e-4")
     live.until(f"Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) - {wanted[1]}) < 1e-4")
@@ -147,7 +147,7 @@ def test_single_pixels_have_the_codes_of_that_attitude(live, run):
     with hilstar.load(run.folder / "serve.toml") as bench:
         codes = bench.frame(np.array(run.q())).codes
     y, x = np.unravel_index(np.argmax(codes), codes.shape)
-    shown_deg = hilstar.rotation.to_radec_roll_deg(np.array(run.q()))[0]
+    shown_deg = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))[0]
     live.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {shown_deg}) < 1e-4")
     first = frame_of(live)
     live.until(f"document.getElementById('picture').dataset.frame > {first}")

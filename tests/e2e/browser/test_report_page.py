@@ -12,10 +12,10 @@ from selenium.webdriver.common.keys import Keys
 
 import hilstar
 from hilstar.attitude.wire.packet import decode
-from hilstar.notices import Notice
-from hilstar.rotation import from_rotation_vector, multiply
-from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
+from hilstar.basics.notices import Notice
+from hilstar.basics.rotation import from_rotation_vector, multiply
+from hilstar.server.record.ledger import Ledger
+from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.commands import run_hilstar_here

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 import hilstar
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.cameras import NO_MISALIGNMENT, tracker_camera
-from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, monitor_camera, write_geometry
-from hilstar.rotation import (
+from hilstar.basics.rotation import (
     angle_between_rad,
     from_radec_roll_deg,
     from_rotation_vector,
@@ -21,12 +18,15 @@ from hilstar.rotation import (
     normalise,
     propagate,
 )
-from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.scene.camera import Lens
-from hilstar.twin.optics import BenchGeometry
-from hilstar.twin.verify.twin import true_geometry
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, monitor_camera, write_geometry
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.twin import true_geometry
+from hilstar.optics.camera import Lens
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import NO_MISALIGNMENT, tracker_camera
+from hilstar.server.record.ledger import Ledger
+from hilstar.server.record.ledger_records import FrameRecord
 from tests.support.alignment import HEADER, reported, write_pairs
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here

@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 from scipy.special import ndtr
 
-from hilstar.calibrate.geometric.dots import read_plan
-from hilstar.monitor.geometry import monitor_camera
-from hilstar.optics.psf_file import read_glass
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.calibrate.geometric.dots import read_plan
+from hilstar.optics.glass.psf_file import read_glass
 from tests.support.commands import assert_refused, run_hilstar_here
 
 SIZE = 512, 288

@@ -14,17 +14,17 @@ import time
 import numpy as np
 import pytest
 
-from hilstar import charts
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.cameras import bench_camera
-from hilstar.calibrate.first_light.photometry import response_error_mag
-from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
-from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
-from hilstar.monitor.response import gamma_response, srgb_response
-from hilstar.resources import resource_path
-from hilstar.rotation import from_rotation_vector, to_matrix
-from hilstar.scene.camera import Camera, Lens
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics import charts
+from hilstar.basics.resources import resource_path
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.display.response import gamma_response, srgb_response
+from hilstar.instruments.calibrate.first_light.photometry import response_error_mag
+from hilstar.optics.camera import Camera, Lens
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import bench_camera
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here

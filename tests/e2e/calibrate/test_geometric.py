@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 import hilstar
-from hilstar.calibrate.geometric.dots import read_plan
-from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.camera import Camera
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.geometric.dots import read_plan
+from hilstar.optics.camera import Camera
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.traced_bench import TracedBench, observed_dots
 

@@ -11,7 +11,7 @@ from astropy.io import fits
 from PIL import Image
 from scipy.special import ndtr
 
-from hilstar.calibrate.geometric.dots import read_plan
+from hilstar.instruments.calibrate.geometric.dots import read_plan
 from tests.e2e.calibrate.test_geometric import BENCH, FILE, STARS_ARCSEC, TRACKER, TRACKER_PX
 from tests.support.commands import assert_refused, run_hilstar_here
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, bench_text
 from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
 from tests.support.campaigns import plan_text, read_columns

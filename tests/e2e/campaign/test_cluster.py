@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import hilstar
-from hilstar.campaign import cluster
+from hilstar.instruments.campaign import cluster
 from tests.support.benches import ROOT
 from tests.support.campaigns import read_columns, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, run_started
@@ -36,7 +36,7 @@ def solve(image, tracker):
 FETCH = """
 import os, signal, sys
 import distributed
-from hilstar.campaign import cluster
+from hilstar.instruments.campaign import cluster
 cluster.FETCH_S = 1.0
 with distributed.Client(sys.argv[1]) as client:
     client.wait_for_workers(1)
@@ -67,7 +67,7 @@ def other_version(folder: Path) -> Path:
     (folder / "other" / "hilstar").mkdir(parents=True)
     for entry in Path(hilstar.__file__).parent.iterdir():
         if entry.name == "version.py":
-            (folder / "other/hilstar/version.py").write_text(
+            (folder / "other/hilstar/basics/version.py").write_text(
                 re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text())
             )
         elif entry.name != "__pycache__":

@@ -16,8 +16,8 @@ import pytest
 
 import hilstar
 from hilstar.attitude.logs.log_formats import readable
+from hilstar.basics.errors import HilstarError, InputError, one_line
 from hilstar.cli.app import run
-from hilstar.errors import HilstarError, InputError, one_line
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
 from tests.support.forks import HILSTAR, Started

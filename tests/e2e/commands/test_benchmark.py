@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.speed import benchmark
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
-from hilstar.study.sweep import Load
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.study.speed import benchmark
+from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
+from hilstar.instruments.study.sweep import Load
 from tests.support.commands import assert_refused, run_hilstar_here, run_started
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
@@ -22,7 +22,7 @@ Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
 FEWER_ROUNDS = """
 from dataclasses import replace
 from hilstar.__main__ import main
-from hilstar.study.speed import benchmark
+from hilstar.instruments.study.speed import benchmark
 benchmark.QUICK = replace(benchmark.QUICK, starts=1, rounds=12, budget_s=0.7)
 main()
 """

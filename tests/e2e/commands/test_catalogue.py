@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 

@@ -17,8 +17,8 @@ from astropy.io import fits
 from PIL import Image
 
 import hilstar
-from hilstar.monitor.response import encode, srgb_response
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.display.response import encode, srgb_response
 from tests.support import leftovers
 from tests.support.benches import ROOT, SMALL_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, has_handlers, run_hilstar, run_hilstar_here

@@ -11,9 +11,9 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from hilstar.render.reference import linear_image
-from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import pack_sprites
+from hilstar.display.render.reference import linear_image
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 

@@ -11,9 +11,9 @@ import time
 import numpy as np
 import pytest
 
-from hilstar.bench.config.attitude import AttitudeSettings
-from hilstar.bench.frame import Bench
-from hilstar.run import demo
+from hilstar.server import demo
+from hilstar.server.bench.config.attitude import AttitudeSettings
+from hilstar.server.bench.frame import Bench
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
 from tests.support.pages import live, page_of, picture_of

@@ -14,10 +14,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import hilstar
-from hilstar.bench.frame import clipping_hip
-from hilstar.monitor.calibration import load_calibration
-from hilstar.scene.psf import GaussianPsf, pixel_share
-from hilstar.twin.budget import budget, zero_point_mag
+from hilstar.display.calibration import load_calibration
+from hilstar.instruments.simulate.budget import budget, zero_point_mag
+from hilstar.optics.psf import GaussianPsf, pixel_share
+from hilstar.server.bench.frame import clipping_hip
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 

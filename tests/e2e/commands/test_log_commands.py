@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 RATE = np.radians([0.3, -0.2, 2.0])
@@ -106,7 +106,7 @@ def test_fault_options_stand_alone_or_take_a_share(tmp_path):
 
 def test_a_resampled_log_keeps_its_breaks_and_its_rates(tmp_path):
     from hilstar.attitude.logs.log_file import read_log
-    from hilstar.run.send_log import log_samples
+    from hilstar.server.send_log import log_samples
 
     lines = [
         {"t_ns": 0, "q": [1, 0, 0, 0], "rate": [0, 0, 0.1]},

@@ -12,11 +12,11 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import load
-from hilstar.rotation import conjugate, from_radec_roll_deg
-from hilstar.twin.budget import not_drawn
-from hilstar.twin.verify.star_finder import faintest_e_per_s
+from hilstar.basics.rotation import conjugate, from_radec_roll_deg
+from hilstar.instruments.simulate.budget import not_drawn
+from hilstar.instruments.simulate.star_finder import faintest_e_per_s
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import load
 from tests.support.commands import run_hilstar_here
 from tests.support.skies import STATION_TLE, STATION_UTC, skyfield, utc_ns
 from tests.support.sources.aem_messages import kvn

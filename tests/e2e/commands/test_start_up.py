@@ -17,8 +17,8 @@ OF_SOME_FRAMES = {
     "hilstar.attitude.wire.packet",
     "numpy.ma",
     "numpy.random",
-    "hilstar.render.disc_tiles",
-    "hilstar.scene.trails",
+    "hilstar.display.render.disc_tiles",
+    "hilstar.optics.trails",
     "scipy",
 }
 FIRST_FRAME = """import sys, hilstar
@@ -39,7 +39,7 @@ def modules_after(program: str, *words: str) -> set[str]:
     return set(result.stdout.split())
 
 
-@pytest.mark.parametrize("module", ["hilstar.cli", "hilstar.bench.build", "hilstar.run.send_log"])
+@pytest.mark.parametrize("module", ["hilstar.cli", "hilstar.server.bench.build", "hilstar.server.send_log"])
 def test_nothing_heavy_is_imported_before_it_is_used(module):
     assert not imported_by(module) & HEAVY
 
@@ -50,7 +50,7 @@ def test_the_process_that_reads_a_link_imports_no_numpy():
 
 
 def test_a_run_imports_before_its_first_frame_what_some_frames_need():
-    assert {"scipy.special", "hilstar.render.disc_tiles"} <= imported_by("hilstar.run.loop")
+    assert {"scipy.special", "hilstar.display.render.disc_tiles"} <= imported_by("hilstar.server.loop")
 
 
 def test_the_first_frame_of_stars_alone_imports_nothing_that_only_others_need():
@@ -60,7 +60,7 @@ def test_the_first_frame_of_stars_alone_imports_nothing_that_only_others_need():
 def test_a_run_begins_no_other_process_by_what_it_imports():
     """As the own search of glfw would, whose process says a traceback where a signal ends the start-up meanwhile."""
     program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
-    program += "import hilstar.cli.serve, hilstar.run.screen.gate; print('glfw' in sys.modules)"
+    program += "import hilstar.cli.serve, hilstar.server.screen.gate; print('glfw' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}
     result = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S, env=environment

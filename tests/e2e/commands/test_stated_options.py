@@ -13,7 +13,7 @@ import pytest
 from astropy.io import fits
 from scipy.spatial.transform import Rotation
 
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 

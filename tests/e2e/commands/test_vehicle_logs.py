@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.run.record.ledger_records import EventRecord, frame_records
+from hilstar.server.record.ledger_records import EventRecord, frame_records
 from tests.support.commands import run_hilstar_here
 from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
 from tests.support.run_page import run_data_of
@@ -21,7 +21,7 @@ from tests.support.servers import bound
 from tests.support.waiting import CHANCES, wait_for
 
 pytestmark = pytest.mark.e2e
-PAGE = "hilstar.console.server"
+PAGE = "hilstar.server.console.server"
 # `stale_after_ms` is 250; then the next frame, a tick of the run's and one of the page's. What is left is for a busy machine.
 STALE_S, SEEN_S = 0.25, 0.5
 

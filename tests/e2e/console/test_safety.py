@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.console.server.connections import MAX_CONNECTIONS, PONG_S
+from hilstar.server.console.server.connections import MAX_CONNECTIONS, PONG_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pages import PageAddress, children, live, page_of, raw
 from tests.support.senders import free_port
@@ -222,7 +222,7 @@ def test_two_hundred_idle_and_hostile_connections_leave_room_for_the_operator(lo
 def test_connections_that_stay_after_their_answer_are_bounded(local):
     """They give way before one that waits for its own: descriptors do not run out."""
     served, page = local
-    (pid,) = children(served.process.pid, "hilstar.console.server")
+    (pid,) = children(served.process.pid, "hilstar.server.console.server")
     with contextlib.ExitStack() as stack:
         for _ in range(300):
             connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
@@ -263,32 +263,32 @@ DEEP = ["[" * 3900, '{"want": {"x": ' + "[" * 3900, '{"want": {"picture": "' + "
 @pytest.mark.parametrize("text", [*NONSENSE, *map(hz, HZ), *DEEP], ids=lambda text: text[:45])
 def test_a_page_that_says_nonsense_is_closed_and_the_page_s_process_stays(local, text):
     served, page = local
-    before = children(served.process.pid, "hilstar.console.server")
+    before = children(served.process.pid, "hilstar.server.console.server")
     with live(page) as link:
         link.say(text)
         with contextlib.suppress(OSError):
             for _ in link.messages():
                 pass  # until it is closed
     assert page.ask("/health")[0] in {200, 503}
-    assert children(served.process.pid, "hilstar.console.server") == before
+    assert children(served.process.pid, "hilstar.server.console.server") == before
 
 
 @pytest.mark.parametrize("text", ["5e-324", "1e-300", "0.001", "1e308", "123456789012345678901234567890"])
 def test_a_wish_beyond_bounds_is_one_within_them(local, text):
     served, page = local
-    before = children(served.process.pid, "hilstar.console.server")
+    before = children(served.process.pid, "hilstar.server.console.server")
     with live(page) as link:
         link.say(hz(text))
         for _ in range(5):
             link.await_message(lambda said: "state" in said if isinstance(said, dict) else False)
-    assert children(served.process.pid, "hilstar.console.server") == before
+    assert children(served.process.pid, "hilstar.server.console.server") == before
 
 
 def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local):
     """More of them than there are places, as browsers' pages with wishes: each that comes later has a place all the same."""
     served, page = local
     own = {"Origin": f"http://127.0.0.1:{page.port}"}
-    before = children(served.process.pid, "hilstar.console.server")
+    before = children(served.process.pid, "hilstar.server.console.server")
     with contextlib.ExitStack() as stack:
         deaf = [stack.enter_context(live(page, own)) for _ in range(40)]
         for each in deaf[-32:]:
@@ -299,7 +299,7 @@ def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local
             for each in [stack.enter_context(live(page, own)) for _ in range(40)]:
                 each.want(picture=True, hz=10)
             link.await_message(lambda _: clients(page) == 1, 10 * PONG_S)
-    assert children(served.process.pid, "hilstar.console.server") == before
+    assert children(served.process.pid, "hilstar.server.console.server") == before
 
 
 def test_a_page_that_reads_gives_way_before_the_operator_is_refused(local):
@@ -314,7 +314,7 @@ def test_a_page_that_reads_gives_way_before_the_operator_is_refused(local):
 
 def test_pings_whose_answers_are_not_read_take_little_memory(local):
     served, page = local
-    (pid,) = children(served.process.pid, "hilstar.console.server")
+    (pid,) = children(served.process.pid, "hilstar.server.console.server")
     before_mb = resident_mb(pid)
     with live(page) as link, contextlib.suppress(OSError):
         link.flood(b"\x89\xfd\0\0\0\0" + b"x" * 125, 200_000)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import pyvisa
 
-from hilstar.rotation import conjugate, multiply
+from hilstar.basics.rotation import conjugate, multiply
 from tests.support.benches import LIVE_BENCH, ORION_Q
 from tests.support.commands import run_hilstar_here
 from tests.support.forks import HILSTAR
@@ -160,7 +160,7 @@ def test_errors_are_the_standard_s_and_set_their_bits(stand):
 
 def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
     served, port = run
-    page = children(served.process.pid, "hilstar.console.server")[0]
+    page = children(served.process.pid, "hilstar.server.console.server")[0]
     rng = np.random.default_rng(5025)
 
     def used_mb() -> float:
@@ -190,7 +190,7 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
         assert opened.ask("*IDN?").startswith("hilstar")
     for each in (unread, *idle):
         each.close()
-    assert children(served.process.pid, "hilstar.console.server") == [page] and served.process.poll() is None
+    assert children(served.process.pid, "hilstar.server.console.server") == [page] and served.process.poll() is None
 
 
 @pytest.mark.parametrize(

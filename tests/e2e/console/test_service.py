@@ -46,7 +46,7 @@ class Systemd:
             try:
                 yield process
             finally:
-                pages = children(process.pid, "hilstar.console.server")
+                pages = children(process.pid, "hilstar.server.console.server")
                 process.kill()
                 wait_for(lambda: all(gone(pid) for pid in pages))
 

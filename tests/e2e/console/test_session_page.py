@@ -40,7 +40,7 @@ def test_a_session_shows_its_patterns_and_tells_its_steps(tmp_path):
                 head, levels = picture_of(link.await_message(is_lit))
                 assert (head["w"], head["h"], str(levels.dtype)) == (640, 480, "uint16")
             assert page.json("/health")["ok"]
-            pages = children(process.pid, "hilstar.console.server")
+            pages = children(process.pid, "hilstar.server.console.server")
         finally:
             process.send_signal(signal.SIGKILL)
         wait_for(lambda: all(gone(pid) for pid in pages))

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 import zmq
 
-from hilstar.answers.answer import Answer
-from hilstar.answers.reader import AnswersApart, open_answers
 from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
-from hilstar.bench.config import parse_config
-from hilstar.errors import HilstarError
-from hilstar.notices import Notices
+from hilstar.basics.errors import HilstarError
+from hilstar.basics.notices import Notices
+from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.reader import AnswersApart, open_answers
+from hilstar.server.bench.config import parse_config
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -276,7 +276,7 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
                     file.write(b'{"q":[0.6,0,0.8,0]}\n')
 
         with http.server.HTTPServer(("127.0.0.1", 0), Page) as server:
-            monkeypatch.setattr("hilstar.console.listener.PORT", server.server_port)
+            monkeypatch.setattr("hilstar.server.console.listener.PORT", server.server_port)
             threads = [threading.Thread(target=each) for each in (server.handle_request, answer_until_over)]
             for thread in threads:
                 thread.start()

@@ -30,8 +30,8 @@ from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp import Datagrams, UdpLink
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, vizard_broadcast
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
 from tests.support.commands import run_started
 from tests.support.forks import Started
 from tests.support.senders import connected, free_port, packet, publisher
@@ -305,7 +305,7 @@ def test_a_reader_that_cannot_begin_is_tried_again_and_ends_nothing(caplog):
 def test_a_process_that_works_for_long_loses_its_priority_until_it_rests():
     program = """
 import os
-from hilstar.process.scheduling import PromptWhileLight
+from hilstar.basics.process.scheduling import PromptWhileLight
 now_s = used_s = 0.0
 def scheduled(): return os.sched_getscheduler(0)
 prompt = PromptWhileLight(lambda: now_s, lambda: used_s)

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.run.record.ledger_records import frame_records
+from hilstar.server.record.ledger_records import frame_records
 from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR

@@ -16,10 +16,10 @@ from fmpy.validation import validate_fmu
 
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import AnswerPacket, TimeRequest, encode
-from hilstar.rotation import from_rotation_vector, multiply
-from hilstar.run import fmu_model
-from hilstar.run.sender import Sender
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import from_rotation_vector, multiply
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.server import fmu_model
+from hilstar.server.sender import Sender
 from tests.e2e.console.test_scpi import instrument, scpi_run
 from tests.support.benches import LIVE_BENCH, ORION_Q
 from tests.support.commands import run_hilstar_here

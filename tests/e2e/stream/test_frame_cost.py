@@ -115,8 +115,8 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
 
 def test_a_frame_that_hangs_is_told_with_its_stage():
     """The loop's own thread stands still; the watchdog's does not."""
-    from hilstar.notices import Notices
-    from hilstar.run.watchdog import FrameWatch
+    from hilstar.basics.notices import Notices
+    from hilstar.server.watchdog import FrameWatch
 
     notices, told = Notices(), threading.Event()
     lines: list[str] = []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.record.ledger_records import EventRecord, run_records
+from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.support.benches import SMALL_BENCH, still_log
 from tests.support.commands import run_hilstar_here, run_started
 from tests.support.ledgers import read_run
@@ -17,9 +17,9 @@ from tests.support.x11.screens import xvfb
 # hilstar's command line in which harm is done, once and for real, when the run first looks how long the machine has slept.
 PLANTED = """
 import sys
-from hilstar.bench import build
+from hilstar.server.bench import build
 from hilstar.cli import run_command
-from hilstar.process.scheduling import HostClock
+from hilstar.basics.process.scheduling import HostClock
 
 harm, wanted, slept_s = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 benches, looks = [], 0

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.rotation import angle_between_rad, multiply
-from hilstar.run.record.ledger_records import frame_records
+from hilstar.basics.rotation import angle_between_rad, multiply
+from hilstar.server.record.ledger_records import frame_records
 from tests.support.commands import assert_refused, run_hilstar
 from tests.support.forks import HILSTAR, Started
 from tests.support.heads import MOUNTINGS, heads_file

@@ -15,10 +15,10 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.errors import InputError
-from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.run.record.ledger_records import drawable_frames
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.record.ledger_records import drawable_frames
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import Started

@@ -17,12 +17,12 @@ from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.attitude.wire.links import LinkCounts
 from hilstar.attitude.wire.nasa42 import MessageReader, MessageSplitter, Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.source import Mounting
-from hilstar.bench.build import load
-from hilstar.errors import InputError
-from hilstar.rotation import angle_between_rad, propagate
-from hilstar.run.loop import Limit
-from hilstar.run.record.ledger_records import frame_records
-from hilstar.run.serve import serve
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.server.bench.build import load
+from hilstar.server.loop import Limit
+from hilstar.server.record.ledger_records import frame_records
+from hilstar.server.serve import serve
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.live_runs import MAX_EXTRAPOLATION_NS, attitudes, serve_until

@@ -16,12 +16,12 @@ import zmq
 
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
-from hilstar.bench.build import load
-from hilstar.rotation import angle_between_rad, propagate
-from hilstar.run.pacer import Shown
-from hilstar.run.record.ledger_records import EventRecord
-from hilstar.run.serve import Running
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.server.bench.build import load
+from hilstar.server.pacer import Shown
+from hilstar.server.record.ledger_records import EventRecord
+from hilstar.server.serve import Running
 from tests.support.live_runs import serve_until
 from tests.support.pages import page_of
 from tests.support.senders import ORION, connected, free_port, packet, publisher

@@ -19,12 +19,12 @@ from cobs import cobs
 
 from hilstar.attitude.wire.links import MAX_PACKETS_PER_S
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.bench.build import load
-from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
-from hilstar.run.loop import Limit
-from hilstar.run.send_log import BadCable, Faults, send, spin_samples
-from hilstar.run.sender import SerialSender
-from hilstar.run.serve import serve
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate
+from hilstar.server.bench.build import load
+from hilstar.server.loop import Limit
+from hilstar.server.send_log import BadCable, Faults, send, spin_samples
+from hilstar.server.sender import SerialSender
+from hilstar.server.serve import serve
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.live_runs import attitudes, median_age_ns, serve_until

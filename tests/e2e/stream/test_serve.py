@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zmq
 
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import await_subscriber, connected, free_port, packet, publisher, publishing

@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.process.interrupts import GUARD_WAITS_S, THREAD_WAITS_S
+from hilstar.basics.process.interrupts import GUARD_WAITS_S, THREAD_WAITS_S
 from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import has_handlers
 from tests.support.forks import Started
@@ -31,7 +31,7 @@ LATE_S = 0.5
 NO_ATTITUDE = 4
 STUCK = """
 import sys, time
-from hilstar.run.loop import FrameLoop
+from hilstar.server.loop import FrameLoop
 def drawn(self, *arguments):
     print("drawing", flush=True)
     {}
@@ -156,7 +156,7 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
 def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_python_s(tmp_path):
     """numba's LLVM does: ctypes prints an exception that comes of a callback, and goes on. Here qsort does, with no numba."""
     before = (
-        "import ctypes, os, signal\nfrom hilstar.study.speed import benchmark\n"
+        "import ctypes, os, signal\nfrom hilstar.instruments.study.speed import benchmark\n"
         "kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\n"
         "def told(*pair):\n    os.kill(os.getpid(), signal.SIGINT)\n    return 0\n"
         "def draw(*arguments):\n    ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n"
@@ -173,7 +173,7 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
 def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
     """Python runs a handler between any two steps of the main thread, and there it may hold the lock of what it waits for."""
     before = (
-        "import os, signal\nfrom hilstar.process.scheduling import HostClock\nwait = HostClock.wait_until\n"
+        "import os, signal\nfrom hilstar.basics.process.scheduling import HostClock\nwait = HostClock.wait_until\n"
         "def told(clock, due_ns, stop):\n    with stop._cond:\n        os.kill(os.getpid(), signal.SIGINT)\n"
         "    return wait(clock, due_ns, stop)\n"
         "HostClock.wait_until = told"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.console import run_status
+from hilstar.server.console import run_status
 from tests.support.benches import LIVE_BENCH, attitude_table, still_log
 from tests.support.commands import HILSTAR, run_hilstar_here
 from tests.support.forks import Started

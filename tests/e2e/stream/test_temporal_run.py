@@ -8,14 +8,14 @@ import numpy as np
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.udp import UdpLink
-from hilstar.bench.build import load
-from hilstar.notices import Notices
-from hilstar.run.loop import Limit
-from hilstar.run.record.ledger import Ledger, LedgerSwitch
-from hilstar.run.replay import Wanted, plan_play, replay
-from hilstar.run.send_log import BadCable, Faults, send, spin_samples
-from hilstar.run.sender import UdpSender
-from hilstar.run.serve import Outlet, serve
+from hilstar.basics.notices import Notices
+from hilstar.server.bench.build import load
+from hilstar.server.loop import Limit
+from hilstar.server.record.ledger import Ledger, LedgerSwitch
+from hilstar.server.replay import Wanted, plan_play, replay
+from hilstar.server.send_log import BadCable, Faults, send, spin_samples
+from hilstar.server.sender import UdpSender
+from hilstar.server.serve import Outlet, serve
 from tests.support.benches import bench_text
 from tests.support.senders import free_port
 

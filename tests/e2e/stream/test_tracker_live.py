@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilstar.run.record.ledger_records import answer_records
+from hilstar.server.record.ledger_records import answer_records
 from tests.support.benches import ROOT
 from tests.support.commands import run_hilstar_here
 from tests.support.pages import live, page_of

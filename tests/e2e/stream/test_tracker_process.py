@@ -17,7 +17,7 @@ import zmq
 
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
-from hilstar.rotation import conjugate, from_radec_roll_deg, multiply, propagate, to_rotation_vector
+from hilstar.basics.rotation import conjugate, from_radec_roll_deg, multiply, propagate, to_rotation_vector
 from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started

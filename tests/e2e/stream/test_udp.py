@@ -18,13 +18,13 @@ import pytest
 from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode, encode
 from hilstar.attitude.wire.udp import UdpLink
-from hilstar.bench.build import load
-from hilstar.notices import Notices
-from hilstar.rotation import angle_between_rad, propagate
-from hilstar.run.pacer import Shown
-from hilstar.run.send_log import BadCable, Faults, send, spin_samples
-from hilstar.run.sender import UdpSender
-from hilstar.run.serve import Outlet, Running
+from hilstar.basics.notices import Notices
+from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.server.bench.build import load
+from hilstar.server.pacer import Shown
+from hilstar.server.send_log import BadCable, Faults, send, spin_samples
+from hilstar.server.sender import UdpSender
+from hilstar.server.serve import Outlet, Running
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started

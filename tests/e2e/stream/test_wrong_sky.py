@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import zmq
 
-from hilstar.console.report import report
-from hilstar.rotation import conjugate, propagate
+from hilstar.basics.rotation import conjugate, propagate
+from hilstar.server.console.report import report
 from tests.support.commands import run_hilstar_here
 from tests.support.pages import page_of
 from tests.support.senders import ORION, connected

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.monitor.calibration import CalibrationHead, NotesTable, add_uniformity, write_calibration
-from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
-from hilstar.monitor.response import srgb_response
-from hilstar.rotation import from_rotation_vector, multiply, to_matrix
-from hilstar.scene.camera import Camera, Lens
-from hilstar.toml_tables import toml_text
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import from_rotation_vector, multiply, to_matrix
+from hilstar.basics.toml_tables import toml_text
+from hilstar.display.calibration import CalibrationHead, NotesTable, add_uniformity, write_calibration
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.display.response import srgb_response
+from hilstar.optics.camera import Camera, Lens
 
 # Panels that labs have: kind, range of pixel pitch in um, sizes.
 PANELS = (
@@ -312,8 +312,8 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
 
 def _white_e_per_s(folder: Path) -> float:
     """Full scale as the bench file has it."""
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.build import open_bench
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.build import open_bench
 
     with open_bench(read_bench_file(folder / "bench.toml")) as bench:
         return bench.flux_at_white_e_per_s

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.build import bench_calibration
-from hilstar.bench.cameras import bench_camera, tracker_camera
-from hilstar.bench.config.hardware import Monitor
-from hilstar.certify.readings import white_of
-from hilstar.monitor.calibration import read_toml
-from hilstar.units import ARCSEC_PER_RAD, magnitude
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
+from hilstar.display.calibration import read_toml
+from hilstar.instruments.certify.readings import white_of
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.build import bench_calibration
+from hilstar.server.bench.cameras import bench_camera, tracker_camera
+from hilstar.server.bench.config.hardware import Monitor
 from tests.support.any_bench.draw import DrawnBench, true_light
 
 STEPS = ("orientation", "focus", "warm-up", "geometry", "uniformity", "photometry", "scale", "latency", "verify")

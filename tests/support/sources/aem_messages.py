@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 EPOCHS = ("2024-02-29T23:59:59.25", "2024-03-01T00:00:01")
 

@@ -14,7 +14,7 @@ import csv
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilstar.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
 from tests.support.benches import ROOT
 
 FOLDER = ROOT / "tests" / "unit" / "attitude" / "wire" / "nasa42"

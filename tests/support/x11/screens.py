@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hilstar.run.record.ledger_records import FrameRecord, frame_records
+from hilstar.server.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import ATTITUDE
 from tests.support.commands import run_hilstar_here
 from tests.support.forks import HILSTAR, Started

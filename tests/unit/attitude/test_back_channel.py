@@ -11,7 +11,7 @@ from hilstar.attitude.receiver import ASK_NS, FIRST_ASKS, QUICK_ASK_NS, QUIET, B
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 NOW_NS = 10**12
 SENDER_AHEAD_NS = 7 * NS_PER_S

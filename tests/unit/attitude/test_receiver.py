@@ -16,10 +16,10 @@ from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
-from hilstar.notices import Notice, Notices
-from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
-from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.notices import Notice, Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
+from hilstar.basics.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 5 * NS_PER_MS

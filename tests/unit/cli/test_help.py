@@ -49,7 +49,7 @@ def test_the_version_is_the_package_s(capsys):
 def test_the_version_stands_in_one_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
-    assert project["tool"]["hatch"]["version"]["path"] == "hilstar/version.py"
+    assert project["tool"]["hatch"]["version"]["path"] == "hilstar/basics/version.py"
 
 
 def test_help_shows_the_name_of_a_table(capsys):

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.cameras import fields_of_view
-from hilstar.errors import InputError, MachineError
-from hilstar.resources import resource_path
-from hilstar.run.doctor import BenchReport
-from hilstar.run.screen.gate import size_fault
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.resources import resource_path
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import fields_of_view
+from hilstar.server.doctor import BenchReport
+from hilstar.server.screen.gate import size_fault
 from hilstar.sky.spectrum import QUANTUM_EFFICIENCIES, TRANSMISSIONS, load_curve
 from tests.support.commands import run_hilstar, run_hilstar_here
 
@@ -159,7 +159,7 @@ def test_a_serial_port_that_is_not_there_is_the_machine_s(port: str, tmp_path: P
 
 
 def test_a_display_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hilstar.monitor.window.window import displays
+    from hilstar.display.window.window import displays
 
     monkeypatch.setenv("DISPLAY", ":9973")
     with pytest.raises(MachineError, match="DISPLAY=:9973: no X server answers there"):
@@ -183,9 +183,9 @@ def test_certify_finds_the_example_of_the_truth(tmp_path: Path, monkeypatch: pyt
 
 
 def test_doctor_keeps_a_long_name_apart_from_its_text() -> None:
-    from hilstar.bench.cameras import bench_camera
-    from hilstar.bench.measured_on import MonitorCheck
-    from hilstar.bench.star_size import star_size
+    from hilstar.server.bench.cameras import bench_camera
+    from hilstar.server.bench.measured_on import MonitorCheck
+    from hilstar.server.bench.star_size import star_size
 
     file = read_bench_file(DEMO)
     star = star_size(file.config, file.folder, bench_camera(file.config, file.folder))

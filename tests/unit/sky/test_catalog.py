@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import COLUMN_COUNT, PACKAGED_CATALOG, load_catalog, plain_catalog
 
 # Rows 1 and 2 of CDS I/239 and HIP 32349 (Sirius), as they stand in the file.

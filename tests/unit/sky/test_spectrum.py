@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
-from hilstar.reading import warn_once
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
 from hilstar.sky.electrons import Optics, Photometry, tabulate
 from hilstar.sky.spectrum import (
     Curve,

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from scipy import ndimage, stats
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.tracker.detector import RAY_DEPTH_UM, RAY_E_PER_UM, Detector, bloom, cosmic_rays_e, false_stars_e
 from hilstar.tracker.settings import MAX_E, DetectorSettings, e2v_dark, silicon_gap_ev
 

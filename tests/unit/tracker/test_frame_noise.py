@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 from scipy.special import ndtr
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.tracker import frame_noise
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.frame_noise import draw_blocks, normal_pairs, poisson

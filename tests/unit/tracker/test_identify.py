@@ -7,8 +7,8 @@ import builtins
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
-from hilstar.rotation import angle_between_rad, from_rotation_vector, multiply, normalise, to_matrix
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import angle_between_rad, from_rotation_vector, multiply, normalise, to_matrix
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.tracker.identify import FoundStars, LostInSpace, identify, wahba

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from hilstar.monitor.balance import Balance, Seen
-from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import Panel
-from hilstar.monitor.response import srgb_response
-from hilstar.render.reference import linear_image
-from hilstar.scene.psf import GaussianPsf
+from hilstar.display.balance import Balance, Seen
+from hilstar.display.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.display.quantise import Panel
+from hilstar.display.render.reference import linear_image
+from hilstar.display.response import srgb_response
+from hilstar.optics.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import GOLDEN, Judge, stamp_errors
 from tests.support import centroiders as outside

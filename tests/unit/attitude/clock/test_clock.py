@@ -11,7 +11,7 @@ from hilstar.attitude.clock.jumps import JumpFilter
 from hilstar.attitude.clock.sender_clock import EXCHANGE_LIFE_NS, MIN_EXCHANGES, SLEW, Exchange, SenderClock
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 PERIOD_NS = 5_000_000
 MIN_DELAY_MS = 0.05

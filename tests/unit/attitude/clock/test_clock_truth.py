@@ -15,7 +15,7 @@ from hilstar.attitude.clock.jumps import LATE_FOR_NS, WAITED_UNKNOWN_NS, JumpFil
 from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 PERIOD_NS = 5 * NS_PER_MS
 MIN_DELAY_NS = 50_000

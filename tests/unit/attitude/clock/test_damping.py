@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import angle_between_rad, from_radec_roll_deg, from_rotation_vectors, multiply, propagate
-from hilstar.study.prediction import shaken_error
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, from_rotation_vectors, multiply, propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
+from hilstar.instruments.study.prediction import shaken_error
 
 START = from_radec_roll_deg(84.057, -1.2, 10.0)
 TURN_RAD_S = np.radians([0.2, -1.0, 3.0])

@@ -7,8 +7,8 @@ import pytest
 
 from hilstar.attitude.clock.losses import RECENT, UNIT, LossCount, TimeUnit
 from hilstar.attitude.wire.packet import U32
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
 
 
 def lost_of(*sequences: int) -> int:

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.rate_causes import OTHER_AXES, ReadAs
 from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.notices import Notices
-from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply, rotate
-from hilstar.units import NS_PER_S
-from hilstar.wrong_sky import CONVENTION
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.notices import Notices
+from hilstar.basics.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply, rotate
+from hilstar.basics.units import NS_PER_S
+from hilstar.basics.wrong_sky import CONVENTION
 
 ARCSEC = math.radians(1 / 3600)
 FINE_S = 1e-3  # steps of the true motion: 0.1 arcsec off in a second of the fastest of these turns

@@ -7,8 +7,8 @@ import pytest
 
 from hilstar.attitude.clock.resolution import COARSE, Resolution, coarse_lines
 from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
-from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 
 TURN_RAD_S = np.radians([0.1, -0.2, 0.5])
 START = from_radec_roll_deg(84.057, -1.2, 10.0)

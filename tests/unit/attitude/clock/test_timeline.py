@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate, rate_between_rad_s
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate, rate_between_rad_s
 
 MS = 1_000_000
 S = 1000 * MS

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log, read_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
+from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few roundings of 1.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.wire.source import Mounting
-from hilstar.rotation import to_matrix
+from hilstar.basics.rotation import to_matrix
 from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Angles are written with 17 digits; three turns of them are a few roundings of 1 rad.

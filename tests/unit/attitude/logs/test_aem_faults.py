@@ -12,8 +12,8 @@ from hilstar.attitude.clock.timeline import Policy
 from hilstar.attitude.logs import aem, aem_blocks
 from hilstar.attitude.logs.log_file import log_timeline, open_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_S
 from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Epochs

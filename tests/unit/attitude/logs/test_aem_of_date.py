@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Mounting
-from hilstar.rotation import to_matrix
+from hilstar.basics.rotation import to_matrix
 from tests.support.sources.aem_messages import kvn, refusal
 
 ARCSEC = np.radians(1 / 3600)

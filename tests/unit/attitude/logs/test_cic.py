@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.errors import InputError
-from hilstar.rotation import to_radec_roll_deg
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.aem_messages import kvn
 from tests.support.sources.attitude_texts import cic_text
 

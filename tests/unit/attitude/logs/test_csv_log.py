@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.telemetry import read_telemetry
-from hilstar.errors import InputError
-from hilstar.reading import warn_once
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
 from tests.support.commands import run_hilstar_here
 
 Q = "0.6987226,0.7135120,-0.0370377,0.0362700"

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 import hilstar
-from hilstar import reading
 from hilstar.attitude.logs import log_formats as formats
 from hilstar.attitude.logs.log_file import open_log, read_log, write_log
-from hilstar.errors import InputError, MachineError
+from hilstar.basics import reading
+from hilstar.basics.errors import InputError, MachineError
 from tests.support.commands import run_hilstar_here
 
 PYPROJECT = Path(hilstar.__file__).parents[1] / "pyproject.toml"

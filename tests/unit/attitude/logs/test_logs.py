@@ -13,7 +13,7 @@ import pytest
 from hilstar.attitude.logs import log_file as logs
 from hilstar.attitude.logs.log_file import read_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 HEAD = "t_s,qw,qx,qy,qz\n"
 FULL_HEAD = "t_s,qw,qx,qy,qz,rx,ry,rz,sequence,discontinuity\n"

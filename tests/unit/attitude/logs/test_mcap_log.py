@@ -22,7 +22,7 @@ from hilstar.attitude.logs.mcap_log import (
     register_attitudes,
 )
 from hilstar.attitude.wire.packet import AttitudeSample, encode
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -19,8 +19,8 @@ from hilstar.attitude.logs.mcap_formats import ledger_format
 from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Mounting
-from hilstar.errors import InputError
-from hilstar.rotation import propagate
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import propagate
 from tests.support.sources import ros_bags
 from tests.support.sources import spice_kernels as ck
 from tests.support.sources.aem_messages import kvn

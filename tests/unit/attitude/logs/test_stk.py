@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.earth import q_icrs_to_itrs
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.errors import InputError
-from hilstar.rotation import to_radec_roll_deg
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.attitude_texts import stk_text
 
 ROUNDING = 1e-12

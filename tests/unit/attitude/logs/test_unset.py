@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.mcap_log import register_attitudes
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from tests.support.sources import ros_bags
 from tests.support.sources.aem_messages import kvn
 from tests.support.sources.attitude_texts import cic_text, stk_text

@@ -13,8 +13,8 @@ import pytest
 
 from hilstar.attitude.wire.byte_links import ACCEPT_EACH_S, HELD_S, TOLD_S, FileBytes, TcpBytes, refuse_no_file
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
-from hilstar.errors import InputError
-from hilstar.notices import Notices
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
 

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.source import AS_SENT, HILSTARS, Convention, Mounting, SentAttitudes
-from hilstar.bench.config.bench_config import parse_config
-from hilstar.errors import InputError
-from hilstar.run.open_link import open_link
+from hilstar.basics.errors import InputError
+from hilstar.server.bench.config.bench_config import parse_config
+from hilstar.server.open_link import open_link
 from tests.support.benches import SMALL_BENCH
 from tests.support.senders import free_port, packet
 from tests.support.waiting import PATIENCE_S

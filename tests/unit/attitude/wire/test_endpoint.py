@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 LOOPBACK = ("tcp://127.0.0.1:5560", "tcp://127.9.8.7:1", "tcp://localhost:5560", "tcp://[::1]:65535", "ipc:///tmp/attitude")
 BEYOND = ("tcp://10.0.0.1:5560", "tcp://bench-pc.lab.example:5560", "tcp://localhost.evil:5560", "tcp://[2001:db8::1]:5560")

@@ -13,10 +13,10 @@ import pytest
 from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_NS, PAUSE_S, FloodGate, LinkCounts, RawMessage
 from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares_discontinuity, decode, encode, framed
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.errors import InputError
-from hilstar.notices import Notices
-from hilstar.run.sender import SerialSender
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.sender import SerialSender
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.samples import sample

@@ -9,7 +9,7 @@ import pytest
 import zmq.auth
 
 from hilstar.attitude.wire.keys import AllowList, load_public, load_secret, make_keys
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 
 
 def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(tmp_path, monkeypatch):

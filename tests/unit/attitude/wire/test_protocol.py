@@ -27,7 +27,7 @@ from hilstar.attitude.wire.packet import (
     encode,
     frame,
 )
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT
 from tests.support.waiting import PATIENCE_S
 

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import pytest
 
 from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
-from hilstar.errors import InputError
-from hilstar.run.open_link import first_attitude
+from hilstar.basics.errors import InputError
+from hilstar.server.open_link import first_attitude
 
 BAUD = 115_200
 WITHIN_S = 20.0

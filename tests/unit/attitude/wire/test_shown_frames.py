@@ -18,7 +18,7 @@ from hilstar.attitude.wire.shown_frames import (
     frame_parts,
     read_frame,
 )
-from hilstar.run.frame_feed import lit_pixels
+from hilstar.server.frame_feed import lit_pixels
 from tests.support.waiting import PATIENCE_S, wait_for
 
 HEAD = FrameHead(frame=7, lit_ns=123, width=5, height=3, bits=8, q=(1.0, 0.0, 0.0, 0.0))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, PACKETS, Conventions, Mounting, components
-from hilstar.rotation import to_radec_roll_deg
+from hilstar.basics.rotation import to_radec_roll_deg
 
 # Three products of float64 rotations.
 ROUNDING = 1e-14

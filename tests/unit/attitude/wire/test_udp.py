@@ -19,8 +19,8 @@ from hilstar.attitude.wire.udp import (
     KernelStamps,
     UdpLink,
 )
-from hilstar.notices import Notices
-from hilstar.units import NS_PER_S
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
 from tests.support.fake_clock import FakeClock
 from tests.support.senders import packet
 

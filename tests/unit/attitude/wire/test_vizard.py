@@ -31,10 +31,10 @@ from hilstar.attitude.wire.vizard import (
     update_of,
 )
 from hilstar.attitude.wire.vizard_message import MAX_PARTS, decode_update
-from hilstar.errors import InputError
-from hilstar.notices import Notices
-from hilstar.rotation import to_radec_roll_deg
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.basics.rotation import to_radec_roll_deg
+from hilstar.basics.units import NS_PER_S
 from tests.support.sources.viz_message import craft, viz_message
 from tests.support.waiting import PATIENCE_S
 

@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
-from hilstar.notices import Notices
+from hilstar.basics.notices import Notices
 
 WITHIN_S = 20.0  # a silent peer takes 3 s; a busy machine is slower
 POLL_MS = 50

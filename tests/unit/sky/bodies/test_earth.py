@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hilstar.basics.units import LIGHT_KM_S
 from hilstar.sky.bodies.disc import DARK_V_MAG, Disc, earth_disc, earth_light
 from hilstar.sky.bodies.light import KM_PER_AU, body_v_mag
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.stars import aberrate
-from hilstar.units import LIGHT_KM_S
 from tests.support.ray_traced.bodies import Body, lambert, limb
 from tests.support.skies import ALL_BODIES, STATION_TLE, STATION_UTC, moving_sky, utc_ns
 from tests.support.stars import stars_at

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError, MachineError
+from hilstar.basics.errors import InputError, MachineError
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.stars import Stars

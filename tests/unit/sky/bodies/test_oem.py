@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.bodies.orbit import OemOrbit
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.table_reader import from_gaia

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from hilstar.errors import InputError
-from hilstar.reading import warn_once
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
 from hilstar.sky.star_table import TableChoice, choose_catalog
 
 RA = [78.63, 88.79, 81.28, 84.05, 85.19, 83.0]

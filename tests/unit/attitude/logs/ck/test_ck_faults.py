@@ -12,7 +12,7 @@ import spiceypy
 from hilstar.attitude.logs.ck_spice import answer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.errors import InputError, MachineError
+from hilstar.basics.errors import InputError, MachineError
 from tests.support.sources import spice_kernels as ck
 
 TIMES = np.arange(0.0, 60.0, 0.25)  # more than 100, so that there is a directory

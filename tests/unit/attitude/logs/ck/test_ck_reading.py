@@ -13,9 +13,9 @@ from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Mounting
-from hilstar.errors import InputError
-from hilstar.rotation import angle_between_rad, from_matrix, to_matrix
-from hilstar.units import NS_PER_S
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import angle_between_rad, from_matrix, to_matrix
+from hilstar.basics.units import NS_PER_S
 from tests.support.sources import spice_kernels as ck
 
 MAS = np.radians(1.0 / 3_600_000)

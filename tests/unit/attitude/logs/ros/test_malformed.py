@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 
@@ -113,7 +113,7 @@ def test_a_topic_without_messages_is_refused(tmp_path):
 def test_without_rosbags_one_line_says_what_to_install(tmp_path, monkeypatch):
     import sys
 
-    from hilstar.errors import MachineError
+    from hilstar.basics.errors import MachineError
 
     monkeypatch.setitem(sys.modules, "rosbags", None)  # as Python has it where a package is not installed
     for kind in ("ROS 1", "db3", "MCAP"):

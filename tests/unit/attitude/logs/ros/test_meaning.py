@@ -12,8 +12,8 @@ from hilstar.attitude.logs.earth import earth_rate_ned_rad_s, q_icrs_to_enu, q_i
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
-from hilstar.errors import InputError
-from hilstar.rotation import to_radec_roll_deg
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_mcap
 

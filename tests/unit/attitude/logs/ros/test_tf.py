@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 

@@ -21,8 +21,8 @@ from hilstar.attitude.wire.nasa42 import (
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
-from hilstar.errors import InputError
-from hilstar.rotation import to_radec_roll_deg
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.nasa42 import BEGIN_NS, STREAM_2024, STREAM_2025, message, report
 
 # 42 writes thirteen significant digits: four components off by 5e-13 turn a unit vector by 2e-12 at most.

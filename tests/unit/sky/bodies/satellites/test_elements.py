@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.bodies.satellites import read_satellites
 from tests.support.satellites import element_set, with_checksum

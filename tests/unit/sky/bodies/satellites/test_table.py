@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.errors import InputError
+from hilstar.basics.errors import InputError
 from hilstar.sky.bodies.satellites import brightness_of, read_satellites, read_table
 from tests.support.satellites import element_set
 from tests.support.skies import STATION_TLE

@@ -1,0 +1,134 @@
+"""Tables of a TOML file as frozen structs, and a wrong one as one line for the person who wrote it.
+
+The line says table, key, value, and what is wanted, in the place of msgspec's own message.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+
+from hilstar.basics.errors import did_you_mean, shortened
+
+EXAMPLES: dict[int, tuple[float, ...]] = {2: (1024, 1024), 3: (0.0, 0.0, 0.0), 4: (1.0, 0.0, 0.0, 0.0)}  # by length
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of a TOML file; unknown keys are refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of file: its outermost table, the page that describes its keys, and the words for msgspec's types."""
+
+    root: type[Table]
+    reference: str
+    type_words: dict[str, str]
+
+
+def explained(message: str, tables: dict[str, Any], kind: Kind) -> str:
+    """The line for msgspec's `message` about `tables`, a file as it was read."""
+    try:
+        return _explain(message, tables, kind)
+    except (LookupError, TypeError, ValueError):  # a key of the user's own with brackets or quotes in it
+        return f"{shortened(message)}; see {kind.reference}"
+
+
+def plain(hint: Any) -> Any:
+    """A key's type without its limits and meaning."""
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
+    """msgspec's message ("... - at `$.tracker`") as table, key, value and advice."""
+    fault, _, place = message.partition(" - at `$")
+    names = [name for name in re.split(r"[.\[\]`]+", place) if name]
+    unknown = re.search(r"unknown field `(.*)`", fault)
+    if unknown:
+        known = [field.name for field in _fields(kind.root, names)]
+        advice = did_you_mean(unknown[1], known).strip() or f"known are {', '.join(known)}"
+        return f"{_place(names)}unknown key {shortened(unknown[1])}; {advice}"
+    missing = re.search(r"missing required field `(.*)`", fault)
+    if missing:
+        name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
+        return f"{_place(names)}the {name} is missing; add it (see {kind.reference})"
+    *table, key = [name for name in names if not name.isdigit()]
+    value: Any = tables
+    for name in (*table, key):
+        value = value[name]
+    field = next(field for field in _fields(kind.root, table) if field.name == key)
+    choices = _choices(plain(field.type))
+    if choices and not isinstance(value, list):
+        wanted = " or ".join(map(_toml, choices))
+        return f"{_place(table)}{key} = {_toml(value)}; {did_you_mean(value, map(str, choices))}{wanted} is wanted"
+    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0].removesuffix(" | null").replace(" | ", " or ")
+    for type_name, word in kind.type_words.items():
+        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
+    return f"{_place(table)}{key} = {_toml(value)}; {wanted} is wanted{_such_as(field, value)}"
+
+
+def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
+    """An example of what the key takes, from what stands there: ", such as bits = 8"; "" where there is none."""
+    if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value):
+        return f", such as {field.name} = {shortened(value)}"
+    kind = plain(field.type)
+    parts = next((part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None)  # X of `X | None`
+    if parts is None:
+        return ""
+    kinds = [plain(kind) for kind in get_args(parts)]
+    if Ellipsis in kinds:
+        return f", such as {field.name} = [{_toml(value)}]" if isinstance(value, kinds[0]) else ""
+    if isinstance(value, int | float) and not isinstance(value, bool) and len(kinds) == 2:
+        return f", such as {field.name} = [{_toml(value)}, {_toml(value)}]"
+    example = field.default if isinstance(field.default, tuple) else EXAMPLES[len(kinds)]
+    return f", such as {field.name} = {_toml(list(example)).replace(',', ', ')}"
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """A file of plain keys, then a table for each dictionary; None and empty tables are left unsaid.
+
+    TOML writes numbers, truth values, plain text and lists as JSON does; a list of lists stands row by row.
+    """
+    plain_keys = {key: value for key, value in tables.items() if not isinstance(value, dict)}
+    parts = {"": plain_keys} | {f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)}
+    texts = []
+    for head, part in parts.items():
+        rows = "".join(f"{key} = {_written(value)}\n" for key, value in part.items() if value is not None)
+        texts += [head + rows] if rows else []
+    return "\n".join(texts)
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        rows = ",\n    ".join(map(json.dumps, value))
+        return f"[\n    {rows},\n]"
+    return json.dumps(value)
+
+
+def _toml(value: Any) -> str:
+    try:
+        return shortened(msgspec.json.encode(value, enc_hook=str).decode())
+    except (ValueError, OverflowError, TypeError, RecursionError):  # a whole number of more than 64 bits
+        return shortened(value)
+
+
+def _choices(kind: Any) -> tuple[Any, ...]:
+    """The values of a key that has choices, those of X where it is `X | None`; none of another key."""
+    parts = get_args(kind) if type(None) in get_args(kind) else (kind,)
+    literal = [plain(part) for part in parts if get_origin(plain(part)) is Literal]
+    return tuple(choice for part in literal for choice in get_args(part))
+
+
+def _place(names: list[str]) -> str:
+    return f"[{'.'.join(names)}] " if names else ""
+
+
+def _fields(root: type[Table], names: list[str]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    table: Any = root
+    for name in names:
+        hint = plain({field.name: field.type for field in msgspec.structs.fields(table)}[name])
+        table = (get_args(hint) or (hint,))[0]  # X in `X | None`
+    return msgspec.structs.fields(table)

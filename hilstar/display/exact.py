@@ -1,0 +1,361 @@
+"""`exact`: the levels of one star's footprint chosen together, so that its light and its place are right in one frame.
+
+Every pixel shows one of the two levels around its light, so that no pixel is off by a whole level. The choice between the
+two minimises the ten sums of `balance`. From the star's middle outwards each pixel is decided, with several choices of the
+pixels before it kept side by side: of the four that two of them lead to the better two are kept, and who is compared with whom
+changes from pixel to pixel. The last pixels, and the choice among what is left, weigh the light more.
+A star drawn as a path hands its errors from sprite to sprite.
+In the straight foot of sRGB all steps are equal, so a star of N steps cannot have its light closer than half a step: 1 / 2N.
+This is the oracle of shaders/exact.comp, and what draws where that cannot run.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import Float32Array, IntArray
+from hilstar.display import quantise
+from hilstar.display.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
+from hilstar.display.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
+from hilstar.display.response import Levels
+from hilstar.optics.psf import Psf
+from hilstar.optics.sprites import Sprites
+
+KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
+KEPT_BEFORE = 4  # where another primary makes up for what these leave
+CHUNK = 256  # stars at a time: their arrays stay in a core's cache
+OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
+SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
+CARRIED = 32  # sprites of a path that hand on their errors; the next ones begin anew, beside them
+NONE = np.float32(1e30)  # the square of a choice that does not exist yet
+COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
+MAX_NEAR = 128  # pixels of a star that exact.comp has bits for: sprites up to a sigma of 1.8 px
+MAX_SIZE = 63  # largest footprint whose places fit into six bits
+# As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for the shader. A field of the
+# Milky Way has twice the stars of an average one.
+EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """The errors of the sums (SUMS, n) that n sprites have to make up for, in steps from black.
+
+    Those of light and moments are plain, the others weighed. Where all steps of a star are equal, `phase` (n,) is the part of
+    one that its light has in hand.
+    """
+
+    error: Float32Array
+    phase: Float32Array
+
+    def of(self, some: IntArray) -> "Carried":
+        """The same of some of the sprites."""
+        return Carried(self.error[:, some], self.phase[some])
+
+
+def nothing_carried(count: int) -> Carried:
+    """No errors, for `count` sprites of a frame that stands by itself."""
+    return Carried(np.zeros((SUMS, count), dtype=np.float32), np.zeros(count, dtype=np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers (n,) as in `Sprites.star`."""
+
+    star: IntArray
+    error: Float32Array
+
+
+def _fits(psf: Psf) -> bool:
+    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are products, as it takes them."""
+    order = PixelOrder(psf)
+    return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
+
+
+class ExactQuantiser(quantise.Quantiser):
+    """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the nearest ones.
+
+    An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that sees it as `seen`. `weights`
+    are those of its sums. One that `remembers` begins each star with what the last frame left, in `left`: None where each frame
+    stands by itself, and at the beginning of a sequence.
+    """
+
+    words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
+    shader = "exact.comp"
+    other_codes = 5e-3
+    weights: ClassVar[Weights] = IN_A_FRAME
+    remembers: ClassVar[bool] = False
+    left: Left | None = None
+    # For so much of what these quantisers of other primaries left in the same frame each star makes up, in steps of both.
+    given: Sequence[tuple[float, quantise.Quantiser]] = ()
+    kept = KEPT
+    over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
+
+    def __init__(self, panel: quantise.Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+        super().__init__(panel, resolution_px, psf, seen)
+        self._map = FootprintMap(resolution_px, psf)
+        self._balance = Balance(psf, seen, self.weights)
+        response = panel.response
+        self._light = np.append(response.light, response.light[-1])  # there is no step above white
+        self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
+        self._lower = quantise.ThresholdCounter(response.light[1:].astype(np.float32))
+        self._nearest = quantise.ThresholdCounter(response.threshold.astype(np.float32))
+        self._first_threshold = np.float32(response.threshold[0])
+        self._flat = np.zeros(self._map.pixels + 1, dtype=quantise.level_dtype(response))  # one more, for pixels off the image
+        self._lit: PlaceArray = np.empty(0, dtype=np.int32)
+        self._on_floor = False
+        uniformity = panel.uniformity
+        self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
+
+    def draw(self, light: quantise.FrameLight) -> Levels:
+        """The levels of the next frame: its stars are added to its dithered extended light."""
+        if light.sprites is None or not light.sprites.extended:
+            return self.levels(light.sprites)
+        return self.levels(light.sprites, quantise.dither_levels(light.extended(), self._panel, self.floor_turn(light.number)))
+
+    def begin_anew(self) -> None:
+        """The next frame is the first of a sequence."""
+        self.left = None
+
+    @classmethod
+    def by_pixel(cls) -> type[quantise.PixelQuantiser]:
+        """The nearest levels, which its pass changes."""
+        return quantise.RoundQuantiser
+
+    @classmethod
+    def takes(cls, psf: Psf, gl_version: int) -> bool:
+        """Whether the shader runs on this OpenGL, and takes such sprites."""
+        return gl_version >= COMPUTE_VERSION and _fits(psf)
+
+    @classmethod
+    def cost(cls, psf: Psf, gl_version: int) -> quantise.LevelCost:
+        """The cost of the shader, or of NumPy where the shader cannot draw."""
+        has_compute = gl_version >= COMPUTE_VERSION
+        by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
+        why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
+        return quantise.LevelCost(EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why)
+
+    @classmethod
+    def fewest(cls, order: PixelOrder) -> int:
+        """The minimum number of a star's pixels to choose among."""
+        return min(FEWEST, order.near)
+
+    @classmethod
+    def floor_turn(cls, number: int) -> float:
+        """How far the mask that dithers extended light is turned in frame `number`, 0 to 1."""
+        return 0.0
+
+    @classmethod
+    def faintest_e_per_s(cls, panel: quantise.Panel, psf: Psf) -> float:
+        """The rate of half a step: any pixel of the star may show it."""
+        return panel.response.half_step * panel.flux_at_white_e_per_s
+
+    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
+        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+
+        Their light is added to that of the levels `floor` (height, width), None for black.
+        """
+        width, height = self._map.resolution_px
+        if floor is None:
+            self._flat[slice(None) if self._on_floor else self._lit] = 0
+        else:
+            self._flat[:-1] = floor.ravel()
+        self._on_floor = floor is not None
+        self._lit = np.empty(0, dtype=np.int32)
+        if sprites is not None and len(sprites):
+            found = self._map.find(sprites)
+            levels = np.empty(found.place.shape, dtype=self._flat.dtype)
+            carried = self._carried(sprites)
+            left = np.empty_like(carried.error)
+            reach = self._reach(found.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32))
+            for some in _turns(sprites):
+                levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some), reach[some])
+                _hand_on(carried.error, left, some, sprites)
+            self._keep(sprites, left)
+            self._lit = found.place.ravel()
+            self._flat[self._lit] = levels.ravel()
+            self._flat[-1] = 0
+        return Levels(self._flat[:-1].reshape(height, width))
+
+    def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
+        """How many pixels of stars of so much light (n,) are chosen, (n,)."""
+        order = self._map.order
+        return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
+
+    def _carried(self, sprites: Sprites) -> Carried:
+        """The errors that each sprite begins with: what its light in other primaries left, or none."""
+        carried = nothing_carried(len(sprites))
+        for part, other in self.given if sprites.per_star == 1 else ():
+            if part and isinstance(other, ExactQuantiser) and other.over is not None:
+                np.add(carried.error, np.float32(part) * other.over, out=carried.error)
+        return carried
+
+    def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
+        """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to make up for."""
+        return error
+
+    def _keep(self, sprites: Sprites, left: Float32Array) -> None:
+        """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
+        self.over = left
+
+    def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
+        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n).
+
+        Of each star the nearest `reach` (n,) pixels are chosen.
+        """
+        near = self._map.order.near
+        lower, upper, short, step = self._levels_about(found)
+        chosen = np.arange(near)[:, None] < reach
+        far, short, step = short.copy(), np.where(chosen, short[:near], np.float32(0)), np.where(chosen, step, np.float32(0))
+        far[:near][chosen] = 0.0
+        d = found.offset_px - found.fraction_px[:, None]
+        weights = self._balance.weights
+        arm = self._balance.arms(
+            found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
+        )
+        error = self._bounded(carried.error, step).copy()
+        error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
+        # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them no choice can show.
+        largest, smallest = step.max(axis=0), np.min(step, axis=0, initial=np.inf, where=step > 0)
+        grid = np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
+        error[0] += carried.phase * grid
+        lowest, unit = short.sum(axis=0) + error[0], np.where(grid > 0, grid, np.float32(1))
+        hidden = np.where(grid > 0, lowest - np.rint(lowest / unit) * unit, np.float32(0))
+        error[0] -= hidden
+        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
+        error[:3] *= weight
+        up, left = _decide(short, step, arm, error, weights.last_light, self.kept)
+        _turn_one_more(step, arm, up, left, grid)
+        left[:3] /= weight
+        left[0] += hidden
+        return np.concatenate([lower + up, upper]), left
+
+    def _levels_about(self, found: Footprints) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
+        """The lower levels of the near pixels and the nearest ones of the others, what these are off the wanted light
+        (pixels, n), and what the next level adds to the near ones' (near, n), in steps from black.
+        """
+        near = self._map.order.near
+        output = None if self._output is None else self._output[found.place]
+        asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
+        if output is not None:
+            asked /= output
+        if self._on_floor:
+            asked += self._light[self._flat[found.place]].astype(np.float32)
+        np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
+        # The nearest level this far out is 0 for all but the brightest stars.
+        lower, upper = self._lower.count(asked[:near]), np.zeros(asked[near:].shape, dtype=np.intp)
+        bright = asked[near:] >= self._first_threshold
+        upper[bright] = self._nearest.count(asked[near:][bright])
+        shown = self._light[np.concatenate([lower, upper])]
+        step = self._light[lower + 1] - shown[:near]
+        short = shown - asked
+        if output is not None:
+            short *= output
+            step *= output[:near]
+        step[found.place[:near] == self._map.pixels] = 0.0
+        short /= self._light[1]
+        step /= self._light[1]
+        return lower, upper, short.astype(np.float32), step.astype(np.float32)
+
+
+def _part(found: Footprints, some: IntArray) -> Footprints:
+    return Footprints(
+        found.light[:, some],
+        found.place[:, some],
+        found.offset_px[..., some],
+        found.fraction_px[:, some],
+        found.rate_e_per_s[some],
+    )
+
+
+def _turns(sprites: Sprites) -> Iterator[IntArray]:
+    """The sprites in chunks, each of a path after those before it; a long path is begun anew in places."""
+    place = np.arange(len(sprites))
+    if sprites.per_star > 1:
+        begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
+        place = (place - np.repeat(begins, np.diff(begins, append=len(sprites)))) % CARRIED
+        order = np.argsort(place, kind="stable")
+    else:
+        order, place = place, np.zeros_like(place)
+    for turn in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
+        for start in range(0, len(turn), CHUNK):
+            yield turn[start : start + CHUNK]
+
+
+def _sprites_in_path(sprites: Sprites) -> IntArray:
+    if sprites.per_star == 1:
+        return np.ones(len(sprites), dtype=np.intp)
+    begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
+    lengths = np.diff(begins, append=len(sprites))
+    return np.asarray(np.repeat(lengths, lengths))
+
+
+def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites: Sprites) -> None:
+    """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their paths, about their centres."""
+    if sprites.per_star == 1:
+        return
+    after = np.minimum(some + 1, len(sprites) - 1)
+    here = some[(sprites.star[after] == sprites.star[some]) & (after > some)]
+    there = here + 1
+    carried[:, there] = left[:, here]
+    for row, place_px in ((1, sprites.x_px), (2, sprites.y_px)):
+        carried[row, there] -= left[0, here] * (place_px[there] - place_px[here])
+
+
+def _decide(
+    short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float, choices: int
+) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+    """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves, (SUMS, n).
+
+    `short` (near, n) is what the lower level is off the wanted light (0 or less), `step` (near, n) how much the next one adds
+    (0 where there is none to take), both in steps from black. `arm` (SUMS, near, n) weighs a pixel's error into the sums of
+    `error` (SUMS, n), of which that of light counts `last_light` times at the end.
+    """
+    near, count = step.shape
+    kept = np.repeat(error[:, None], choices, axis=1)
+    up = np.zeros((near, choices, count), dtype=np.bool_)
+    missing = np.zeros((choices, count), dtype=np.float32)
+    missing[1:] = NONE
+    for pixel in range(near):
+        weight, by = arm[:, pixel, None], step[pixel]
+        kept += weight * short[pixel]
+        down = np.square(kept).sum(axis=0) + missing
+        rise = by * (2 * (weight * kept).sum(axis=0) + by * np.square(weight).sum(axis=0))
+        rise[:, by == 0] = NONE
+        # Of the four choices that two of those kept lead to keep two, in their places. Where both of one lead to less than
+        # either of the other, the other's place takes the second.
+        other = np.arange(choices) ^ (1 << (pixel % (choices.bit_length() - 1)))
+        better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
+        taken = worse[other] < better
+        place, star = np.nonzero(taken)
+        kept[:, place, star] = kept[:, other[place], star]
+        up[:pixel, place, star] = up[:pixel, other[place], star]
+        missing[place, star] = missing[other[place], star]
+        up[pixel] = np.where(taken, rise[other] >= 0, rise < 0)
+        kept += weight * by * up[pixel]
+    heavier = (last_light**2 - 1) * np.square(kept[0])
+    best = (np.square(kept).sum(axis=0) + heavier + missing).argmin(axis=0)[None, None]
+    return np.take_along_axis(up, best, axis=1)[:, 0], np.take_along_axis(kept, best, axis=1)[:, 0]
+
+
+def _turn_one_more(
+    step: Float32Array, arm: Float32Array, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array
+) -> None:
+    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm.
+
+    `step` and `arm` as in `_decide`, whose results are changed.
+    """
+    stars = np.flatnonzero(np.abs(error[0]) > OFF * arm[0, 0] * np.where(grid > 0, grid, np.inf))
+    if not len(stars):
+        return
+    rise = error[0, stars] < 0
+    by = np.where(rise, step[:, stars], -step[:, stars])
+    arm = arm[:, :, stars]
+    more = by * (2 * (arm * error[:, None, stars]).sum(axis=0) + by * np.square(arm).sum(axis=0))
+    more[(by == 0) | (up[:, stars] == rise)] = np.inf
+    pixel = more.argmin(axis=0)
+    can = np.flatnonzero(np.isfinite(more.min(axis=0)))
+    up[pixel[can], stars[can]] ^= True
+    error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]

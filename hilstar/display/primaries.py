@@ -1,0 +1,223 @@
+"""A monitor's primaries and a tracker's channels: the electrons of each channel by each primary, one matrix from spectra.
+
+The spectra come from a table, from an ArgyllCMS file of the display's own samples, or from CIE chromaticities.
+"""
+
+import itertools
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import read_text
+from hilstar.basics.text_tables import finite_numbers, read_rows
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import MAX_CURVE_BYTES, RANGE_NM, Curve, integration_nodes, refuse_other_units
+
+PRIMARIES = ("r", "g", "b")
+COLUMNS = ("wavelength_nm", *PRIMARIES)
+ADVICE = "write wavelength_nm,r,g,b: each primary's relative spectral power at full drive"
+CCSS_ADVICE = "give a .ccss of this display (ccxxmake -S), or a CSV of wavelength_nm,r,g,b"
+MAX_SAMPLES = 40
+MIXED_WITHIN = 0.03  # relative rms: a spectrometer's repeatability, and a display whose primaries add up
+MAX_EXCESS = 0.15  # light of white over that of its primaries: screens that dim with what they show are off by less
+DARK_SHARE = 0.02  # relative to the brightest sample: black and near it
+SINGULAR = 1e-12  # for a Gram matrix
+D65_XY = (0.3127, 0.3290)
+FAR_XY = 0.08  # the blue of sRGB is 0.03 from a Gaussian of 30 nm
+FWHM_SIGMAS = 2.3548
+XY_NM = np.arange(380.0, 781.0, 1.0)
+# CIE 1931 2 degrees, as sums of Gaussians with two sides (Wyman, Sloan and Shirley 2013, JCGT 2, 1): times, middle, 1 / sigma.
+MATCHING = (
+    ((0.362, 442.0, 0.0624, 0.0374), (1.056, 599.8, 0.0264, 0.0323), (-0.065, 501.1, 0.0490, 0.0382)),
+    ((0.821, 568.8, 0.0213, 0.0247), (0.286, 530.9, 0.0613, 0.0322)),
+    ((1.217, 437.0, 0.0845, 0.0278), (0.681, 459.0, 0.0385, 0.0725)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelMatrix:
+    """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a pixel at full light.
+
+    By `condition` times as much as the channels' light can the primaries' be wrong, both relative; None where two channels, or
+    two primaries, have the same colour.
+    """
+
+    channels: tuple[str, ...]
+    e_per_s: FloatArray
+    condition: float | None
+
+
+def read_primaries(path: Path) -> tuple[Curve, ...]:
+    """The spectra of red, green and blue in a CSV file or a .ccss, per nm in one unit, zero outside its wavelengths.
+
+    Raises InputError.
+    """
+    if path.suffix.lower() == ".ccss":
+        return read_ccss(path)
+    rows = []
+    for line, cells in read_rows(path, COLUMNS, ADVICE, MAX_CURVE_BYTES):
+        rows.append(finite_numbers(path, line, COLUMNS, cells[: len(COLUMNS)], ADVICE))
+        if min(rows[-1][1:]) < 0 or not RANGE_NM[0] < rows[-1][0] < RANGE_NM[1]:
+            raise InputError(f"{path}:{line}: power below 0, or a wavelength that is not in nm; {ADVICE}")
+        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+            raise InputError(f"{path}:{line}: wavelengths do not rise from row to row; sort them, each once")
+    table = np.array(rows).reshape(-1, len(COLUMNS)).T
+    if len(rows) > 1:
+        refuse_other_units(path, rows[0][0], rows[-1][0])
+    dark = [name for name, power in zip(PRIMARIES, table[1:], strict=True) if not power.any()]
+    if dark:
+        raise InputError(f"{path}: {len(rows)} rows, and no light of {', '.join(dark)}; {ADVICE}")
+    return _curves(table[0], table[1:])
+
+
+def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
+    first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])  # knots beside both ends and far off
+    knots = np.concatenate([[RANGE_NM[0], first], nm, [last, RANGE_NM[1]]])
+    return tuple(Curve(knots, np.pad(one, 2)) for one in power)
+
+
+def read_ccss(path: Path) -> tuple[Curve, ...]:
+    """The primaries of an ArgyllCMS .ccss (CGATS text): those three samples of which all others are mixtures.
+
+    Of samples of one colour the brightest counts; red and blue are those of the longest and the shortest mean wavelength.
+    Raises InputError for another file, and where no three samples make the others, as of a panel with a fourth subpixel.
+    """
+    nm, samples = _samples(path)
+    power = samples.sum(axis=1)
+    lit = np.flatnonzero(power > DARK_SHARE * power.max())
+    if len(lit) < 3:
+        raise InputError(f"{path}: {len(lit)} samples with light, where three primaries are wanted; {CCSS_ADVICE}")
+    shape = samples[lit] / np.linalg.norm(samples[lit], axis=1, keepdims=True)
+    together = shape @ shape.T
+    found = []
+    for three in map(list, itertools.combinations(range(len(lit)), 3)):
+        gram = together[np.ix_(three, three)]
+        if np.linalg.det(gram) > MIXED_WITHIN**4:
+            by = nearest_mixtures(gram, together[:, three])
+            off = 1 - 2 * (by * together[:, three]).sum(axis=1) + np.einsum("ni,ij,nj->n", by, gram, by)
+            found.append((float(np.sqrt(max(off.max(), 0.0))), -float(power[lit[three]].sum()), three))
+    worst = min(found, default=(1.0, 0.0, []))[0]
+    if worst > MIXED_WITHIN:
+        raise InputError(
+            f"{path}: no three of its {len(lit)} samples are primaries of which the others are mixtures (the nearest leave"
+            f" {100 * worst:.0f} % of one): a white subpixel, or samples of several displays; {CCSS_ADVICE}"
+        )
+    _, _, three = min((one for one in found if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1])
+    size = np.linalg.norm(samples[lit], axis=1)
+    drive = nearest_mixtures(together[np.ix_(three, three)], together[:, three]) * size[:, None] / size[three]
+    if drive.max() > 1 + MAX_EXCESS:
+        raise InputError(
+            f"{path}: a sample has {drive.max():.2f} times the light of its primaries: a white subpixel, as of a panel that is"
+            f" no sum of red, green and blue; {CCSS_ADVICE}"
+        )
+    primaries = samples[lit[three]]
+    order = np.argsort(-(primaries @ nm) / primaries.sum(axis=1))
+    return _curves(nm, primaries[order])
+
+
+def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
+    text = read_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
+    if not text.lstrip().startswith("CCSS"):
+        raise InputError(f"{path}: its first word is not CCSS; {CCSS_ADVICE}")
+    try:
+        head, _, rest = text.partition("BEGIN_DATA_FORMAT")
+        names, _, rest = rest.partition("END_DATA_FORMAT")
+        keys = dict(words for line in head.splitlines() if len(words := shlex.split(line, comments=True)) == 2)
+        first, last = float(keys["SPECTRAL_START_NM"]), float(keys["SPECTRAL_END_NM"])
+        nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))
+        fields = names.split()
+        spectral = [k for k, name in enumerate(fields) if name.startswith("SPEC_")]
+        cells = np.array(rest.partition("BEGIN_DATA")[2].partition("END_DATA")[0].split()).reshape(-1, len(fields))
+        samples = cells[:, spectral].astype(np.float64)
+        good = len(spectral) == len(nm) > 1 and RANGE_NM[0] < first < last < RANGE_NM[1] and np.isfinite(samples).all()
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: {error} is wrong or missing; {CCSS_ADVICE}") from error
+    if not good or not 0 < len(samples) <= MAX_SAMPLES:
+        raise InputError(f"{path}: {len(samples)} samples of {len(spectral)} bands; {CCSS_ADVICE}")
+    return nm, np.maximum(samples, 0.0)  # a spectrometer's noise
+
+
+def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tuple[Curve, ...]:
+    """Gaussian spectra whose chromaticities are nearest to `xy` of red, green and blue; all three together are D65.
+
+    Raises InputError where none is near.
+    """
+    matching = np.array([sum(t * _lobe(m, a, b) for t, m, a, b in lobes) for lobes in MATCHING])
+    middles = np.arange(XY_NM[0], XY_NM[-1], 0.25)
+    spectra = np.exp(-((XY_NM - middles[:, None]) ** 2) / 2 * (FWHM_SIGMAS / fwhm_nm) ** 2)
+    seen = spectra @ matching.T
+    seen_xy = (seen / seen.sum(axis=1, keepdims=True))[:, :2]
+    chosen = []
+    for name, wanted in zip(PRIMARIES, xy, strict=True):
+        off = np.hypot(*(seen_xy - wanted).T)
+        chosen.append(int(np.argmin(off)))
+        if off[chosen[-1]] > FAR_XY:
+            near = ", ".join(f"{value:.3f}" for value in seen_xy[chosen[-1]])
+            raise InputError(
+                f"[monitor.primaries] xy_{name} = {list(wanted)}: the nearest Gaussian of {fwhm_nm:g} nm has [{near}]; write"
+                " another width_nm, or measured spectra as file"
+            )
+    white = np.array([D65_XY[0], D65_XY[1], 1 - sum(D65_XY)]) / D65_XY[1]
+    amounts = np.linalg.solve(seen[chosen].T, white) if len(set(chosen)) == len(chosen) else np.zeros(3)
+    if not (amounts > 0).all():
+        raise InputError("[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those of r, g and b")
+    return _curves(XY_NM, spectra[chosen] * amounts[:, None])
+
+
+def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
+    away = XY_NM - middle_nm
+    return np.asarray(np.exp(-((away * np.where(away < 0, below, above)) ** 2) / 2))
+
+
+def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
+    """The longest wavelength at which a primary has `least` of its largest power."""
+    lit = [curve.wavelength_nm[curve.value > least * curve.value.max()].max() for curve in primaries]
+    return float(max(lit))
+
+
+def channel_matrix(primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float) -> ChannelMatrix:
+    """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels together.
+
+    An entry is in proportion to the integral of power, quantum efficiency, transmission and wavelength: photons are counted.
+    Raises InputError where the tracker detects no light of the primaries.
+    """
+    matrix = np.array([[_electrons(primary, optics) for primary in primaries] for optics in channels.values()])
+    if not matrix.any():
+        raise InputError("[monitor.primaries] file: the tracker detects none of this light; check that both are in nm")
+    parted = np.linalg.matrix_rank(matrix) == min(matrix.shape)
+    condition = float(np.linalg.cond(matrix)) if parted else None
+    return ChannelMatrix(tuple(channels), matrix * (white_e_per_s / matrix.sum()), condition)
+
+
+def _electrons(primary: Curve, optics: Optics) -> float:
+    curves = primary, optics.quantum_efficiency, optics.transmission
+    nm, weight = integration_nodes(*curves)
+    return float(np.prod([curve(nm) for curve in curves], axis=0) * nm @ weight)
+
+
+def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = False) -> FloatArray:
+    """The mixtures s (n, 3), none below 0, with the least s gram s - 2 s wanted: non-negative least squares by its products.
+
+    `gram` (3, 3) has the products of the three parts, `wanted` (n, 3) those of each with what is wanted; `whole` holds the sum
+    of a mixture to 1. Every set of parts is tried: the best of those without a negative part is the solution.
+    """
+    scale = np.trace(gram)
+    gram, wanted = gram / scale, wanted / scale
+    best, least = np.zeros_like(wanted), np.full(len(wanted), np.inf if whole else 0.0)
+    for size in range(1, len(gram) + 1):
+        for parts in map(list, itertools.combinations(range(len(gram)), size)):
+            system, right = gram[np.ix_(parts, parts)], wanted[:, parts]
+            if whole:
+                system = np.block([[system, np.ones((size, 1))], [np.ones((1, size)), np.zeros((1, 1))]])
+                right = np.column_stack([right, np.ones(len(right))])
+            found = np.zeros_like(wanted)
+            found[:, parts] = (right @ np.linalg.pinv(system, rcond=SINGULAR).T)[:, :size]
+            cost = np.einsum("ni,ij,nj->n", found, gram, found) - 2 * (found * wanted).sum(axis=1)
+            better = (found.min(axis=1) >= 0) & (cost < least)
+            best[better], least[better] = found[better], cost[better]
+    return best

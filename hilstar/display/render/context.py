@@ -1,0 +1,154 @@
+"""Headless OpenGL contexts through EGL, on which GPU, and what they can draw."""
+
+import contextlib
+import ctypes
+import math
+import mmap
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+import numpy.typing as npt
+from glcontext import egl
+
+from hilstar.basics.errors import InputError, MachineError, NotThereError, did_you_mean
+from hilstar.basics.process.scheduling import drawing_threads_apart
+from hilstar.basics.units import GL_VERSIONS
+from hilstar.display.exact import COMPUTE_VERSION
+from hilstar.display.render.backend import EGL_LIBRARY
+
+INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
+Context = moderngl.Context
+SOFTWARE = ("llvmpipe", "softpipe")
+# llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
+MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
+MAX_GPUS = 32
+PINNED_MEMORY = "GL_AMD_pinned_memory"
+EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # constants of that extension and of OpenGL
+
+
+@dataclass(frozen=True, slots=True)
+class Gpu:
+    """A device of EGL's list: its index, and its GL_RENDERER ("" where no context can be made on it)."""
+
+    index: int
+    renderer: str
+
+    def line(self) -> str:
+        """The GPU for a person."""
+        return f"{self.index}: {self.renderer or 'opens no OpenGL 3.3'}"
+
+
+def gpus() -> list[Gpu]:
+    """EGL's devices in its order, a context made on each; none where EGL has no list of them."""
+    found = []
+    for index in range(_device_count()):
+        renderer = ""
+        with contextlib.suppress(MachineError):
+            ctx = _context_on(index)
+            renderer = str(ctx.info["GL_RENDERER"])
+            ctx.release()
+        found.append(Gpu(index, renderer))
+    return found
+
+
+def _device_count() -> int:
+    """How many devices EGL lists (EGL_EXT_device_enumeration)."""
+    found = ctypes.c_int()
+    with contextlib.suppress(OSError, AttributeError):
+        find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
+        find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+        if address := find(b"eglQueryDevicesEXT"):
+            devices = (ctypes.c_void_p * MAX_GPUS)()
+            query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))(address)
+            query(MAX_GPUS, devices, ctypes.byref(found))
+    return found.value
+
+
+def create_context(gpu: int | str | None = None) -> moderngl.Context:
+    """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
+
+    `gpu` is an index of EGL's list or a part of a GL_RENDERER (NotThereError where there is no such one), by default EGL's
+    first. Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
+    """
+    if gpu is None or (isinstance(gpu, int) and gpu < _device_count()):
+        return _context_on(gpu)
+    found = gpus()
+    for one in found:
+        if isinstance(gpu, str) and gpu.lower() in one.renderer.lower():
+            return _context_on(one.index)
+    known = "; ".join(one.line() for one in found) or "none: EGL lists no devices"
+    meant = did_you_mean(gpu, (one.renderer for one in found))
+    raise NotThereError(f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}")
+
+
+def _context_on(index: int | None) -> moderngl.Context:
+    settings: Any = {"libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
+    refusal = ""
+    with drawing_threads_apart():
+        for major, minor in GL_VERSIONS:
+            version = 100 * major + 10 * minor
+            try:
+                if index is None:
+                    return moderngl.create_context(require=version, standalone=True, **settings | {"backend": "egl"})
+                # moderngl's own way to an index gives way to a variable of the environment.
+                on_device = egl.create_context(glversion=version, mode="standalone", device_index=index, **settings)
+                return moderngl.create_context(require=version, standalone=True, context=on_device)
+            except Exception as error:  # moderngl and glcontext raise plain Exceptions here
+                refusal = str(error)
+    raise MachineError(f"OpenGL 3.3 through EGL is missing ({refusal}); {INSTALL_EGL}")
+
+
+def described() -> str:
+    """The headless OpenGL of this machine for a person: who draws, and how. Raises MachineError with what to install."""
+    ctx = create_context()
+    try:
+        info = ctx.info
+        what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        exact = "compute shaders" if ctx.version_code >= COMPUTE_VERSION else "NumPy (slow: their shaders need OpenGL 4.3)"
+        return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
+    finally:
+        ctx.release()
+
+
+def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
+    """Raise InputError where this GL cannot draw such an image, or points as large as its sprites; those are by `sigma`."""
+    largest = int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
+    if max(resolution_px) > largest:
+        raise InputError(f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px")
+    points = ctx.info["GL_POINT_SIZE_RANGE"][1]
+    if footprint_px > points:
+        raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
+
+
+def computes_in_software(ctx: moderngl.Context) -> bool:
+    """Whether this GL is a processor's, with compute shaders in the process's own memory; cards rasterise in their stride."""
+    return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx) and PINNED_MEMORY in ctx.extensions
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether a processor draws, and no graphics card."""
+    return str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
+
+
+def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) -> tuple[npt.NDArray[Any], moderngl.Buffer]:
+    """A black array in whole pages, which it keeps for as long as somebody holds it, and a buffer of the same memory."""
+    count, size = math.prod(shape), -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4  # whole words, too
+    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    values = np.frombuffer(pages, dtype, count).reshape(shape)
+    find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
+    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    bind = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint)(find(b"glBindBuffer"))
+    specify = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint)(find(b"glBufferData"))
+    buffer = ctx.buffer(reserve=size)
+    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, buffer.glo)
+    specify(EXTERNAL_VIRTUAL_MEMORY_BUFFER, size, values.ctypes.data, DYNAMIC_COPY)
+    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, 0)
+    return values, buffer
+
+
+def leave_contexts() -> None:
+    """Let this thread's headless context go: it stays current after its release, and a window's GLX then ends the process."""
+    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
+        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()

@@ -1,0 +1,262 @@
+"""An ExactQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together.
+
+With `temporal` what each star leaves is kept on the GPU from frame to frame.
+"""
+
+import math
+from typing import Any
+
+import moderngl
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import IntArray
+from hilstar.display.balance import SUMS, Balance
+from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
+from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
+from hilstar.display.render.backend import Target, Turn
+from hilstar.display.render.encoder import (
+    LevelTexture,
+    LookupTable,
+    Planes,
+    Shares,
+    build_compute,
+    linear_format,
+    set_uniforms,
+    write,
+)
+from hilstar.display.render.star_passes import TURNS_BINDING, StarPasses, turns_of
+from hilstar.display.temporal import NONE_BEFORE, first_phases, places_before
+from hilstar.optics.psf import PIXEL_VARIANCE
+from hilstar.optics.sprites import Sprites
+
+IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
+# Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
+NARROW_PX = 0.75
+OVERRATED = 1.0001  # rounding
+PARTS = tuple(f"{one}.glsl" for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
+LOCAL_SIZE = 32  # as in exact.comp
+FIRST_BINDING = 4  # first binding of a Memory's buffers
+BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
+SUMS_BYTES = 4 * SUMS
+
+
+class ExactPass:
+    """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
+
+    `turn` says on which, and for what stars make up there; `left` has room for what all planes leave. It lives in its
+    renderer's context.
+    """
+
+    def __init__(
+        self,
+        quantiser: type[ExactQuantiser],
+        target: Target,
+        planes: Planes,
+        turn: Turn,
+        *,
+        linear: moderngl.Texture,
+        levels: LevelTexture,
+        shares: Shares,
+        left: moderngl.Buffer | None,
+    ) -> None:
+        ctx = self._ctx = linear.ctx
+        self.plane, self._makes_up, self._kept = turn
+        panel = planes.panels[self.plane]
+        self._planes, self._together = planes, left
+        balance = Balance(target.psf, target.seen, quantiser.weights)
+        self._linear, self._levels, self._level_defines = linear, levels.texture, levels.defines
+        self._pixels = PixelOrder(balance.psf)
+        self._shares = shares
+        light = panel.light_e_per_s()
+        self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
+        self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
+        gain = panel.gain()
+        self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
+        self._memory = Memory(ctx) if quantiser.remembers else None
+        self._step_e_per_s = float(light[1])
+        self._turns = ctx.buffer(reserve=4, dynamic=True)
+        self._quantiser, self._panel, self._balance = quantiser, panel, balance
+        self._programs: dict[tuple[bool, bool, bool], moderngl.ComputeShader] = {}
+
+    def _program(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
+        """The program for stars or paths, whose light is summed, on a `floor` of levels or not, or in the linear image."""
+        if (paths, summed, floor) in self._programs:
+            return self._programs[paths, summed, floor]
+        order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
+        defines = [f"NEAR {order.near}", *self._level_defines, f"LINEAR {linear_format(self._planes)}"]
+        defines += [f"PLANE {self.plane}", f"KEPT {self._kept}", *self._planes.defines, *self._shares.defines]
+        defines += [f"SIZE {order.size}", f"FIRST ({order.first})", *self._order.define, *self._light.define]
+        narrow, uneven = min(balance.psf.width_px) < NARROW_PX, self._gain is not None
+        whether = {"MAKES_UP": any(self._makes_up), "LEAVES": self._kept == KEPT_BEFORE, "TOGETHER": together, "NARROW": narrow}
+        whether |= {"PATHS": paths, "UNIFORMITY": uneven, "TEMPORAL": self._memory is not None, "SUMS": summed, "FLOOR": floor}
+        defines += [name for name, is_so in whether.items() if is_so]
+        files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
+        program = build_compute(self._ctx, self._quantiser.shader, defines, files)
+        self._shares.set(program)
+        self._planes.set(program, makes_up=self._makes_up)
+        window, weights = balance.window_px, balance.weights
+        values: dict[str, Any] = {
+            "footprint": order.size**2,
+            "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
+            "reach_px2": order.area_px2,
+            "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
+            "fewest": self._quantiser.fewest(order),
+            "white": panel.response.white,
+            "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
+            "resolution_px": self._linear.size,
+            "odd": order.bias,
+            "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
+            "half_inverse_spread2": tuple(0.5 / variance for variance in balance.psf.variance_px2),
+            "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
+            "follows": (*balance.follows(3), *balance.follows(5)),
+            "weights": (weights.light, weights.moments, weights.window_light, weights.window_moments),
+            "few_steps": weights.few_steps,
+            "last_light": weights.last_light,
+        } | ({"gain": 0} if self._gain is not None else {})
+        set_uniforms(program, values)
+        self._programs[paths, summed, floor] = program
+        return program
+
+    @property
+    def left(self) -> Left | None:
+        """The errors of the last frame of `temporal`; None at the beginning of a sequence. NumPy's quantiser may give them."""
+        return None if self._memory is None else self._memory.left
+
+    @left.setter
+    def left(self, left: Left | None) -> None:
+        if self._memory is not None:
+            self._memory.left = left
+
+    @property
+    def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
+        """The tables by which levels are chosen."""
+        return [self._order.buffer, self._light.buffer, *([] if self._gain is None else [self._gain])]
+
+    def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
+        """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
+        paths = sprites.per_star > 1
+        program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
+        if passes is None:
+            self._linear.bind_to_image(1, read=True, write=False)
+        else:
+            passes.bind(program)
+        if paths or passes is None or not self._planes.apart:  # else `passes` have an order
+            turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+            write(self._turns, turns.astype(np.int32))
+            self._turns.bind_to_storage_buffer(TURNS_BINDING)
+        count = len(turns) if paths else len(sprites)
+        if self._memory is not None and paths:
+            self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
+        elif self._memory is not None:
+            self._memory.bind(sprites.star, np.zeros(count, dtype=np.bool_))
+        elif self._together is not None:
+            if self._together.size < (size := count * len(self._planes.panels) * SUMS_BYTES):
+                self._together.orphan(2 * size)
+            self._together.bind_to_storage_buffer(FIRST_BINDING + 2)
+        buffer.bind_to_storage_buffer(0)
+        self._order.bind()
+        self._light.bind()
+        if self._gain is not None:
+            self._gain.use(0)
+        self._levels.bind_to_image(0, read=True, write=True)
+        program["count"] = count
+        program.run(-(-count // LOCAL_SIZE))
+        self._ctx.memory_barrier()
+        if passes is not None:
+            self._ctx.finish()  # before NumPy looks at the levels
+
+
+class Memory:
+    """The errors that the stars of one frame leave to the next, on the GPU; it lives in its renderer's context."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._star: IntArray | None = None  # the last frame's stars
+        self._room = 0
+        self._begins, self._before, self._left = (self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,)))
+
+    def _reserved(self, size: int) -> moderngl.Buffer:
+        return self._ctx.buffer(reserve=max(self._room, 1) * size, dynamic=True)
+
+    def bind(self, star: IntArray, goes_on: npt.NDArray[np.bool_]) -> None:
+        """Bind it for a pass over stars, or stretches of their paths, of these numbers (n,).
+
+        One that goes on with a path is no star's first, and begins with nothing.
+        """
+        places = places_before(self._star, star)
+        begins = np.empty(len(star), dtype=BEGIN_DTYPE)
+        begins["before"] = np.where(goes_on, NONE_BEFORE, places)
+        begins["phase"] = np.where(goes_on, 0, first_phases(star, places))
+        self._before, self._left = self._left, self._before
+        if len(star) > self._room:
+            self._room = 2 * len(star)
+            self._begins.release()
+            self._begins = self._reserved(BEGIN_DTYPE.itemsize)
+        if self._left.size < len(star) * SUMS_BYTES:
+            self._left.release()
+            self._left = self._reserved(SUMS_BYTES)
+        self._begins.write(begins)
+        for place, buffer in enumerate((self._begins, self._before, self._left), start=FIRST_BINDING):
+            buffer.bind_to_storage_buffer(place)
+        self._star = star.copy()
+
+    @property
+    def left(self) -> Left | None:
+        """The errors of the last frame, read back; None at the beginning of a sequence."""
+        if self._star is None:
+            return None
+        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(-1, SUMS)
+        return Left(self._star, np.ascontiguousarray(sums.T))
+
+    @left.setter
+    def left(self, left: Left | None) -> None:
+        self._star = None if left is None else left.star
+        if left is None:
+            return
+        self._room = max(self._room, len(left.star))
+        self._left.release()
+        self._left = self._reserved(SUMS_BYTES)
+        self._left.write(np.ascontiguousarray(left.error.T, dtype="<f4"))
+
+
+def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
+    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
+    x, y = order.places()
+    away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
+    box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))
+    words = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
+    return np.asarray(words, dtype=np.uint32)
+
+
+def overrated(width_px: tuple[float, float]) -> float:
+    """Largest ratio of a path's light as the shader takes it to the true light in a pixel within reach.
+
+    The shader takes a Gaussian of the width and a pixel's variance together; where stars are narrow, the true light. Two stars
+    must never own the same pixel, or the order in which threads reach it would choose its level.
+    """
+    if min(width_px) < NARROW_PX:
+        return OVERRATED
+    away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
+    along_x, along_y = (np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px)
+    rest = np.sqrt(REACH_SIGMA**2 - away**2)
+    return OVERRATED * float((along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max())
+
+
+def _ratio(place: float, width_px: float) -> float:
+    """A Gaussian's density of the sigma and a pixel together, over the light in the pixel, `place` wide sigmas off."""
+    wide = math.sqrt(width_px**2 + PIXEL_VARIANCE)
+    edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
+    light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
+    return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
+
+
+def stretches_of(star: IntArray) -> IntArray:
+    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and of its path."""
+    begins = np.flatnonzero(np.diff(star, prepend=star[0] - 1))
+    ends = np.append(begins[1:], len(star))
+    parts = -(-(ends - begins) // CARRIED)
+    path = np.repeat(np.arange(len(begins)), parts)
+    number = np.arange(len(path)) - np.repeat(np.cumsum(parts) - parts, parts)
+    first = begins[path] + number * CARRIED
+    return np.stack([first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1)

@@ -1,0 +1,175 @@
+"""Frames drawn by NumPy where a machine has no OpenGL: the oracle of the GL renderer as a backend, slower.
+
+The linear image is that of `reference` in float32, and the quantisers are those of `monitor`, which the shaders follow.
+"""
+
+import ctypes
+import logging
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.errors import MachineError, NotThereError
+from hilstar.display.quantise import FrameLight
+from hilstar.display.render.aids import LINE_SHARE, lay_over
+from hilstar.display.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target, as_maps
+from hilstar.display.render.reference import add_stars, extended_image
+from hilstar.display.response import Levels
+from hilstar.optics.extended import ExtendedLight
+from hilstar.optics.sprites import Sprites
+
+if TYPE_CHECKING:
+    from moderngl import Context
+
+NUMPY = "NumPy"
+log = logging.getLogger(__name__)
+
+
+def open_backend(target: Target, context: "Context | None") -> Backend:
+    """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
+    if context is None:
+        return NumpyBackend(target)
+    from hilstar.display.render.renderer import Renderer  # moderngl, which nothing needs where NumPy draws
+
+    return Renderer(target, context)
+
+
+def headless_context(gpu: int | str | None = None) -> "Context | None":
+    """A headless GL context on a GPU (see `create_context`); None where this machine has no OpenGL, so that NumPy draws.
+
+    Raises InputError where the machine has no such GPU.
+    """
+    if gpu is None:
+        try:
+            ctypes.CDLL(EGL_LIBRARY)
+        except OSError:
+            _say_once(f"{EGL_LIBRARY} is missing")
+            return None
+    from hilstar.display.render.context import create_context  # moderngl
+
+    try:
+        return create_context(gpu)
+    except NotThereError:  # a named one is meant, and no other draws in its place
+        raise
+    except MachineError as error:
+        _say_once(str(error))
+        return None
+
+
+@lru_cache(maxsize=1)
+def _say_once(why: str) -> None:
+    log.warning("NumPy draws, slower than OpenGL would (%s); 'hilstar doctor' says what to install", why)
+
+
+class NumpyBackend(Backend):
+    """Draws sprites of one Target in NumPy; `back_buffer` has the codes (height, width, 3) that were presented."""
+
+    back_buffer: npt.NDArray[np.uint16]
+
+    context = None
+    gl_renderer = NUMPY
+    gl_version = np.__version__
+    path = "NumPy"
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        self._quantisers = target.quantisers()
+        self._last_frame = NO_FRAME
+        self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
+        self._sprites: Sprites | None = None
+        self._levels: Levels | None = None
+        self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}  # the last of each primary, and its image
+
+    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+        """Draw `sprites` (None: blank); see `Backend.draw`."""
+        if frame <= self._last_frame:
+            self.begin_anew()
+        self._last_frame = frame
+        self._sprites, self._linear = sprites, None
+        if self._quantisers:
+            self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
+
+    def _plane(self, frame: int, k: int, light: Sprites | None) -> Levels:
+        image, alone = partial(self._image, light, True, k), partial(self._image, light, False, k, stars=False)
+        return self._quantisers[k].draw(FrameLight(light, image, alone, frame))
+
+    def draw_linear(self, sprites: Sprites) -> None:
+        """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
+        self._sprites, self._linear = sprites, None
+
+    def linear(self) -> Float32Array:
+        """The linear image of the last draw, electrons per second, float32 (height, width)."""
+        if self._linear is None:
+            self._linear = self._image(self._sprites, shrunk=False)
+        return self._linear
+
+    def levels(self) -> Levels:
+        """The levels of the last draw (height, width); TypeError for a target without a response."""
+        if self._levels is None:
+            raise TypeError("this target has no monitor response, so no levels")
+        return self._levels
+
+    def show_on(self, view: ScreenView) -> None:
+        """See `Backend.show_on`."""
+        self._screen = view
+
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """See `Backend.present`."""
+        view = self._screen
+        turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
+        shown = self.levels()[:height, :width]
+        shown = shown if view.triples is None else view.triples[shown]
+        codes = np.zeros((height, width, 3), dtype=np.uint16)
+        codes[: shown.shape[0], : shown.shape[1]] = shown if shown.ndim == 3 else shown[..., None]
+        cross_x, cross_y = map(round, view.cross_px)
+        lay_over(codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y))
+        codes = np.rot90(codes, -turn.quarter_turns)[:: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1].copy()
+        codes[len(codes) - marker[0] :, : marker[0]] = marker[1]
+        self.back_buffer = codes
+
+    def take_back_buffer(self) -> None:
+        """Return at once: nothing swaps it."""
+
+    def remember_tables(self) -> None:
+        """The host's memory keeps them."""
+
+    def begin_anew(self) -> None:
+        """The next frame is the first of a sequence."""
+        self._last_frame = NO_FRAME
+        for one in self._quantisers.values():
+            one.begin_anew()
+
+    def finish(self) -> None:
+        """Return at once: `draw` has drawn."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def _image(self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True) -> Float32Array:
+        """The linear image of a plane, or its extended light; `shrunk` draws fainter stars within the target's `sides`."""
+        width, height = self.target.resolution_px
+        sprites = as_maps(sprites, self.target) if stars else sprites
+        if sprites is None:
+            return np.zeros((height, width), dtype=np.float32)
+        image = self._extended(sprites.extended, plane)
+        if not stars:
+            return image.astype(np.float32)
+        image = image.copy()
+        sides_px = np.full(len(sprites), self.target.psf.footprint_px)
+        rate = sprites.data["electrons_per_s"] * sprites.per_star
+        if self.target.primaries:
+            rate = rate * (self.target.flux_at_white_e_per_s / self.target.primaries[plane].flux_at_white_e_per_s)
+        for side in self.target.sides if shrunk else ():
+            sides_px[rate < side.below_e_per_s] = side.side_px
+        for side_px in np.unique(sides_px).tolist():
+            add_stars(image, sprites, self.target.psf, side_px, np.flatnonzero(sides_px == side_px))
+        return image.astype(np.float32)
+
+    def _extended(self, lights: tuple[ExtendedLight, ...], plane: int) -> FloatArray:
+        """The light of discs and stray light alone (height, width); the same lights again are not drawn again."""
+        if plane not in self._lights or self._lights[plane][0] != lights:
+            self._lights[plane] = lights, extended_image(lights, self.target.resolution_px)
+        return self._lights[plane][1]

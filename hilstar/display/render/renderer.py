@@ -1,0 +1,506 @@
+"""The renderer: sprites to a linear image and code values, in OpenGL (3.3 core or newer).
+
+This room is the only user of moderngl.
+"""
+
+import zlib
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Self
+
+import moderngl
+import numpy as np
+
+from hilstar.basics.arrays import Float32Array
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
+from hilstar.display.quantisers import QUANTISERS
+from hilstar.display.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
+from hilstar.display.render.context import MAX_WRITTEN_BYTES, Context, check_limits, computes_in_software, create_context
+from hilstar.display.render.driver import Driver
+from hilstar.display.render.encoder import (
+    CUT_WINGS,
+    SPRITE_PIXEL_COST,
+    Encoder,
+    Eraser,
+    LevelTexture,
+    Planes,
+    Shares,
+    lit_sides,
+    most_covered_px,
+    set_sides,
+    splat_program,
+    sprites_array,
+)
+from hilstar.display.render.exact_pass import ExactPass
+from hilstar.display.render.host_image import HostImage
+from hilstar.display.render.star_passes import ApartPasses, LightUnits, StarPasses
+from hilstar.display.response import Levels
+from hilstar.optics.extended import Rectangle
+from hilstar.optics.sprites import Sprites
+
+if TYPE_CHECKING:
+    from hilstar.display.render.disc_tiles import Sure, Tiles
+    from hilstar.display.render.extended import ExtendedLayer
+
+FIRST_CAPACITY = 4096
+UNTIMED = nullcontext()
+
+
+class Renderer(Backend):
+    """Draws sprites of one Target, in a context of its own or in a window's. Free it with `close`."""
+
+    context: Context
+    ON_HOST = True  # whether a linear image alone may be drawn in the process's memory, where this GL can
+
+    def __init__(self, target: Target, context: Context | None = None) -> None:
+        self.target = target
+        self._planes = Planes.of(target)
+        self.footprint_px = self._planes.footprint_px
+        self._undrawn: tuple[Sprites | None, bool] | None = None
+        self._by_numpy = False
+        quantiser = QUANTISERS[target.quantisation]
+        self._by_pixel = quantiser.by_pixel()
+        self._by_star = quantiser if target.response is not None and issubclass(quantiser, ExactQuantiser) else None
+        self._last_frame = NO_FRAME
+        self.context = self._ctx = context or create_context()
+        self.gl_renderer, self.gl_version = (str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION"))
+        try:
+            with self._ctx:
+                self._driver = Driver(self._ctx)
+                key = "sprite_sigma_px" if target.response else "psf_sigma_px"
+                check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.psf.width_px)}")
+                self._build()
+        except BaseException:
+            self._ctx.release()
+            raise
+
+    def _build(self) -> None:
+        ctx, target, planes = self._ctx, self.target, self._planes
+        ctx.enable(moderngl.PROGRAM_POINT_SIZE)
+        ctx.blend_func = (moderngl.ONE, moderngl.ONE)
+        self._linear = ctx.texture(target.resolution_px, planes.texel, dtype="f4")
+        self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._linear_fbo = ctx.framebuffer([self._linear])
+        self._shares = Shares(ctx, target.psf, self.footprint_px)
+        self._splat = splat_program(ctx, target.resolution_px, self._shares, planes)
+        self._eraser = Eraser(ctx, target.resolution_px, planes, of_levels=False)
+        self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
+        self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
+        self._tiles: Tiles | None = None  # a disc whose levels need no linear image everywhere
+        self._cut_sides = self._wider(target.sides)
+        self._build_levels()
+        set_sides(self._splat, self._cut_sides)
+        self._reserve(FIRST_CAPACITY)
+        width, height = target.resolution_px
+        self._linear_image = np.empty((height, width), dtype=np.float32)
+        fits = 4 * width * height <= MAX_WRITTEN_BYTES
+        on_host = self.ON_HOST and target.response is None and fits and computes_in_software(ctx)
+        self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
+        self._on_host = False  # where the last draw is
+
+    def _wider(self, sides: SpriteSides) -> SpriteSides:
+        """The sides of sprites that have the light of all planes."""
+        more_px = self.footprint_px - self.target.psf.footprint_px
+        return tuple(SpriteSide(side.below_e_per_s, side.side_px + more_px) for side in sides)
+
+    def _build_levels(self) -> None:
+        target, planes = self.target, self._planes
+        # What turns light into codes; a window adds its own.
+        self.tables: list[moderngl.Texture | moderngl.Buffer] = []
+        self._checksums: list[tuple[moderngl.Texture | moderngl.Buffer, int]] = []
+        self.path = "points"
+        self._levels: LevelTexture | None = None
+        self._levels_black = True  # but for the last frame
+        self._encoder: Encoder | None = None
+        self._exact_passes: list[ExactPass] = []  # by plane, as those are chosen in turn
+        self._units: LightUnits | None = None
+        self._passes: StarPasses | None = None
+        self._unit_splat: moderngl.Program | None = None  # where points are in units
+        # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
+        self._exact: dict[int, ExactQuantiser] = {}
+        self._floor_encoder: Encoder | None = None
+        self._floor_levels: LevelTexture | None = None
+        self._floor_key: tuple[object, float] = ((), 0.0)
+        if not planes.panels:
+            return
+        panel, gain = planes.lit, planes.panels[0].gain()
+        self._gains = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
+        self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
+        by_star, ctx = self._by_star, self._ctx
+        if by_star is not None and by_star.takes(target.psf, ctx.version_code):
+            left = ctx.buffer(reserve=4, dynamic=True) if planes.apart and not by_star.remembers else None
+            chosen = partial(ExactPass, by_star, target, planes, linear=self._linear, levels=self._levels, shares=self._shares)
+            self._exact_passes = [chosen(turn, left=left) for turn in target.in_turn()]
+        if by_star is None or self._exact_passes:
+            self._encoder = Encoder(ctx, self._linear, self._levels, planes, self._by_pixel)
+            lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
+            sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
+            self._lit_sides = self._wider(sides)
+            set_sides(self._encoder.sprite_program, self._lit_sides)
+            if lit_e_per_s and not target.sides:
+                self._cut_sides = self._wider(lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS))
+            # The passes count thresholds alone.
+            if not self._by_pixel.shader and LightUnits.takes(planes, target.resolution_px):
+                self._build_units(self._levels, self._encoder)
+        for made in (self._encoder, *self._exact_passes, self._passes):
+            self.tables += [] if made is None else made.tables
+        if by_star is not None and not self._exact_passes:
+            self.path = "NumPy"
+        elif self._passes is not None:
+            self.path = "compute shaders"
+        elif self._exact_passes:
+            self.path = "points, then compute shaders"
+
+    def _build_units(self, levels: LevelTexture, encoder: Encoder) -> None:
+        """Build what draws light in whole units: the passes of a software OpenGL, else sprites."""
+        target, planes = self.target, self._planes
+        units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
+        if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
+            made, psf = ApartPasses if planes.apart else StarPasses, target.psf if self._by_star is not None else None
+            self._passes = made(levels, planes, self._shares, units, psf)
+            return
+        self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
+        planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
+        planes.set(encoder.sprite_program)
+        for program in (self._unit_splat, encoder.sprite_program):
+            program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
+
+    def _reserve(self, sprites: int) -> None:
+        """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
+        self._capacity = sprites
+        self._buffer = self._ctx.buffer(reserve=sprites * self._planes.dtype.itemsize, dynamic=True)
+        self._splat_vao, self._unit_vao = (
+            None if program is None else sprites_array(program, self._buffer, self._planes)
+            for program in (self._splat, self._unit_splat)
+        )
+        self._last_count: int | None = None  # sprites in the buffer and on the images
+        for eraser in (self._eraser, self._level_eraser):
+            eraser.take_places_from(self._buffer, self.footprint_px)
+        if self._encoder is not None:
+            self._encoder.take_places_from(self._buffer, self.footprint_px)
+
+    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+        """See `Backend.draw`."""
+        with self._ctx:
+            if frame <= self._last_frame:
+                self.begin_anew()
+            self._last_frame = frame
+            passes, by_star = self._passes, self._by_star
+            if by_star is None or self._exact_passes:
+                sprites = as_maps(sprites, self.target)
+            extended = sprites is not None and bool(sprites.extended)
+            # Stars are added to levels of extended light, by passes or by NumPy.
+            on_floor = extended and by_star is not None
+            units = None if extended and (not on_floor or passes is None or self._planes.apart) else self._units
+            unit_e_per_s = None if units is None else units.unit_for(sprites)
+            self._by_numpy = by_star is not None and (not self._exact_passes or (on_floor and unit_e_per_s is None))
+            if sprites is not None and not self._by_numpy:
+                sprites = self._planes.packed(sprites)
+            if passes is not None and unit_e_per_s is not None:
+                floor = None
+                if sprites is not None and on_floor and by_star is not None:
+                    with self._stage("extended"):
+                        floor = self._floor(sprites, by_star.floor_turn(frame))
+                # Levels star by star; the linear image is drawn only when it is read.
+                self._undrawn, self._levels_black = (sprites, True), False
+                with self._stage("erase"):
+                    passes.lay(floor)
+                if sprites is not None and len(sprites):
+                    with self._stage("upload"):
+                        passes.upload(sprites)
+                    with self._stage("splat"):
+                        passes.add_light(unit_e_per_s)
+                    with self._stage("encode"):
+                        passes.encode()
+                self._choose(sprites, passes)
+                return
+            if passes is not None:
+                passes.forget()
+            if self._by_numpy:
+                self._draw_by_numpy(sprites, frame)
+                self._undrawn = (sprites, False)
+                self._last_count = None
+            else:
+                self._draw_by_points(sprites, unit_e_per_s)
+
+    def draw_linear(self, sprites: Sprites) -> None:
+        """See `Backend.draw_linear`."""
+        if self._planes.apart:
+            self._white.draw_linear(sprites)
+            return
+        with self._ctx:
+            self._draw_linear(sprites, whole=True)
+
+    @cached_property
+    def _white(self) -> "Renderer":
+        """What draws linear images beside those of primaries."""
+        return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
+
+    @cached_property
+    def _extended(self) -> "ExtendedLayer":
+        from hilstar.display.render.extended import ExtendedLayer  # no frame of stars alone needs it
+
+        return ExtendedLayer(self._ctx, self.target.resolution_px)
+
+    def begin_anew(self) -> None:
+        """See `Backend.begin_anew`."""
+        self._last_frame = NO_FRAME
+        for quantiser in self._exact.values():
+            quantiser.left = None
+        for one in self._exact_passes:
+            one.left = None
+
+    def _draw_by_points(self, sprites: Sprites | None, unit_e_per_s: list[float] | None) -> None:
+        """The linear image and its levels by rasterised sprites, in units where one is given."""
+        few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
+        sides = self._lit_sides if self._encoder is not None else ()
+        covered_px = 0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
+        units, encoder, splat = self._units, self._encoder, self._unit_splat
+        in_units = sprites is not None and unit_e_per_s is not None and splat is not None
+        if units is not None and encoder is not None and splat is not None:
+            reach_per_e = 0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
+            encoder.sprite_program["reach_per_e"] = reach_per_e
+            if in_units and unit_e_per_s is not None:
+                splat["reach_per_e"] = reach_per_e
+                self._planes.set(splat, unit_e_per_s=unit_e_per_s)
+        cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
+        sure = None if sprites is None or not sprites.extended or covered_px >= few_px else self._sure(self._by_pixel, sprites)
+        self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units, sure=sure)
+        if self._encoder is not None:
+            with self._stage("encode"):
+                count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
+                uniforms = self._by_pixel.uniforms(self._last_frame)
+                lit = self._regions, self._tiles
+                self._encoder.draw(count, per_star, covered_px, uniforms, *lit, is_black=self._levels_black)
+                self._levels_black = True  # but for what this frame has
+        if in_units or (cut and not self.target.sides) or self._tiles is not None:
+            self._undrawn = (sprites, True)  # without what is left out, when somebody asks
+        self._choose(sprites, None)
+
+    def _stage(self, name: str) -> AbstractContextManager[object]:
+        """The context in which a stage of a frame runs; see StagedRenderer."""
+        return UNTIMED
+
+    def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
+        """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
+        for one in self._exact_passes:
+            if self._exact and (left := self._exact[one.plane].left) is not None:
+                one.left, self._exact[one.plane].left = left, None
+            if sprites is None or not len(sprites):
+                one.left = None
+                continue
+            with self._stage("choose"):
+                one.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
+
+    def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
+        """Levels by the sprites themselves: the linear image is drawn only when it is read."""
+        target, levels, by_star = self.target, self._levels, self._by_star
+        if levels is None or by_star is None:
+            return
+        if not self._exact:
+            self._exact = {k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)}
+        for one in self._exact_passes:
+            if (left := one.left) is not None:
+                self._exact[one.plane].left, one.left = left, None
+        floor = None
+        if sprites is not None and sprites.extended:
+            floor = self._floor(sprites, by_star.floor_turn(frame)).read()
+        on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
+        self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
+        levels.write(self._exact_levels)
+
+    def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
+        """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
+
+        The same lights and turn again give the same levels, which are kept.
+        """
+        key = sprites.lights or sprites.extended, turn
+        if self._floor_encoder is None or self._floor_levels is None:
+            self._floor_key, self._floor_levels = ((), 0.0), LevelTexture(self._ctx, self.target.resolution_px, self._planes)
+            self._floor_encoder = Encoder(self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser)
+        if key != self._floor_key:
+            self._erase(levels=False)
+            self._draw_extended(sprites, self._sure(DitherQuantiser, None))
+            self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False)
+            self._floor_levels.in_memory = False
+            self._floor_levels.read()
+            self._floor_levels.in_memory = True  # read back once, for all frames that keep it
+            self._floor_key = key
+        return self._floor_levels
+
+    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> "Sure | None":
+        """What a quantiser's levels need not know of a disc's light, where there is one plane."""
+        if self._planes.apart or not self._planes.panels:
+            return None
+        from hilstar.display.render.disc_tiles import Sure
+
+        panel, (least, most) = self._planes.panels[0], self._gains
+        white_e_per_s = panel.flux_at_white_e_per_s
+        # The first step by the smallest threshold of a mask, at all of its turns
+        dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(panel.response.light[1]) * white_e_per_s / (2 * MASK_TURNS)
+        places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
+        return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
+
+    def _draw_extended(self, sprites: Sprites, sure: "Sure | None" = None) -> None:
+        """Add extended light to the linear image, that of each primary to its plane alone."""
+        fbo, self._regions = self._linear_fbo, ()
+        for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
+            fbo.color_mask = tuple(plane == k or not self._planes.apart for k in range(4))  # type: ignore[assignment]
+            regions, self._tiles = self._extended.draw(fbo, lights, sure)
+            self._regions += regions
+        fbo.color_mask = True, True, True, True
+
+    def _draw_linear(
+        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: "Sure | None" = None
+    ) -> None:
+        """Draw the linear image; `levels` says whether the last frame's are erased."""
+        self._undrawn, sprites = None, as_maps(sprites, self.target)
+        self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
+        if self._host is not None and self._on_host:
+            self._host.draw(sprites)
+            return
+        with self._stage("erase"):
+            self._erase(levels)
+        if sprites is not None and sprites.extended:
+            self._draw_extended(sprites, sure)
+        if sprites is not None and len(sprites):
+            with self._stage("upload"):
+                if len(sprites) > self._capacity:
+                    for held in (self._splat_vao, self._unit_vao, self._buffer):
+                        if held is not None:
+                            held.release()
+                    self._reserve(max(2 * self._capacity, len(sprites)))
+                self._buffer.orphan()
+                self._buffer.write(sprites.data)
+            self._last_count = len(sprites)
+            width, height = self.target.resolution_px
+            margin = self.footprint_px
+            with self._stage("splat"):
+                if not in_units:
+                    self._splat["sides"] = 0 if whole else len(self._cut_sides)
+                    self._splat["sprites_per_star"] = float(sprites.per_star)
+                self._linear_fbo.use()
+                self._shares.bind()
+                self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+                self._ctx.enable(moderngl.BLEND)
+                vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
+                if vao is not None:
+                    vao.render(moderngl.POINTS, vertices=len(sprites))
+                self._ctx.disable(moderngl.BLEND)
+
+    def _erase(self, levels: bool = True) -> None:
+        """Make black what the last frame drew."""
+        if levels and self._encoder is not None and self._levels is not None:
+            # A clear waits for the encoder: the fewer changes from image to image, the faster.
+            self._levels_black = self._levels_black and not self._level_eraser.clears(self._last_count)
+            if self._levels_black:
+                self._level_eraser.erase(self._levels.fbo, self._last_count)
+                self._level_eraser.erase_regions(self._levels.fbo, self._regions)
+        self._eraser.erase(self._linear_fbo, self._last_count)
+        self._eraser.erase_regions(self._linear_fbo, self._regions)
+        self._regions, self._tiles = (), None
+        self._last_count = 0
+
+    def levels(self) -> Levels:
+        """See `Backend.levels`."""
+        if self._by_numpy:
+            return self._exact_levels
+        if self._levels is None:
+            raise TypeError("this target has no monitor response, so no levels")
+        with self._ctx:
+            self._driver.wait()
+            return self._levels.read()
+
+    @property
+    def codes_texture(self) -> moderngl.Texture:
+        """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
+        if self._levels is None:
+            raise TypeError("this target has no monitor response, so no levels")
+        with self._ctx:
+            return self._levels.upload()
+
+    def linear(self) -> Float32Array:
+        """See `Backend.linear`."""
+        if self._host is not None and self._on_host:
+            return self._host.image
+        if self._planes.apart:
+            return self._white.linear()
+        with self._ctx:
+            if self._undrawn is not None:
+                self._draw_linear(*self._undrawn, levels=self._by_numpy)
+            self._driver.wait()
+            self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
+        return self._linear_image
+
+    def show_on(self, view: ScreenView) -> None:
+        """See `Backend.show_on`."""
+        from hilstar.display.render.presenter import Presenter
+
+        self._screen, self._presenter = view, Presenter(self.codes_texture, view, apart=self._planes.apart)
+        self.tables.append(self._presenter.table)
+
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """See `Backend.present`."""
+        _ = self.codes_texture  # with the last levels
+        self._presenter.present(overlay, patch_code, marker)
+
+    def take_back_buffer(self) -> None:
+        """See `Backend.take_back_buffer`."""
+        self._presenter.wait()
+
+    def changed_codes(self) -> str:
+        """See `Backend.changed_codes`."""
+        from hilstar.display.render.presenter import changed_codes
+
+        return changed_codes(self._ctx, self._screen.screen_px, self._screen.bits)
+
+    def fault(self) -> str:
+        """See `Backend.fault`."""
+        with self._ctx:
+            return self._driver.fault()
+
+    def remember_tables(self) -> None:
+        """See `Backend.remember_tables`."""
+        with self._ctx:
+            self._checksums = [(table, _checksum(table)) for table in self.tables]
+
+    def changed_tables(self) -> int:
+        """See `Backend.changed_tables`."""
+        with self._ctx:
+            return sum(_checksum(table) != checksum for table, checksum in self._checksums)
+
+    def forget_images(self) -> None:
+        """See `Backend.forget_images`."""
+        self._last_count, self._levels_black = None, False
+        self._floor_encoder, self._floor_levels = None, None
+        with self._ctx:
+            if self._passes is not None:
+                self._passes.forget()
+            self._extended.forget()
+        self.begin_anew()
+
+    def gl_error(self) -> str:
+        """The GL error since the last call, "GL_NO_ERROR" when there is none."""
+        with self._ctx:
+            return str(self._ctx.error)
+
+    def finish(self) -> None:
+        """Wait until everything that was asked for is drawn."""
+        with self._ctx:
+            self._driver.wait()
+
+    def close(self) -> None:
+        """Free the GL context and everything in it."""
+        self._ctx.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _checksum(table: moderngl.Texture | moderngl.Buffer) -> int:
+    data = table.read() if isinstance(table, moderngl.Buffer) else table.read(alignment=1)
+    return zlib.crc32(data)

@@ -1,0 +1,142 @@
+"""Whether an X11 window is seen: a thread with its own connection listens, so that no frame ever asks the server."""
+
+import ctypes
+import os
+import select
+import threading
+from dataclasses import dataclass
+from typing import Any, Self
+
+from hilstar.display.window.x11 import INT, NUMBER, POINTER, Survival, load_library, xlib
+
+# X.h
+VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
+VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
+COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
+LOOK_AGAIN_S = 0.5  # interval of what sends no events: the position of a window's parents, and the display's sleep
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenArea:
+    """A rectangle of the whole screen, px: its top left corner and its size."""
+
+    corner_px: tuple[int, int]
+    size_px: tuple[int, int]
+
+
+class _VisibilityEvent(ctypes.Structure):  # XVisibilityEvent of Xlib, and the beginning of every other event
+    _fields_ = (
+        *(("type", INT), ("serial", NUMBER), ("send_event", INT)),
+        *(("display", POINTER), ("window", NUMBER), ("state", INT)),
+    )
+
+
+class _Event(ctypes.Union):  # XEvent of Xlib
+    _fields_ = (("visibility", _VisibilityEvent), ("pad", ctypes.c_long * 24))
+
+
+class Visibility:
+    """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly seen, "" where it is."""
+
+    def __init__(self, x11: Any, connection: int, window: int, place: ScreenArea | None) -> None:
+        self._x11, self._connection, self._window, self.place = x11, connection, window, place
+        self._covered = 0
+        self._mapped = self._there = True
+        self._asleep = _sleep_of(connection)
+        self.hidden = ""
+        self._stop, self._stopped = os.pipe()
+        x11.XSelectInput(connection, window, VISIBILITY_CHANGES | STRUCTURE_CHANGES)
+        x11.XSync(connection, 0)
+        self._thread = threading.Thread(target=self._run, name="hilstar-visibility", daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def of(cls, window: int, place: ScreenArea | None, survival: Survival) -> Self | None:
+        """Watch a window that has to fill `place` (None: that may be anywhere); None without a connection to the server."""
+        try:
+            x11 = xlib()
+        except (OSError, AttributeError):
+            return None
+        connection = x11.XOpenDisplay(None)
+        if not connection:
+            return None
+        survival.cover(connection)
+        return cls(x11, connection, window, place)
+
+    def _run(self) -> None:
+        descriptor = self._x11.XConnectionNumber(self._connection)
+        while self._there:
+            off_place = self._off_place() if self._mapped else ""
+            while self._x11.XPending(self._connection) > 0:
+                event = _Event()
+                self._x11.XNextEvent(self._connection, ctypes.byref(event))
+                kind = event.visibility.type
+                if kind == VISIBILITY_NOTIFY:
+                    self._covered = event.visibility.state
+                elif kind in {MAP_NOTIFY, UNMAP_NOTIFY}:
+                    self._mapped = kind == MAP_NOTIFY
+                self._there = self._there and kind != DESTROY_NOTIFY
+            if self._there and not self._mapped:
+                self.hidden = "not on the screen"
+            elif self._there:  # X11 also calls covered what is off the screen
+                self.hidden = off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
+            ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
+            # A readable connection without an event has ended.
+            if self._stop in ready or (ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)):
+                return
+
+    def _off_place(self) -> str:
+        """Why the window is not where it should be: on its display, or wholly on the screen; "" where it is."""
+        root = self._x11.XDefaultRootWindow(self._connection)
+        size, screen = self._geometry(self._window), self._geometry(root)
+        x, y, child = ctypes.c_int(), ctypes.c_int(), ctypes.c_ulong()
+        pointers = (ctypes.byref(part) for part in (x, y, child))
+        if size is None or screen is None:
+            return ""
+        self._x11.XTranslateCoordinates(self._connection, self._window, root, 0, 0, *pointers)
+        corner = x.value, y.value
+        if self.place is not None:
+            return "" if ScreenArea(corner, size) == self.place else "moved off its display"
+        inside = all(at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True))
+        return "" if inside else "off the screen, in part or wholly"
+
+    def _geometry(self, drawable: int) -> tuple[int, int] | None:
+        root = ctypes.c_ulong()
+        x, y = ctypes.c_int(), ctypes.c_int()
+        width, height, border, depth = (ctypes.c_uint() for _ in range(4))
+        pointers = (ctypes.byref(part) for part in (root, x, y, width, height, border, depth))
+        if not self._x11.XGetGeometry(self._connection, drawable, *pointers):
+            return None
+        return width.value, height.value
+
+    def close(self) -> None:
+        """Stop watching."""
+        os.write(self._stopped, b"\0")
+        self._thread.join(LOOK_AGAIN_S)
+        if not self._thread.is_alive() and self._there:
+            self._x11.XCloseDisplay(self._connection)
+
+
+def _ended(descriptor: int) -> bool:
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    return bool(poll.poll(0))  # without requested events, it still reports a hang-up
+
+
+def _sleep_of(connection: int) -> Any:
+    """A function that tells whether the display sleeps (DPMS); always false where that is not known."""
+    try:
+        library = load_library("libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER))
+        parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
+        # Asked for a missing extension, Xlib prints to stderr.
+        if not xlib().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
+            return bool
+    except (OSError, AttributeError):
+        return bool
+
+    def asleep() -> bool:
+        level, enabled = ctypes.c_ushort(), ctypes.c_ubyte()
+        known = library.DPMSInfo(connection, ctypes.byref(level), ctypes.byref(enabled))
+        return bool(known and enabled.value and level.value)
+
+    return asleep

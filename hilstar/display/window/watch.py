@@ -1,0 +1,163 @@
+"""What is done to a display while a window is shown on it: somebody else's gamma ramp, and frames copied or flipped.
+
+A thread with connections of its own looks once a second, so that no frame ever asks the server.
+"""
+
+import contextlib
+import ctypes
+import threading
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.display.window.randr import Randr
+from hilstar.display.window.x11 import INT, POINTER, TEXT, Survival, load_library
+
+LOOK_S = 1.0
+FULL_RAMP, RAMP_BITS = 65535, 16
+COARSEST_BITS = 8
+XCB_LIBRARY, PRESENT_LIBRARY = "libxcb.so.1", "libxcb-present.so.0"
+GENERIC_EVENT, COMPLETE_NOTIFY, COMPLETE_MASK = 35, 1, 2  # xproto.h, present.h
+KIND_PIXMAP = 0
+MODES = ("copy", "flip", "skip", "copy")  # the last is a copy that a flip could have been
+UNKNOWN = "unknown"
+
+
+def is_straight(ramp: bytes | FloatArray) -> bool:
+    """Whether a gamma ramp is the identity, to half a code of its own depth.
+
+    Red, green and blue, in 16 bits a step or (3, steps) from 0 to 1. A driver that keeps 8 bits rounds to them. In a finer
+    table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less light at the faintest code.
+    """
+    parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP if isinstance(ramp, bytes) else ramp
+    if not parts.size:
+        return False
+    off = np.abs(parts - np.linspace(0, 1, parts.shape[1]))
+    # An entry of 16 bits is rounded itself.
+    return bool(np.all(off <= 0.5 / (2 ** ramp_bits(parts) - 1) + 0.5 / FULL_RAMP))
+
+
+def ramp_bits(parts: FloatArray) -> int:
+    """The depth in bits of a ramp's entries (3, steps) from 0 to 1: the coarsest, from 8, that holds each of them."""
+    for bits in range(COARSEST_BITS, RAMP_BITS):
+        full = 2**bits - 1
+        rounded = np.rint(parts * full) / full
+        if np.all(np.abs(parts - rounded) * FULL_RAMP <= 1.0):
+            return bits
+    return RAMP_BITS
+
+
+class PresentEvents:
+    """How the X server shows a window's frames, by the events of its Present extension on an XCB connection.
+
+    Drivers that do not use Present (NVIDIA's, llvmpipe) cause none. Raises OSError without a server, XCB, or Present.
+    """
+
+    def __init__(self, window: int) -> None:
+        number = ctypes.c_uint32
+        self._xcb = load_library(
+            XCB_LIBRARY,
+            xcb_connect=(POINTER, TEXT, POINTER),
+            xcb_connection_has_error=(INT, POINTER),
+            xcb_get_extension_data=(ctypes.POINTER(ctypes.c_ubyte), POINTER, POINTER),
+            xcb_generate_id=(number, POINTER),
+            xcb_flush=(INT, POINTER),
+            xcb_poll_for_event=(POINTER, POINTER),
+            xcb_disconnect=(None, POINTER),
+        )
+        self._present = load_library(PRESENT_LIBRARY, xcb_present_select_input=(ctypes.c_uint, POINTER, number, number, number))
+        self._free: Any = ctypes.CDLL(None).free
+        self._free.argtypes = [ctypes.c_void_p]
+        self._connection: Any = self._xcb.xcb_connect(None, None)
+        extension: Any = ctypes.addressof(ctypes.c_byte.in_dll(self._present, "xcb_present_id"))
+        reply = None
+        if not self._xcb.xcb_connection_has_error(self._connection):
+            reply = self._xcb.xcb_get_extension_data(self._connection, extension)
+        if not reply or not reply[8]:  # xcb_query_extension_reply_t: present, major_opcode
+            self.close()
+            raise OSError("the X server has no Present")
+        self._opcode = reply[9]
+        event_id = self._xcb.xcb_generate_id(self._connection)
+        self._present.xcb_present_select_input(self._connection, event_id, window, COMPLETE_MASK)
+        self._xcb.xcb_flush(self._connection)
+
+    def modes(self) -> list[str]:
+        """How each frame was shown that completed since the last call: "flip", "copy" or "skip"."""
+        found = []
+        while event := self._xcb.xcb_poll_for_event(self._connection):
+            # response_type, extension, sequence (2), length (4), event_type (2), kind, mode
+            head = ctypes.string_at(event, 12)
+            self._free(event)
+            generic = head[0] & 0x7F == GENERIC_EVENT and head[1] == self._opcode
+            if generic and head[8] == COMPLETE_NOTIFY and head[10] == KIND_PIXMAP and head[11] < len(MODES):
+                found.append(MODES[head[11]])
+        return found
+
+    def close(self) -> None:
+        """End the connection."""
+        self._xcb.xcb_disconnect(self._connection)
+
+
+class DisplayWatch:
+    """Looks once a second whether the gamma ramp of `output` (None: of none) is another, and how a window's frames are shown.
+
+    `ramp_changed` is true while the ramp is neither the one of the start nor straight.
+    """
+
+    def __init__(self, output: str | None, window: int, survival: Survival, look_s: float = LOOK_S) -> None:
+        self.ramp_changed = False
+        self._shown: Counter[str] = Counter()
+        self._output, self._look_s = output, look_s
+        self._randr: Randr | None = None
+        self._events: PresentEvents | None = None
+        self._lock = threading.Lock()
+        with contextlib.suppress(OSError):
+            self._randr = Randr(survival) if output else None
+        with contextlib.suppress(OSError, AttributeError, ValueError):
+            self._events = PresentEvents(window)
+        self._first = self._ramp()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-display-watch", daemon=True)
+        self._thread.start()
+
+    def _ramp(self) -> bytes:
+        return b"" if self._randr is None or self._output is None else self._randr.ramp(self._output)
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._look_s):
+            ramp = self._ramp()
+            self.ramp_changed = bool(ramp) and ramp != self._first and not is_straight(ramp)
+            self._take_events()
+
+    def _take_events(self) -> None:
+        with self._lock:
+            if self._events is not None:
+                self._shown.update(self._events.modes())
+
+    @property
+    def presented(self) -> dict[str, int]:
+        """Frames by how the X server showed them up to now: flip, copy, skip; empty where it does not say."""
+        self._take_events()
+        return dict(self._shown)
+
+    def stop(self) -> None:
+        """Stop looking; the connections stay."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Stop looking, and end the connections."""
+        self.stop()
+        self._thread.join(self._look_s)
+        if self._thread.is_alive():
+            return
+        for connection in (self._randr, self._events):
+            if connection is not None:
+                connection.close()
+
+
+def presented_as(shown: dict[str, int]) -> str:
+    """In a word how frames were shown: "flip", "copy", "flip and copy", or "unknown" where the server did not say."""
+    modes = [mode for mode in ("flip", "copy") if shown.get(mode)]
+    return " and ".join(modes) or UNKNOWN

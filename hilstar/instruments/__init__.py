@@ -1,0 +1,1 @@
+"""What is measured with a display; the server never imports it."""

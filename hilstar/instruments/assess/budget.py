@@ -1,0 +1,227 @@
+"""The error budget of a tracker, from a run's telemetry or from independent cases, with its 95 % intervals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.assess.clock import CUT_SIGMAS, FLOOR_ARCSEC, ClockFit, ClockSolver, CoarseClock, weights_of
+from hilstar.instruments.assess.components import MIN_ROWS, Component, Components, components_of
+from hilstar.instruments.assess.places import Scale
+from hilstar.server.record.commanded import Commanded
+
+BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # the bootstrap's blocks and draws
+COVERED = (2.5, 97.5)  # percent
+HALF_OF_95 = 1.96  # sigmas of a normal distribution
+UNUSUAL_SIGMAS = 5.0
+MAX_SPREAD_ARCSEC = 600.0  # one sigma; a larger spread is no star tracker but another run with a similar motion
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """One sigma across the boresight (an axis) and about it, arcsec; None where it cannot be told."""
+
+    cross: float | None
+    roll: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Intervals:
+    """95 % intervals, low and high, arcsec: the bias (2, 3), and each part across and about the boresight (2, 2)."""
+
+    bias: FloatArray
+    fov: FloatArray
+    pixel: FloatArray
+    noise: FloatArray
+
+
+@dataclass(frozen=True)
+class Decomposed:
+    """A budget and its ingredients.
+
+    `row` (k,) are the indices of the right answers, `components` the parts of their residuals, `commanded_q` (k, 4) and
+    `rate_rad_s` (k, 3) the attitudes and rates commanded at them. `wrong` (m,) are the indices of answers that are no attitude
+    of this sky.
+    """
+
+    bias_arcsec: FloatArray
+    fov_arcsec: Axes
+    pixel_arcsec: Axes
+    noise_arcsec: Axes
+    components: Components
+    intervals: Intervals
+    row: IntArray
+    wrong: IntArray
+    commanded_q: FloatArray
+    rate_rad_s: FloatArray
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class DecomposedRun(Decomposed):
+    """The budget of a run, with the clock that was found together with the bias.
+
+    `held` (h,) are the indices of answers that looked while a frame was held for missed ones. They are in no figure, and wrong
+    only where they are further off than the field turned meanwhile.
+    """
+
+    clock: ClockFit
+    held: IntArray
+
+
+def assess_run(
+    commanded: Commanded, tau_s: FloatArray, reported: FloatArray, coarse: CoarseClock, scale: Scale, rng: np.random.Generator
+) -> DecomposedRun:
+    """The budget of answers (n, 4) at rising times (n,), s of the tracker's clock, against the attitudes that a run commanded.
+
+    `coarse` is where the telemetry lies on the run's clock (see `clock.coarse_offset`). Raises InputError for fewer than
+    MIN_ROWS answers while the sky was shown, and where half or more of them are wild.
+    """
+    clock = ClockSolver(commanded, tau_s, reported, scale).fit(coarse)
+    known, held = clock.moments.known, clock.moments.known & (clock.moments.held_s > 0)
+    free = known & ~held
+    if known.sum() < MIN_ROWS:
+        raise InputError(f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer telemetry")
+    if free.sum() < MIN_ROWS:
+        raise InputError(
+            f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers looked while one was held,"
+            f" and {MIN_ROWS} others are needed; give a run that keeps its refresh rate, or a lower [monitor] refresh_hz"
+        )
+    if 2 * clock.used.sum() <= free.sum():
+        raise InputError(
+            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())} agree with one rotation"
+        )
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max())
+    if spread > MAX_SPREAD_ARCSEC:
+        raise InputError(f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run")
+    total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
+    right, parts = _right_answers(total, clock.moments.q, clock.used, scale)
+    intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
+    found = _decomposed(parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s)
+    astray = held & _beyond_turn(clock, parts)
+    wrong = np.sort(np.append(found.wrong, np.flatnonzero(astray)))
+    return DecomposedRun(**{**vars(found), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray))
+
+
+def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
+    """Answers (n,) further off than noise and the field's turn while a frame was held explain."""
+    moments = clock.moments
+    turned = ARCSEC_PER_RAD * np.linalg.norm(moments.rate_rad_s, axis=1) * moments.held_s
+    noise = float(np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2).sum()))
+    return np.asarray(np.linalg.norm(clock.residual_arcsec, axis=1) > turned + CUT_SIGMAS * noise)
+
+
+def assess_cases(
+    commanded: FloatArray, reported: FloatArray, scale: Scale, rng: np.random.Generator, rate_rad_s: FloatArray | None = None
+) -> Decomposed:
+    """The budget of cases: reported attitudes (n, 4), NaN where there is none, against the commanded ones (n, 4).
+
+    `rate_rad_s` (n, 3), cam, is the rate of each case. Raises InputError for fewer than MIN_ROWS answers, or half of them wild.
+    """
+    known = np.asarray(np.isfinite(reported).all(axis=1) & np.isfinite(commanded).all(axis=1))
+    if known.sum() < MIN_ROWS:
+        raise InputError(f"{int(known.sum())} answers, and {MIN_ROWS} are needed; plan more cases")
+    error = np.full((len(reported), 3), np.nan)
+    error[known] = ARCSEC_PER_RAD * to_rotation_vector(multiply(reported[known], conjugate(commanded[known])))
+    used = known.copy()
+    used[known] = weights_of(error[known])[1] > 0
+    if 2 * used.sum() <= known.sum():
+        raise InputError(f"half or more of the answers are wild: {int(used.sum())} of {int(known.sum())} agree")
+    rate = np.zeros_like(error) if rate_rad_s is None else rate_rad_s
+    right, parts = _right_answers(error, commanded, used, scale)
+    return _decomposed(parts, intervals_of(parts, rng), known, right, commanded, rate)
+
+
+def _right_answers(
+    error_arcsec: FloatArray, q: FloatArray, used: npt.NDArray[np.bool_], scale: Scale
+) -> tuple[IntArray, Components]:
+    """The indices (k,) of the right answers among those used (n,), and the components of their errors."""
+    row = np.flatnonzero(used)
+    parts = components_of(error_arcsec[row], q[row], scale)
+    stray = _stray(parts, error_arcsec[row])
+    if stray.any():
+        row = row[~stray]
+        parts = components_of(error_arcsec[row], q[row], scale)
+    return row, parts
+
+
+def _decomposed(
+    parts: Components, intervals: Intervals, known: npt.NDArray[np.bool_], row: IntArray, q: FloatArray, rate: FloatArray
+) -> Decomposed:
+    right = np.zeros(len(known), dtype=bool)
+    right[row] = True
+    return Decomposed(
+        bias_arcsec=parts.mean,
+        fov_arcsec=_told(parts.fov),
+        pixel_arcsec=_told(parts.pixel),
+        noise_arcsec=axes_of_variance(parts.noise_variance),
+        components=parts,
+        intervals=intervals,
+        row=row,
+        wrong=np.flatnonzero(known & ~right),
+        commanded_q=q[row],
+        rate_rad_s=rate[row],
+        notes=tuple(each.reason for each in (parts.fov, parts.pixel) if each.reason),
+    )
+
+
+def _stray(parts: Components, error_arcsec: FloatArray) -> npt.NDArray[np.bool_]:
+    """Answers (k,) far outside the noise and the errors as a whole: among few answers the fit alone can be far off."""
+    sigma = np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2))
+    off = error_arcsec - np.median(error_arcsec, axis=0)
+    usual = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
+    out_of_noise = ((parts.left / sigma) ** 2).sum(axis=1) > CUT_SIGMAS**2
+    return np.asarray(out_of_noise & (((off / usual) ** 2).sum(axis=1) > UNUSUAL_SIGMAS**2))
+
+
+def axes_of_variance(variance: FloatArray) -> Axes:
+    """One sigma across and about the boresight from the variances (3,) of the camera's axes."""
+    x, y, z = np.maximum(variance, 0.0).tolist()
+    return Axes(float(np.sqrt((x + y) / 2)), float(np.sqrt(z)))
+
+
+def _told(part: Component) -> Axes:
+    return Axes(None, None) if part.reason else axes_of_variance(part.variance)
+
+
+def intervals_of(parts: Components, rng: np.random.Generator, sigma_bias_arcsec: FloatArray | None = None) -> Intervals:
+    """The intervals of components by the block bootstrap (Kuensch 1989): errors of neighbouring answers go together.
+
+    `sigma_bias_arcsec` (3,) is the smallest uncertainty of the bias, where the clock was found together with it.
+    """
+    left, fov, pixel = parts.left, parts.fov, parts.pixel
+    n = len(left)
+    blocks = max(2, min(BLOCKS, n // MIN_IN_BLOCK))
+    block = np.arange(n) * blocks // n
+    count = np.bincount(block).astype(float)
+
+    def sums(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(block, column) for column in values.T], axis=1)
+
+    drawn = rng.integers(0, blocks, (DRAWS, blocks))
+    rows = count[drawn].sum(axis=1)[:, None]
+    total = sums(left + fov.fitted + pixel.fitted)[drawn].sum(axis=1) / rows
+    spread = np.std(total, axis=0)
+    if sigma_bias_arcsec is not None:
+        spread = np.maximum(spread, sigma_bias_arcsec)
+    freedom = n - 1 - fov.freedom - pixel.freedom
+    noise = sums(left**2)[drawn].sum(axis=1) / rows * (n / max(freedom, 1.0))
+    repeating = [
+        np.maximum(sums(each.fitted**2)[drawn].sum(axis=1) / rows - each.freedom / n * noise, 0.0) for each in (fov, pixel)
+    ]
+    return Intervals(
+        bias=np.stack([parts.mean - HALF_OF_95 * spread, parts.mean + HALF_OF_95 * spread]),
+        fov=_covered(repeating[0]),
+        pixel=_covered(repeating[1]),
+        noise=_covered(noise),
+    )
+
+
+def _covered(variance: FloatArray) -> FloatArray:
+    """Low and high of one sigma across and about the boresight, (2, 2), from drawn variances (draws, 3)."""
+    axes = np.sqrt(np.stack([variance[:, :2].mean(axis=1), variance[:, 2]], axis=1))
+    return np.asarray(np.percentile(axes, COVERED, axis=0))

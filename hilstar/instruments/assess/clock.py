@@ -1,0 +1,451 @@
+"""The tracker's clock against the run's: a coarse offset from angular speeds, then clock and bias together.
+
+**Coarse**, to some tenths of a second. The angular speed of an attitude is the same in every convention of axes and
+quaternions. So the speeds of the run and of the telemetry are correlated at every offset at once, by Fourier transforms; where
+the speed does not vary, the attitudes themselves are compared. The best offset is the one at which the rotation from commanded
+to reported attitudes is most nearly constant. Of offsets as good as that, zero is preferred, then the smallest rotation.
+
+**Fine.** With tau the telemetry's time and t the run's, tau = t + o + d (t - t_0). Reading the run at t' = t + delta adds omega
+delta to the residual e of T C(t')*, so that
+
+    e_i = b + omega_i (delta_0 + delta_1 s_i) + f(place_i) + n_i,        s = (t - t_0) / T
+
+is linear in bias and clock. They are first fitted robustly without f (Tukey's weights: Beaton and Tukey 1974). Then f is a
+random function of the place, a sum of bumps of variance kappa sigma^2, with the kappa and the spacing under which the residuals
+are most likely. Bias and clock are the generalised least squares estimate (Aitken 1935) under its covariance. So an error that
+repeats with the place is not taken for a clock, and a clock not for such an error.
+
+An answer whose exposure touches a frame that was held for missed ones saw another sky than the commanded one. It is in no fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, linalg, optimize, sparse
+from scipy.spatial import cKDTree
+
+from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.assess.places import Scale, bumps_at, centres_of, places_of
+from hilstar.server.record.commanded import Commanded, Moments
+
+# Coarse.
+STEP_S = 0.5  # step of the grid on which speeds are compared; larger for slow telemetry
+MAX_BINS, MIN_BINS = 2_000_000, 8
+MIN_OVERLAP = 0.1  # smallest overlap, as a share of the shorter recording
+TRIED = 12  # offsets tried
+COMPARED = 400  # attitudes compared at each
+STARTS = 40  # rotations that are tried as the one with half of all nearest to it
+SCANNED = 3000  # offsets of the scan by attitudes
+AS_GOOD, SMALL_RAD = 1.2, 1e-4  # a spread up to this factor and this angle above the smallest is as good
+OVERLAP_SHARE = 0.8  # offsets with a smaller share of the largest overlap are dropped
+TURN_RAD = np.radians(0.5)  # a tracker reports nearly the commanded attitude; a run that repeats itself elsewhere does not
+# Fine.
+CUT_SIGMAS = 8.0
+AGREE_ARCSEC = 3600.0  # an answer further from the others is of another sky, whatever their spread
+ROUNDS, REFINED = 40, 3
+MIN_USED = 5  # answers, as many as the fit has unknowns
+PART_PX = 150.0  # size of the parts of the field whose errors are compared for the clock's sigma
+# Prior sigmas of the clock; it is told once its sigma is below TOLD of them.
+OFFSET_PRIOR_S, DRIFT_PRIOR, TOLD = 10.0, 2e-3, 0.3
+DONE_ARCSEC = 1e-4
+FLOOR_ARCSEC = 1e-3
+MAX_BUMPS = 1000
+MIN_SPACING_PX, MAX_SPACING_PX = 20.0, 1300.0
+KAPPAS = np.logspace(-5, 4, 37)
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseClock:
+    """Seconds to add to the telemetry's times, and how nearly its attitudes then follow the commanded ones.
+
+    `rotation` (4,) leads from the commanded to the reported attitudes, half of which lie within `spread_rad` of it.
+    `compared` counts the attitudes with a commanded one.
+    """
+
+    offset_s: float
+    spread_rad: float
+    rotation: FloatArray
+    compared: int
+
+    @property
+    def turn_rad(self) -> float:
+        """The angle of the rotation."""
+        return float(2 * np.arctan2(np.linalg.norm(self.rotation[1:]), abs(self.rotation[0])))
+
+
+def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> CoarseClock | None:
+    """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset gives an overlap."""
+    few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
+    t, q = t_s[few], reported[few]
+    # Starts or ends together, and where speeds or attitudes agree.
+    tried = [_spread_at(commanded, t, q, float(commanded.t_s[end] - t_s[end])) for end in (0, -1)]
+    for peaks, reach_s in (_by_speed(commanded, t_s, reported), _by_attitude(commanded, t_s, reported)):
+        tried += [_nearby(commanded, t, q, float(offset_s), reach_s) for offset_s in peaks]
+    known = [each for each in tried if each is not None]
+    if not known:
+        return None
+    limit = AS_GOOD * min(each.spread_rad for each in known) + SMALL_RAD
+    good = [each for each in known if each.spread_rad <= limit]
+    many = OVERLAP_SHARE * max(each.compared for each in good)
+    best = min((each for each in good if each.compared >= many), key=lambda each: each.turn_rad)
+    as_they_are = _spread_at(commanded, t, q, 0.0)
+    if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
+        return as_they_are if as_they_are.turn_rad <= best.turn_rad + TURN_RAD else best
+    return best
+
+
+def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> FloatArray:
+    """Offsets (k,), s, at which the angular speeds agree, best first, and zero. They hold in every convention."""
+    return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
+
+
+def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
+    first = _spread_at(commanded, t_s, reported, offset_s)
+    if first is None:
+        return first
+
+    def spread(offset: float) -> float:
+        found = _spread_at(commanded, t_s, reported, offset)
+        return np.pi if found is None else found.spread_rad
+
+    low, high = offset_s - reach_s, offset_s + reach_s
+    better = optimize.minimize_scalar(spread, bounds=(low, high), method="bounded", options={"maxiter": 12})
+    found = _spread_at(commanded, t_s, reported, float(better.x))
+    return found if found is not None and found.spread_rad < first.spread_rad else first
+
+
+def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float) -> CoarseClock | None:
+    moments = commanded.at(t_s + offset_s)
+    if moments.known.sum() < max(3, MIN_OVERLAP * len(t_s)):
+        return None
+    rotations = multiply(reported[moments.known], conjugate(moments.q[moments.known]))
+    rotation, spread = nearest_to_half(rotations)
+    return CoarseClock(offset_s, spread, rotation, int(moments.known.sum()))
+
+
+def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
+    """The rotation among (n, 4) with half of all nearest to it, and the angle within which they lie, rad."""
+    chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
+    cosine = np.abs(rotations @ rotations[chosen].T)
+    # The chord is exact for tiny angles, where the cosine is not.
+    chord = np.sqrt(np.maximum(2 - 2 * cosine, 0))
+    half = np.quantile(4 * np.arcsin(np.minimum(chord / 2, 1)), 0.5, axis=0, method="higher")
+    best = int(np.argmin(half))
+    return rotations[chosen[best]], float(half[best])
+
+
+def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
+    """The offsets at which attitudes are nearest to the commanded ones, and the step of the scan."""
+    few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED // 4).astype(int))
+    t, q = t_s[few], reported[few]
+    reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
+    angle = np.full(len(reach), np.inf)
+    shown = commanded.shown
+    frame_s, frame_q = commanded.t_s[shown], commanded.q[shown]
+    for k, offset in enumerate(reach):  # the frame after each moment is near enough for a scan
+        frame = np.searchsorted(frame_s, t + offset)
+        inside = (frame > 0) & (frame < len(frame_s))
+        if inside.sum() >= max(3, MIN_OVERLAP * len(t)):
+            cosine = np.abs((q[inside] * frame_q[frame[inside]]).sum(axis=1))
+            angle[k] = float(np.median(1 - np.minimum(cosine, 1)))
+    return _peaks(-angle, reach), float(reach[1] - reach[0])
+
+
+def _by_speed(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
+    """The offsets at which angular speeds correlate best, and the step of the grid."""
+    cycle_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    step_s = max(STEP_S, 2 * cycle_s, 2 * commanded.interval_s)
+    spans = commanded.t_s[-1] - commanded.t_s[0], t_s[-1] - t_s[0]
+    step_s = max(step_s, max(spans) / MAX_BINS)
+    shown = commanded.shown
+    of_run = _speeds(commanded.t_s[shown], commanded.q[shown], step_s, commanded.t_s[0], spans[0])
+    of_tracker = _speeds(t_s, reported, step_s, t_s[0], spans[1])
+    if min(len(of_run), len(of_tracker)) < MIN_BINS:
+        return np.zeros(0), step_s
+    score, lag = _correlation(of_run, of_tracker)
+    return _peaks(score, commanded.t_s[0] - t_s[0] + step_s * lag), step_s
+
+
+def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_s: float) -> FloatArray:
+    """The median angular speed, rad/s, in each bin of a grid, over turns of about one step; NaN in an empty bin."""
+    bins = int(span_s / step_s) + 1
+    after = np.searchsorted(t_s, t_s + step_s)
+    inside = after < len(t_s)
+    before, after = np.flatnonzero(inside), after[inside]
+    gap_s = t_s[after] - t_s[before]
+    cosine = np.minimum(np.abs((q[before] * q[after]).sum(axis=1)), 1)
+    chord = np.sqrt(2 - 2 * cosine)
+    speed = 4 * np.arcsin(np.minimum(chord / 2, 1)) / gap_s
+    place = np.clip((((t_s[before] + t_s[after]) / 2 - start_s) / step_s).astype(int), 0, bins - 1)
+    good = gap_s < 3 * step_s
+    place, speed = place[good], speed[good]
+    order = np.lexsort((speed, place))
+    place, speed = place[order], speed[order]
+    first = np.searchsorted(place, np.arange(bins))
+    count = np.searchsorted(place, np.arange(bins), side="right") - first
+    median = np.full(bins, np.nan)
+    filled = count > 0
+    median[filled] = speed[(first + count // 2)[filled]]
+    return median
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How well b, begun `lag` bins after a, explains it: common bins times the information per bin; and the lags."""
+    size = fft.next_fast_len(len(a) + len(b), real=True)
+    weight_a, weight_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    # A wild pair of answers turns at any speed: speeds above twice the run's largest are clipped.
+    limit = 2 * float(np.nanmax(a, initial=0.0)) + 1e-12
+    a, b = np.nan_to_num(a), np.minimum(np.nan_to_num(b), limit)
+    mean = float(a.sum() / max(weight_a.sum(), 1))
+    a, b = (a - mean) * weight_a, (b - mean) * weight_b
+
+    def over_lags(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(fft.irfft(fft.rfft(x, size) * np.conj(fft.rfft(y, size)), size))
+
+    count = np.maximum(np.rint(over_lags(weight_a, weight_b)), 0)
+    sum_a, sum_b = over_lags(a, weight_b), over_lags(weight_a, b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = over_lags(a, b) - sum_a * sum_b / count
+        spread_a = over_lags(a * a, weight_b) - sum_a**2 / count
+        spread_b = over_lags(weight_a, b * b) - sum_b**2 / count
+        floor = 1e-9 * max(float((a * a).sum()), 1e-300)
+        r = np.where((spread_a > floor) & (spread_b > floor), covariance / np.sqrt(spread_a * spread_b), 0.0)
+    enough = count >= max(MIN_BINS, MIN_OVERLAP * min(weight_a.sum(), weight_b.sum()))
+    r = np.clip(np.where(enough, np.nan_to_num(r), 0.0), 0.0, 1 - 1e-9)
+    lag = np.arange(size)
+    return -count * np.log1p(-(r**2)), np.where(lag < len(a), lag, lag - size)
+
+
+def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
+    """The places of a score's highest peaks, best first."""
+    order = np.argsort(at)
+    score, at = score[order], at[order]
+    inner = np.r_[-np.inf, score, -np.inf]
+    peak = np.flatnonzero((score >= inner[:-2]) & (score >= inner[2:]) & np.isfinite(score))
+    return at[peak[np.argsort(-score[peak])][:TRIED]]
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """The clock, the bias (a rotation (4,) from commanded to reported), and which answers (n,) are of this sky.
+
+    `offset_s` is the telemetry's time minus the run's at the run's start, `drift` the excess rate of its clock, `sigma_*` one
+    sigma. `residual_arcsec` (n, 3), cam, is the error beyond bias and clock at the commanded `moments`; NaN where those are
+    not known.
+    """
+
+    offset_s: float
+    drift: float
+    sigma_offset_s: float
+    sigma_drift: float
+    sigma_bias_arcsec: FloatArray
+    rotation: FloatArray
+    moments: Moments
+    t_s: FloatArray
+    residual_arcsec: FloatArray
+    used: BoolArray
+
+    @property
+    def offset_told(self) -> bool:
+        """Whether the motion determines the offset."""
+        return self.sigma_offset_s < TOLD * OFFSET_PRIOR_S
+
+    @property
+    def drift_told(self) -> bool:
+        """Whether the motion determines the drift."""
+        return self.sigma_drift < TOLD * DRIFT_PRIOR
+
+
+class ClockSolver:
+    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded attitudes.
+
+    t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]; `rotation` (4,) is the bias.
+    """
+
+    def __init__(self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale) -> None:
+        self.commanded, self.tau_s, self.reported, self.scale = commanded, tau_s, reported, scale
+        self.start_s = float(commanded.t_s[0])
+        self.span_s = max(float(commanded.t_s[-1]) - self.start_s, 1e-9)
+
+    def fit(self, coarse: CoarseClock) -> ClockFit:
+        """The fit, begun at a coarse clock."""
+        self.rotation, self.delay_s, self.stretch_s = coarse.rotation, -coarse.offset_s, 0.0
+        self._align()
+        used = self._robust(-coarse.offset_s)
+        covariance = np.linalg.inv(self._prior(0.0)[0] + np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2)
+        for _ in range(REFINED):
+            used = used & self.free
+            if used.sum() < MIN_USED:
+                break
+            covariance = self._refine(used, -coarse.offset_s)
+        stretch = self.stretch_s / self.span_s
+        sigma = np.sqrt(np.diag(covariance))
+        return ClockFit(
+            offset_s=self.delay_s,  # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
+            drift=stretch / (1 - stretch),
+            sigma_offset_s=float(sigma[3]),
+            sigma_drift=float(sigma[4]) / self.span_s,
+            sigma_bias_arcsec=sigma[:3],
+            rotation=self.rotation,
+            moments=self.moments,
+            t_s=self.t_s,
+            residual_arcsec=self.residual,
+            used=used,
+        )
+
+    def _align(self, step: FloatArray | None = None) -> None:
+        """Take a step (5,) of bias, arcsec, delay and stretch, and find the run's times and the residuals there."""
+        if step is not None:
+            turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
+            self.rotation = normalise(multiply(turn, self.rotation))
+            self.delay_s, self.stretch_s = self.delay_s + float(step[3]), self.stretch_s + float(step[4])
+        plain = self.tau_s - self.delay_s
+        self.share = (plain - self.start_s) / self.span_s
+        self.t_s = plain - self.stretch_s * self.share
+        self.moments = self.commanded.at(self.t_s)
+        known = self.moments.known
+        self.free = known & (self.moments.held_s == 0)
+        turn = multiply(multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation))
+        self.residual = np.full((len(self.t_s), 3), np.nan)
+        self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
+
+    def _design(self, rows: BoolArray) -> FloatArray:
+        """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3, rows, 5), arcsec."""
+        omega = ARCSEC_PER_RAD * self.moments.rate_rad_s[rows]
+        design = np.zeros((3, int(rows.sum()), 5))
+        for axis in range(3):
+            design[axis, :, axis] = 1.0
+            design[axis, :, 3] = omega[:, axis]
+            design[axis, :, 4] = omega[:, axis] * self.share[rows]
+        return design
+
+    def _prior(self, delay_s: float) -> tuple[FloatArray, FloatArray]:
+        """The prior's precision (5, 5), and its pull (5,) towards it."""
+        precision = np.array([0, 0, 0, 1 / OFFSET_PRIOR_S**2, 1 / (DRIFT_PRIOR * self.span_s) ** 2])
+        return np.diag(precision), precision * np.array([0, 0, 0, delay_s - self.delay_s, -self.stretch_s])
+
+    def _robust(self, begun_s: float) -> BoolArray:
+        """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not wild."""
+        for _ in range(ROUNDS):
+            rows, residual = self.free, self.residual[self.free]
+            if rows.sum() < MIN_USED:
+                break
+            sigma, weight = weights_of(residual)
+            if (weight > 0).sum() < MIN_USED:  # no one rotation: the caller refuses them
+                break
+            design = self._design(rows)
+            normal, right = self._prior(begun_s)
+            for axis in range(3):
+                scaled = design[axis] * (weight / sigma[axis] ** 2)[:, None]
+                normal, right = normal + scaled.T @ design[axis], right + scaled.T @ residual[:, axis]
+            step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+            self._align(step)
+            if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
+                break
+        used: BoolArray = self.free.copy()
+        if used.sum() >= MIN_USED:
+            used[self.free] = weights_of(self.residual[self.free])[1] > 0
+        return used
+
+    def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:
+        """One generalised least squares step; its covariance (5, 5)."""
+        design, left = self._design(used), self.residual[used]
+        place = places_of(to_matrix(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
+        normal, right = self._prior(begun_s)
+        smooth = most_likely(place, left)
+        pulls = np.zeros((len(left), 5))
+        for axis in range(3):
+            whitened = smooth.whiten(np.column_stack([design[axis], left[:, axis]]), axis)
+            normal = normal + design[axis].T @ whitened[:, :5]
+            right = right + design[axis].T @ whitened[:, 5]
+            pulls += whitened[:, :5] * left[:, axis : axis + 1]
+        covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        self._align(covariance @ right)
+        return honest(covariance, pulls, place)
+
+
+def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> FloatArray:
+    """A covariance (5, 5) whose sigmas are at least those by which parts of the field differ.
+
+    `pulls` (n, 5) are the answers' terms in the normal equations. An error that lasts longer than the random function allows
+    pulls neighbours the same way (Liang and Zeger 1986).
+    """
+    centre = centres_of(place, PART_PX)
+    _, part = cKDTree(centre).query(place)
+    sums = np.stack([np.bincount(part, column, minlength=len(centre)) for column in pulls.T], axis=1)
+    sums = sums - sums.mean(axis=0)
+    spread = covariance @ (sums.T @ sums) @ covariance
+    growth = np.sqrt(np.maximum(np.diag(spread) / np.diag(covariance), 1.0))
+    return np.asarray(covariance * np.outer(growth, growth))
+
+
+def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """One sigma (3,) by the median deviation, and Tukey's weights (n,) of residuals (n, 3); 0 for a wild answer."""
+    off = residual_arcsec - np.median(residual_arcsec, axis=0)
+    sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
+    squared = ((off / sigma) ** 2).sum(axis=1)
+    near = (squared < CUT_SIGMAS**2) & ((off**2).sum(axis=1) < AGREE_ARCSEC**2)
+    return sigma, np.where(near, (1 - squared / CUT_SIGMAS**2) ** 2, 0.0)
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A random function of the place and white noise, with `kappa` (3,) and `variance` (3,), arcsec^2, of each axis.
+
+    `turn` (p, p) and `square` (p,) are the eigenvectors and eigenvalues of the bumps' normal matrix.
+    """
+
+    bumps: sparse.csr_matrix | None
+    turn: FloatArray
+    square: FloatArray
+    kappa: FloatArray
+    variance: FloatArray
+
+    def whiten(self, columns: FloatArray, axis: int) -> FloatArray:
+        """An axis's inverse covariance times columns (n, k)."""
+        if self.bumps is None or self.kappa[axis] == 0:
+            return np.asarray(columns / self.variance[axis])
+        share = self.kappa[axis] / (1 + self.kappa[axis] * self.square)
+        inner = self.turn @ (share[:, None] * (self.turn.T @ (self.bumps.T @ columns)))
+        return np.asarray((columns - self.bumps @ inner) / self.variance[axis])
+
+
+def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
+    """The spacing, and each axis's variances, under which residuals (n, 3) about their mean are most likely."""
+    left = residual - residual.mean(axis=0)
+    n = len(left)
+    power = np.maximum((left**2).mean(axis=0), FLOOR_ARCSEC**2)
+    best = Smooth(None, np.zeros((0, 0)), np.zeros(0), np.zeros(3), power)
+    likely = -0.5 * n * float(np.log(power).sum())
+    spacing = MIN_SPACING_PX
+    while spacing <= MAX_SPACING_PX:
+        centre = centres_of(place, spacing)
+        if 1 < len(centre) <= min(MAX_BUMPS, n // 8):
+            found, likelihood = _variances(bumps_at(place, centre, spacing), left)
+            if likelihood > likely:
+                best, likely = found, likelihood
+        if len(centre) <= 2:
+            break
+        spacing *= 2
+    return best
+
+
+def _variances(bumps: sparse.csr_matrix, left: FloatArray) -> tuple[Smooth, float]:
+    """The most likely variances with these bumps, and the logarithm of their likelihood."""
+    square, turn = linalg.eigh(np.asarray((bumps.T @ bumps).todense()), check_finite=False)
+    square = np.maximum(square, 0.0)
+    projected = (turn.T @ (bumps.T @ left)) ** 2  # (p, 3)
+    n, total = len(left), (left**2).sum(axis=0)
+    kappa, variance, likelihood = np.zeros(3), np.zeros(3), 0.0
+    grown = 1 + KAPPAS[:, None] * square  # (kappas, p)
+    logs = np.log(grown).sum(axis=1)
+    for axis in range(3):
+        rest = total[axis] - ((KAPPAS[:, None] / grown) * projected[:, axis]).sum(axis=1)
+        rest = np.maximum(rest / n, FLOOR_ARCSEC**2)
+        each = -0.5 * (n * np.log(rest) + logs)
+        k = int(np.argmax(each))
+        kappa[axis], variance[axis] = KAPPAS[k], rest[k]
+        likelihood += float(each[k])
+    return Smooth(bumps, turn, square, kappa, variance), likelihood

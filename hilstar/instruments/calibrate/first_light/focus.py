@@ -1,0 +1,409 @@
+"""The step `focus`: how sharp the tracker sees dots, by its PSF's sigma and the side of a dot, fitted together to their pixels.
+
+A dot is a square of light, turned as the screen is turned before the tracker. Where a monitor pixel is wide for the tracker its
+edges say how sharp the tracker is; where the PSF is wide the whole width does, and the side has to be known. So both are
+fitted, with the side as well known as the step `orientation` leaves it, and the error says how well the two can be told apart.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import chart
+from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.effective_psf import Found, dots_of_image, draw_effective, fit_effective
+from hilstar.instruments.calibrate.first_light.context import (
+    DarkSubtracted,
+    Figure,
+    FittedFigure,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern
+from hilstar.instruments.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, dot_image, lit_for, plan_seen_dots
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.settings import DetectorSettings
+
+THRESHOLD_SIGMA = 8.0
+MIN_DOTS, MAX_DOTS = 5, 40  # of which the brightest are fitted: 40 leave 0.2 % of error where a dot leaves 1 %
+MIN_ALONE_DOTS, MIN_WINGS_PX = 8, 2.0  # with fewer alone, a dot's square of pixels is made smaller, to so much about its side
+MAX_ALL_POINTS = 24_000  # of all dots together: fewer dots where each has many points
+SIGMAS_PX = (0.1, 12.0)  # ends of the model
+STARTS_PX = np.geomspace(0.2, 8.0, 12)
+START_SIGMAS, MIN_HALF_PX, MAX_HALF_PX = 4.0, 5, 40  # of a dot's wings in its square of pixels, beside its own half side
+POINTS_A_SIGMA, MIN_POINTS, MAX_POINTS = 2.5, 5, 48  # along a dot's side: 2.5 in a sigma make its edge softer by 0.7 %
+ROUNDS, FIRST_DAMPING, SETTLED = 40, 1e-3, 1e-4
+SIDE_SHARE = 0.01  # sigma of a dot's side: lens and tilt change it so much over the field
+# What the model leaves, relative to the PSF's sigma: a pixel is no even square, and the points are not infinitely many.
+MODEL_SHARE = 0.01
+# Sigma of the PSF by an edge that is softer than a square's, relative to a dot's side: of 19.5 px it was 0.019 px off.
+EDGE_SHARE = 3.5e-4
+FLUX_FLOOR = 1e-9
+WILD_SIGMAS = 5.0  # a dot whose own sigma is so far from the others' has a neighbour, dust or a dead pixel
+
+
+@dataclass(frozen=True, slots=True)
+class DotNoise:
+    """What the tracker's detector adds to a dot's pixels beside the noise of the background: gain and PRNU."""
+
+    gain_e_per_dn: float = math.inf
+    prnu: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """Dots in the tracker's image: places (n,), the PSF's sigma by each (n,), and by all together with its error, tracker px.
+
+    `dot_side_px` is the side that was fitted with it, with its error. Where the fit did not settle `has_settled` is False.
+    """
+
+    x_px: FloatArray
+    y_px: FloatArray
+    each_psf_sigma_px: FloatArray
+    psf_sigma_px: float
+    psf_sigma_error_px: float
+    dot_side_px: float
+    dot_side_error_px: float
+    has_settled: bool = True
+
+
+class _Dots(NamedTuple):
+    """Squares of pixels (n, k, k) about dots, and the offsets of their middles from the dots' first places (n,)."""
+
+    values: FloatArray
+    x_px: FloatArray
+    y_px: FloatArray
+    half_px: int
+
+
+class _Shape(NamedTuple):
+    """A dot's points (p, 2) of a side of 1, turned; and what is common to all dots: the PSF's sigma and the side, px."""
+
+    points: FloatArray
+    sigma_px: float
+    side_px: float
+
+
+class _Fitted(NamedTuple):
+    """The shape common to all dots, their places (n, 2), and the standard errors of the PSF's sigma and of the side."""
+
+    shape: _Shape
+    places: FloatArray
+    sigma_error_px: float
+    side_error_px: float
+    has_settled: bool
+
+
+def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, noise: DotNoise | None = None) -> Sharpness:
+    """Measure the sharpness of dots in an image (h, w) above its dark frame.
+
+    A dot is a square of about `dot_side_px` tracker px, turned by `turn_deg` in the image. Raises InputError where too few dots
+    are there, or none stands alone.
+    """
+    background = noisiest_background(image)
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+    found = find_stars(image, settings, background)
+    if len(found) < MIN_DOTS:
+        raise InputError(f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look at the focus")
+    turn = math.radians(turn_deg)
+    half_side = dot_side_px / 2 * (abs(math.cos(turn)) + abs(math.sin(turn)))
+    # The wings of a first look at the dots: the blob's pixels are those above the threshold.
+    blob_px = math.sqrt(float(np.median(found.pixels)) / math.pi)
+    half = int(np.clip(math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX))
+    # Where dots stand closer together, smaller squares hold less of the wings and the fit's error says so.
+    smallest = math.ceil(half_side + MIN_WINGS_PX)
+    while True:
+        dots = _alone(image, background.level, found.x_px, found.y_px, half)
+        if len(dots.values) >= MIN_ALONE_DOTS or half <= smallest:
+            break
+        half -= 1
+    if len(dots.values) < MIN_DOTS:
+        raise InputError(
+            f"{len(dots.values)} dots stand alone and whole in the image and {MIN_DOTS} are needed; look at the focus"
+        )
+    noise = noise or DotNoise()
+    shape = _started(dots, dot_side_px, turn)
+    dots = _first(dots, max(MAX_ALL_POINTS // len(shape.points), MIN_DOTS + 3))
+    fit = _fitted(dots, shape, dot_side_px, background.noise, noise)
+    each, usable = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
+    if usable.sum() >= MIN_DOTS and not usable.all():
+        dots = _Dots(dots.values[usable], dots.x_px[usable], dots.y_px[usable], half)
+        fit = _fitted(dots, fit.shape, dot_side_px, background.noise, noise)
+        each, _ = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
+    sigma_px = fit.shape.sigma_px
+    by_scatter = float(np.std(each)) / math.sqrt(len(each))
+    by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
+    error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
+    return Sharpness(
+        x_px=np.rint(dots.x_px) + fit.places[:, 0],
+        y_px=np.rint(dots.y_px) + fit.places[:, 1],
+        each_psf_sigma_px=each,
+        psf_sigma_px=sigma_px,
+        psf_sigma_error_px=error_px,
+        dot_side_px=fit.shape.side_px,
+        dot_side_error_px=fit.side_error_px,
+        has_settled=fit.has_settled,
+    )
+
+
+def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, half: int) -> _Dots:
+    """The brightest dots whose square of pixels has no other dot's middle and is within the image."""
+    height, width = image.shape
+    apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px))
+    apart += np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
+    column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
+    whole = (column >= half) & (column < width - half) & (row >= half) & (row < height - half)
+    kept = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
+    steps = np.arange(-half, half + 1)
+    values = image[(row[kept, None] + steps)[:, :, None], (column[kept, None] + steps)[:, None, :]] - level
+    return _Dots(np.asarray(values, dtype=np.float64), x_px[kept], y_px[kept], half)
+
+
+def _points(sigma_px: float, side_px: float, turn: float) -> FloatArray:
+    """Points (p, 2) spread evenly over a square of side 1 that is turned by `turn` rad."""
+    count = int(np.clip(math.ceil(POINTS_A_SIGMA * side_px / sigma_px), MIN_POINTS, MAX_POINTS))
+    along = (np.arange(count) + 0.5) / count - 0.5
+    x, y = (part.ravel() for part in np.meshgrid(along, along))
+    cos, sin = math.cos(turn), math.sin(turn)
+    return np.column_stack([cos * x - sin * y, sin * x + cos * y])
+
+
+def _started(dots: _Dots, side_px: float, turn: float) -> _Shape:
+    """The PSF's sigma, of some, that leaves the smallest squares."""
+    few = _first(dots, MIN_DOTS)
+    left = []
+    for sigma_px in STARTS_PX:
+        shape = _Shape(_points(float(sigma_px), side_px, turn), float(sigma_px), side_px)
+        own = _slopes(shape, _first_places(few), few.half_px)[0]
+        flux, level = _amplitudes(own, few.values)
+        left.append(float(((few.values - flux * own - level) ** 2).sum()))
+    best = float(STARTS_PX[int(np.argmin(left))])
+    return _Shape(_points(best / 2, side_px, turn), best, side_px)
+
+
+def _first(dots: _Dots, count: int) -> _Dots:
+    return _Dots(dots.values[:count], dots.x_px[:count], dots.y_px[:count], dots.half_px)
+
+
+def _first_places(dots: _Dots) -> FloatArray:
+    return np.column_stack([dots.x_px - np.rint(dots.x_px), dots.y_px - np.rint(dots.y_px)])
+
+
+def _amplitudes(own: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Light and background (n, 1, 1) of dots with a model (n, k, k), by least squares."""
+    flat = own - own.mean(axis=(1, 2), keepdims=True)
+    flux = (flat * values).sum(axis=(1, 2), keepdims=True) / np.maximum((flat**2).sum(axis=(1, 2), keepdims=True), 1e-300)
+    flux = np.maximum(flux, FLUX_FLOOR)
+    return flux, values.mean(axis=(1, 2), keepdims=True) - flux * own.mean(axis=(1, 2), keepdims=True)
+
+
+def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, ...]:
+    """Shares of dots' light in pixels (n, k, k), and their derivatives by x, y, the PSF's sigma and the side's logarithm."""
+    across, down = (_along(shape, places[:, k], shape.points[:, k], half) for k in (0, 1))
+    weight = 1 / len(shape.points)
+    (share_x, by_x, sigma_x, side_x), (share_y, by_y, sigma_y, side_y) = across, down
+
+    def together(of_y: FloatArray, of_x: FloatArray) -> FloatArray:
+        return np.asarray(of_y.transpose(0, 2, 1) @ of_x * weight)
+
+    return (
+        together(share_y, share_x),
+        together(share_y, by_x),
+        together(by_y, share_x),
+        together(sigma_y, share_x) + together(share_y, sigma_x),
+        together(side_y, share_x) + together(share_y, side_x),
+    )
+
+
+def _along(shape: _Shape, place: FloatArray, points: FloatArray, half: int) -> tuple[FloatArray, ...]:
+    """Along one axis, of each point's light in each pixel (n, p, k): the share, and its derivatives as in `_slopes`."""
+    edges = np.arange(2 * half + 2) - half - 0.5
+    middle = place[:, None] + shape.side_px * points
+    reach = (edges - middle[:, :, None]) / shape.sigma_px
+    density = np.exp(-0.5 * reach**2) / (math.sqrt(2 * math.pi) * shape.sigma_px)
+    share = np.diff(ndtr(reach), axis=2)
+    by_place = -np.diff(density, axis=2)
+    by_sigma = -np.diff(density * reach, axis=2)
+    return share, by_place, by_sigma, by_place * (shape.side_px * points)[:, None]
+
+
+def _weights(own: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise) -> FloatArray:
+    """One over the sigma of each pixel (n, k, k), by the model's light."""
+    light = np.maximum(flux * own, 0.0)
+    return np.asarray(1 / np.sqrt(noise_dn**2 + light / noise.gain_e_per_dn + (noise.prnu * light) ** 2))
+
+
+def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise) -> _Fitted:
+    """The shape common to all dots and their places, fitted to their pixels.
+
+    Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from the normal equations.
+    """
+    shape, places, damping = start, _first_places(dots), FIRST_DAMPING
+    value, settled = math.inf, False
+    for _ in range(ROUNDS):
+        own, *slopes = _slopes(shape, places, dots.half_px)
+        flux, level = _amplitudes(own, dots.values)
+        weight = _weights(own, flux, noise_dn, noise)
+        off = (dots.values - flux * own - level) * weight
+        columns = np.stack([own, np.ones_like(own), *(flux * each for each in slopes)], axis=1) * weight[:, None]
+        columns = columns.reshape(len(own), 6, -1)
+        right = columns @ off.reshape(len(own), -1, 1)
+        normal = columns @ columns.transpose(0, 2, 1)
+        normal += 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(6)
+        by_own = np.linalg.solve(normal[:, :4, :4], np.concatenate([normal[:, :4, 4:], right[:, :4]], axis=2))
+        common = (normal[:, 4:, 4:] - normal[:, 4:, :4] @ by_own[:, :, :2]).sum(axis=0)
+        aim = (right[:, 4:] - normal[:, 4:, :4] @ by_own[:, :, 2:]).sum(axis=0)[:, 0]
+        chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(own), 1), 1.0)
+        # The side is known beforehand to SIDE_SHARE; its weight grows with the misfit as the pixels' own does.
+        known = chi2 / SIDE_SHARE**2
+        common[1, 1] += known
+        aim[1] += known * math.log(side_px / shape.side_px)
+        step = np.linalg.solve(common + damping * np.diag(np.diag(common)), aim)
+        grown = float(np.clip(shape.sigma_px + step[0], 0.5 * shape.sigma_px, 2 * shape.sigma_px))
+        sigma_px = float(np.clip(grown, *SIGMAS_PX))
+        moved = by_own[:, 2:4, 2] - by_own[:, 2:4, :2] @ step
+        places = places + np.clip(moved, -0.5, 0.5)
+        settled = bool(abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED)
+        side = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
+        turn = math.atan2(*(shape.points[-1] - shape.points[0])[::-1]) - math.pi / 4
+        shape = _Shape(_points(sigma_px, side, turn), sigma_px, side)
+        damping = damping / 3 if float((off**2).sum()) <= value else damping * 5
+        value = float((off**2).sum())
+        if settled:
+            break
+    covariance = np.linalg.inv(common) * chi2
+    side_error_px = shape.side_px * math.sqrt(covariance[1, 1])
+    return _Fitted(shape, places, math.sqrt(covariance[0, 0]), side_error_px, settled)
+
+
+def _each_sigma(
+    dots: _Dots, shape: _Shape, places: FloatArray, noise_dn: float, noise: DotNoise
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """The PSF's sigma by each dot (n,), with the side of all, and which dots agree with the others (n,)."""
+    own, by_x, by_y, by_sigma, _ = _slopes(shape, places, dots.half_px)
+    flux, level = _amplitudes(own, dots.values)
+    weight = _weights(own, flux, noise_dn, noise)
+    off = ((dots.values - flux * own - level) * weight).reshape(len(own), -1, 1)
+    columns = np.stack([own, np.ones_like(own), flux * by_x, flux * by_y, flux * by_sigma], axis=1) * weight[:, None]
+    columns = columns.reshape(len(own), 5, -1)
+    normal = columns @ columns.transpose(0, 2, 1)
+    steps = np.linalg.solve(normal + 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(5), columns @ off)[:, 4, 0]
+    each = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
+    far = np.abs(each - np.median(each))
+    return each, far <= WILD_SIGMAS * 1.4826 * max(float(np.median(far)), 1e-3 * shape.sigma_px)
+
+
+PLAN_SEED = 0
+FIRST_FRAMES = 8  # of dots where the figure of `orientation` says that the tracker looks
+FIRST_LIT_DOTS = 18  # in a frame: 48 dots, of 56 codes of three frames in eight
+OVERSAMPLING = 4  # for the effective PSF
+BLURRED, BLURRED_BY_PX = 1.3, 0.1  # times the bench file's sigma, and px: less is no reason to turn the focus
+# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a pixel's middle where the screen
+# is brightest, and later steps refuse what is over MAX_FILL.
+DOT_FILL = 0.6
+MAX_ERROR_SHARE = 0.2  # of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
+
+
+class SharpDots(NamedTuple):
+    """The brightest code that does not saturate the tracker, how sharp dots of it are, and their image."""
+
+    code: int
+    sharpness: Sharpness
+    looked: DarkSubtracted
+
+
+def focus(context: StepContext) -> StepOutcome:
+    """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
+    code, found, looked = sharp_dots(context)
+    wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
+    sigma, error = found.psf_sigma_px, found.psf_sigma_error_px
+    picture = context.session / "focus.svg"
+    finding = f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), the bench file has {wanted:.4g}"
+    with chart(picture, finding, height_inch=6.0) as (axes,):
+        dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
+        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
+        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.invert_yaxis()
+    pixel_px = found.dot_side_px / DOT_PX
+    figures: dict[str, Figure] = {
+        "psf_sigma_px": sigma,
+        "psf_sigma_error_px": error,
+        "monitor_pixel_px": pixel_px,
+        "monitor_pixel_error_px": found.dot_side_error_px / DOT_PX,
+        "dots": len(found.x_px),
+        "dot_code": code,
+    }
+    files: tuple[Path, ...] = looked.path, picture
+    pictures: tuple[Path, ...] = (picture,)
+    line = f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:.4g}; dots at code {code}"
+    line += f", a monitor pixel is {pixel_px:.3f} px"
+    effective = _effective(looked, found)
+    if effective is not None:
+        drawn = context.session / "psf.svg"
+        draw_effective(drawn, effective)
+        files, pictures = (*files, drawn), (picture, drawn)
+        figures["effective_psf_rms"] = effective.chosen.rms
+        line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
+    number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
+    verdict: Verdict = "done"
+    if not found.has_settled:
+        why = f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and at the focal lengths"
+        line, verdict = f"{line}: {why}", "failed"
+    elif error > MAX_ERROR_SHARE * sigma:
+        why = f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer [tracker] exposure_s"
+        line, verdict = f"{line}: {why}", "failed"
+    elif sigma > BLURRED * wanted + BLURRED_BY_PX:
+        cure = "turn the focus until this figure is smallest (--again focus), or write [tracker] psf_sigma_px as it is"
+        line, verdict = f"{line}: {cure}", "failed"
+    fitted = (FittedFigure("PSF sigma", sigma, *SIGMAS_PX),)
+    return StepOutcome(verdict, line, figures, files, pictures, number=number, fitted=fitted)
+
+
+def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
+    """The effective PSF by the dots of one image; None where too few stand alone, and the width alone is known."""
+    try:
+        return fit_effective(dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING)
+    except InputError:
+        return None
+
+
+def sharp_dots(context: StepContext) -> SharpDots:
+    """Lower the dots' code until they do not saturate the tracker, and measure them. Raises InputError."""
+    seen, code = context.seen_screen, context.white
+    plan = first_dots(seen)
+    dark = context.read(context.dark())
+    for number in range(context.file.config.monitor.bits * 2):
+        codes = dot_image(plan, 0, context.resolution_px, code)
+        looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
+        if looked.raw_peak < DOT_FILL * context.full_dn:
+            break
+        code = context.darker(code)
+    return SharpDots(code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked)
+
+
+def seen_sharpness(image: FloatArray, seen: SeenScreen, detector: DetectorSettings, images: int = 1) -> Sharpness:
+    """Measure the sharpness of dots of DOT_PX in the mean (h, w) of some images, above their dark frame.
+
+    The squares are as large, and turned, as `seen` has the screen's pixels. Raises InputError as `sharpness` does.
+    """
+    noise = DotNoise(images * detector.gain_e_per_dn, detector.prnu)
+    return sharpness(image, DOT_PX * seen.tracker_px_a_monitor_px, seen.turn_deg, noise)
+
+
+def dot_code(context: StepContext) -> int:
+    """The brightest code whose dots do not saturate the tracker. Raises InputError."""
+    return int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
+
+
+def first_dots(seen: SeenScreen) -> DotPlan:
+    """The dots of the first frames: where the figure says that the tracker looks. Raises InputError."""
+    lit = min(lit_for(seen), FIRST_LIT_DOTS)
+    return plan_seen_dots(seen, FIRST_FRAMES, lit, np.random.default_rng(PLAN_SEED))

@@ -1,0 +1,384 @@
+"""The steps that find where the tracker sees each pixel: orientation, focus, geometry."""
+
+import itertools
+import math
+from dataclasses import astuple, dataclass, replace
+from operator import ne
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import DARK, ORANGE, TEXT_PT, chart
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import make_directory
+from hilstar.basics.rotation import from_matrix
+from hilstar.instruments.calibrate.first_light.context import (
+    SEEN_FOCAL,
+    SEEN_Q,
+    DarkSubtracted,
+    Figure,
+    FittedFigure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    with_changes,
+)
+from hilstar.instruments.calibrate.first_light.focus import PLAN_SEED, dot_code, first_dots
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern, black
+from hilstar.instruments.calibrate.geometric.calibration import (
+    Calibrated,
+    calibrate_seen,
+    dot_sigma_px,
+    notes_for_a_person,
+    parameters_of,
+    rough_geometry,
+    write_calibrated,
+)
+from hilstar.instruments.calibrate.geometric.dots import DotPlan, dot_image, joined, lit_for, plan_seen_dots, write_plan
+from hilstar.instruments.calibrate.geometric.fit import FIELD_DEGREES
+from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
+
+FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
+SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
+SQUARES = (3, 2, 1)  # sides of the squares at the corner, to its right and below it, in those of the smallest
+
+
+@dataclass(frozen=True, slots=True)
+class OrientationFigure:
+    """An asymmetric figure: squares of three sizes at a corner, to its right and below it, (3,) monitor px."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    side_px: int
+    reach_px: float
+
+    def pattern(self, name: str, resolution_px: tuple[int, int], code: int) -> Pattern:
+        """The figure in squares of `code`."""
+        codes = black(resolution_px)
+        for x, y, sides in zip(self.x_px, self.y_px, SQUARES, strict=True):
+            half = self.side_px * sides / 2
+            codes[round(y - half) : round(y + half), round(x - half) : round(x + half)] = code
+        return Pattern(name, codes)
+
+
+def figure_for(geometry: BenchGeometry) -> OrientationFigure:
+    """The figure in the middle of what the bench file's ideal lens shows the tracker. Raises InputError without space."""
+    monitor, tracker = geometry.monitor, geometry.tracker
+    ratio = monitor.focal_length_px / tracker.focal_length_px
+    reach = FIGURE_REACH * min(*monitor.resolution_px, *(ratio * size for size in tracker.resolution_px))
+    side = max(3, math.ceil(SQUARE_TRACKER_PX * ratio))
+    if reach < SQUARES[0] * side:
+        raise InputError("the tracker sees too little of the monitor for a figure; look at the focal lengths and pixel pitches")
+    (middle_x,), (middle_y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in tracker.resolution_px))
+    width, height = monitor.resolution_px
+    if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
+        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
+    x_px, y_px = middle_x + reach * np.array([-1.0, 1.0, -1.0]), middle_y + reach * np.array([-1.0, -1.0, 1.0])
+    return OrientationFigure(x_px, y_px, side, reach)
+
+
+THRESHOLD_SIGMA = 8.0
+MIN_PIXELS = 3
+MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
+SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
+MAX_SCALE = 2.0
+MIN_LIGHT_STEP = 1.3  # between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
+MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
+UPRIGHT = (1, 0, 0, 1)
+QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
+OBLIQUE_DEG = 40.0  # from the nearest right angle
+WAYS = {
+    UPRIGHT: "upright",
+    (-1, 0, 0, 1): "mirrored left to right",
+    (1, 0, 0, -1): "mirrored top to bottom",
+    (-1, 0, 0, -1): "turned by 180 degrees",
+    (0, -1, 1, 0): "turned by 90 degrees clockwise",
+    (0, 1, -1, 0): "turned by 270 degrees clockwise",
+    (0, 1, 1, 0): "with columns and rows swapped",
+    (0, -1, -1, 0): "with columns and rows swapped, and turned by 180 degrees",
+}
+CORNERS = {(-1, -1): "top left", (1, -1): "top right", (-1, 1): "bottom left", (1, 1): "bottom right"}
+SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0, -1): "above it"}
+NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFigure:
+    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares.
+
+    The turn's error is half of what the figure's two sides disagree by, and that of the spots. `focal_length_px` of the monitor
+    and `q_cam_to_mon` (4,) are those that put the figure where it is seen.
+    """
+
+    way: tuple[int, int, int, int]
+    scale: float
+    turn_deg: float
+    turn_error_deg: float
+    x_px: FloatArray
+    y_px: FloatArray
+    focal_length_px: float
+    q_cam_to_mon: FloatArray
+
+    @property
+    def whole_turn_deg(self) -> float:
+        """The turn that is left, with the quarter turn of an orientation that is not upright."""
+        return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
+
+
+class SquaresAlike(InputError):
+    """The figure's squares have about the same light: they saturate the tracker, or other light is among them."""
+
+
+def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (3,) of the figure's squares in an image (h, w), the largest first. Raises InputError, SquaresAlike."""
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
+    background = noisiest_background(image)
+    found = find_stars(image, settings, background)
+    if len(found) < len(SQUARES):
+        raise InputError(f"{len(found)} of the figure's three squares are in the image; {NOT_SEEN}")
+    largest = np.argsort(-found.pixels, kind="stable")[:MAX_SPOTS]
+    # By light, for a wide PSF makes spots of nearly one size of squares of three.
+    radius_px = math.ceil(WINDOW_SIDES * math.sqrt(found.pixels.max()))
+    values, dx, dy = squares(image, background.level, found.x_px[largest], found.y_px[largest], radius_px)
+    light = values.sum(axis=(1, 2))
+    brightest = np.argsort(-light, kind="stable")[: len(SQUARES)]
+    step = light[brightest[:-1]] / np.maximum(light[brightest[1:]], 1e-9)
+    if (step < MIN_LIGHT_STEP).any():
+        told = ", ".join(f"{each:.3g}" for each in light[brightest])
+        raise SquaresAlike(
+            f"the three brightest spots have {told} DN in all and cannot be told apart, where squares of three sizes have 9, 4"
+            " and 1 parts; look at stray light and reflections, or expose shorter"
+        )
+    right, down = ((values * offset).sum(axis=(1, 2)) / light for offset in (dx, dy))
+    which = largest[brightest]
+    return found.x_px[which] + right[brightest], found.y_px[which] + down[brightest]
+
+
+def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
+    """Find the figure in a tracker's image (h, w) above its dark frame, by the bench file's lens.
+
+    Raises InputError where it is not there, or not as large as the focal lengths say, SquaresAlike where its squares are.
+    """
+    x_px, y_px = _squares_of(image)
+    monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
+    shown_x, shown_y = geometry.to_monitor(x_px, y_px)
+    corner, right, below = np.stack([shown_x, shown_y], axis=1)
+    seen = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
+    scale = float(np.sqrt(abs(np.linalg.det(seen))))
+    if not 1 / MAX_SCALE < scale < MAX_SCALE:
+        raise InputError(f"the figure is {scale:.2f} times as large as the bench file says; look at focal lengths and pitches")
+    ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
+    way = max(ways, key=lambda each: float((ways[each] * seen).sum()))
+    left = np.linalg.inv(ways[way]) @ seen / scale
+    longest, shortest = np.linalg.svd(left, compute_uv=False)
+    if longest > MAX_STRETCH * shortest:
+        raise InputError(
+            f"the figure is no square: {longest / shortest:.2f} times as long one way as the other; look at stray light, and at"
+            " how far the screen is tilted"
+        )
+    turn = float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1])))
+    sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
+    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
+    turn_error = math.hypot(float(sides[0] - sides[1]) / 2, by_spots)
+    # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the figure is large.
+    focal_length_px = geometry.monitor.focal_length_px / scale
+    camera = replace(geometry.monitor, focal_length_px=focal_length_px)
+    shown_rays = np.column_stack([*camera.tangents(figure.x_px, figure.y_px), np.ones(3)])
+    aligned, _ = Rotation.align_vectors(_unit(shown_rays), _unit(geometry.tracker.rays(x_px, y_px)))
+    q_cam_to_mon = from_matrix(aligned.as_matrix())
+    return SeenFigure(way, scale, turn, turn_error, x_px, y_px, focal_length_px, q_cam_to_mon)
+
+
+def _unit(rays: FloatArray) -> FloatArray:
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
+    """The key to press for each orientation; the first is upright."""
+    return {str(number): way for number, way in enumerate(WAYS, start=1)}
+
+
+def look_of(way: tuple[int, int, int, int]) -> str:
+    """Where the figure's squares appear in this orientation, in words."""
+    right, below = (way[0], way[2]), (way[1], way[3])
+    corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
+    return f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]} ({WAYS[way]})"
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenMounting:
+    """How the screen is mounted: keys of [monitor]."""
+
+    flip_x: bool
+    flip_y: bool
+    rotate_deg: int
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The matrix (2, 2) from the image's axes to the screen's, x right and y down."""
+        turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
+        return np.asarray(np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn)
+
+
+def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
+    """The mounting that turns an image seen in orientation `way` upright, with the fewest keys changed."""
+    wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
+    flips = (False, True)
+    all_ways = [ScreenMounting(x, y, turn) for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))]
+    right = [each for each in all_ways if np.allclose(each.matrix, wanted)]
+    return min(right, key=lambda each: (sum(map(ne, astuple(each), astuple(mounting))), each.flip_y, each.rotate_deg))
+
+
+FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
+MAX_TILT_DEG = 60.0  # of a geometry file
+FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not followed
+
+
+def orientation(context: StepContext) -> StepOutcome:
+    """Find how the screen is mounted, set the bench file's keys, and check that the figure is upright. Raises InputError."""
+    monitor = context.file.config.monitor
+    before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
+    first, measured = _way(context, "figure_000")
+    after = corrected(before, first)
+    keys = ("flip_x", "flip_y", "rotate_deg")
+    changes = tuple(change for key in keys for change in context.change("monitor", key, getattr(after, key)))
+    if (before.rotate_deg - after.rotate_deg) % 180:
+        width, height = monitor.resolution_px
+        changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)
+    if changes:
+        now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
+        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit takes either.
+        if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (now != UPRIGHT and not _is_oblique(measured)):
+            made = "; ".join(change.line for change in changes)
+            raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
+    way = f"first {WAYS[first]}, now upright" if changes else "upright"
+    if measured is None:
+        figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
+        return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
+    found, looked = measured
+    turn_deg = found.whole_turn_deg
+    picture = context.session / "orientation.svg"
+    draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
+    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": turn_deg, "turn_error_deg": found.turn_error_deg}
+    figures |= {SEEN_FOCAL: found.focal_length_px, **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True))}
+    line = f"{way}, {found.scale:.4f} of the expected size, turned by {turn_deg:+.2f} deg"
+    number = StepNumber(turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
+    return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
+
+
+def _is_oblique(measured: tuple[SeenFigure, DarkSubtracted] | None) -> bool:
+    return measured is not None and abs(measured[0].turn_deg) > OBLIQUE_DEG
+
+
+def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
+    """The figure's orientation, and its measurement; None where a person pressed a key instead."""
+    geometry = context.geometry()
+    figure, keys = figure_for(geometry), keys_of_ways()
+    code, tries = context.white, 0
+    while True:
+        shown = name if not tries else f"{name}_dim{tries}"
+        pattern = figure.pattern(shown, context.resolution_px, code)
+        told = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
+        if isinstance(told, str):
+            return keys[told], None
+        looked = context.looked(told, context.read(context.dark()))
+        try:
+            found = see_figure(looked.image, figure, geometry)
+        except SquaresAlike:
+            # Squares that saturate the tracker are alike: darker ones are not.
+            if not context.is_too_bright(looked):
+                raise
+            code, tries = context.darker(code), tries + 1
+        else:
+            return found.way, (found, looked)
+
+
+SQUARE_NAMES = ("corner", "right", "below")
+
+
+def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str) -> None:
+    """Draw an image of the tracker (h, w) with a ring about each spot found."""
+    with chart(path, finding, height_inch=6.4) as (axes,):
+        low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
+        axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
+        axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
+        plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}  # readable over stars and on black
+        for name, x, y in zip(SQUARE_NAMES, x_px[:3], y_px[:3], strict=False):
+            side = "right" if x > image.shape[1] / 2 else "left"
+            away = -14 if side == "right" else 14
+            axes.annotate(
+                name, (x, y), (away, 16), textcoords="offset points", ha=side, color=DARK[ORANGE], size=TEXT_PT + 1, bbox=plate
+            )
+        axes.grid(visible=False)
+        axes.set(xlabel="tracker x [px]", ylabel="tracker y [px]")
+
+
+def geometry(context: StepContext) -> StepOutcome:
+    """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises InputError."""
+    code = dot_code(context)
+    make_directory(context.folder)
+    dark = context.dark()
+    first = first_dots(context.seen_screen)
+    paths, seen = _frames_of(context, first, 0, code, dark)
+    rough = rough_geometry(context.file, first, seen)
+    second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
+    more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
+    plan, paths = joined(first, second), [*paths, *more_paths]
+    write_plan(context.folder / "plan.csv", plan)
+    ideal = context.file.config.tracker.distortion is None
+    context.stage(f"fits lenses to {len(seen) + len(more_seen)} centroids")
+    found = calibrate_seen(context.file, plan, seen.joined(more_seen), tracker_is_ideal=ideal)
+    output, picture = context.session / "geometry.toml", context.session / "geometry.svg"
+    write_calibrated(output, found, picture, context.source.monitor)
+    chosen, error = found.chosen, found.uncertainty
+    figures: dict[str, Figure] = {
+        "model": chosen.name,
+        "held_out_rms_arcsec": chosen.rms_arcsec,
+        "held_out_max_arcsec": chosen.max_arcsec,
+        "error_rms_arcsec": error.rms_arcsec,
+        "error_max_arcsec": error.max_arcsec,
+        "noise_px": found.problem.noise_px,
+        "dots_recognised": found.recognised,
+        "dots_planned": len(found.plan),
+        "centroids_lost": int(found.lost),
+        "centroids_false": int(found.false),
+        **{name: each.value for name, each in parameters_of(found).items() if "rotation" not in name},
+        "notes": "; ".join(notes_for_a_person(found)) or "none",
+    }
+    line = (
+        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f} max;"
+        f" a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
+    )
+    files = (output, picture, context.folder / "plan.csv", dark, *paths)
+    rms, points = chosen.rms_arcsec, len(found.data)
+    number = StepNumber(rms, rms / math.sqrt(4 * points), "arcsec", "rms distance of held-out dots from where the fit has them")
+    changes = context.names("collimator", "geometry", output)
+    return StepOutcome("done", line, figures, files, (picture,), changes, number, _ends_of(found))
+
+
+def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark: Path) -> tuple[list[Path], Observed]:
+    """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises InputError."""
+    paths = [
+        context.take(Pattern(f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)))
+        for frame in range(plan.frames)
+    ]
+    size_px = context.file.config.tracker.resolution_px
+    context.stage(f"measures the dots of {len(paths)} images")
+    return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
+
+
+def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
+    """The tilts, and where dots are farther off than their noise the degree of the field: a larger one was not tried."""
+    tilts = [
+        FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
+        for name in ("tilt_x_deg", "tilt_y_deg")
+    ]
+    if found.chosen.rms_arcsec > FAR * found.held_out_noise_arcsec:
+        tilts.append(FittedFigure("the degree of the lens's field", found.chosen.field_degree, -1.0, max(FIELD_DEGREES)))
+    return tuple(tilts)

@@ -1,0 +1,770 @@
+"""The tracker as a photometer: dots on lattices that do not saturate it, each reading with its
+standard error.
+
+A reading is the sum of an image over a field of dots, less that of a black screen, over the number
+of dots and the exposure. Codes differ by three decades and more, an image holds two. Bright codes
+are read on sparse lattices and faint ones on dense lattices; those that are still faint there are
+exposed longer. A lattice and an exposure are a `Range`. Neighbouring ranges are compared by one
+code that both of them hold, in pairs of images.
+
+The standard errors come from the images themselves. Repeats of one image tell the noise of its sum,
+pixel by pixel. What several readings have in common is told apart (`Readings.common`): the ratios
+of ranges, and the ADC's rounding, which is alike in all pixels of one light where too little noise
+spreads it over the steps.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.files import write_whole
+from hilstar.instruments.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
+from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern, black
+from hilstar.instruments.calibrate.measurements import COMMON
+from hilstar.instruments.calibrate.plan import Patch, in_channel
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light, rounding_rms
+
+SHARE = 0.5  # relative to the smaller side of what both screen and tracker have
+MAX_SIDE_TRACKER_PX = 200.0
+APART_TRACKER_PX = 8.0  # distance of the sparsest lattice's dots: their wings do not add up
+MIN_DOTS = 4  # along a side of the sparsest lattice
+MARGIN_SIGMAS, MARGIN_PX = 6.0, 3.0
+PHASES = 24
+FILL = 0.5  # peak that a range is chosen for, relative to the tracker's range
+LESS = 4.0  # by which the exposure is shortened while white saturates
+LONGER = 4  # by which it is lengthened from range to range for faint codes
+LONGEST_S = 10.0
+FAINT_DN = 32.0  # a peak below this is exposed longer: half a step of the ADC is over 1 % of it
+MAX_PROBES = 10
+BLACK = Patch(0, "w")
+HALF_STEP_DN = 0.5  # of the ADC
+SMALL_MODE = 0.01  # of each reading's own error: modes of the rounding below it are not written
+
+
+@dataclass(frozen=True, slots=True)
+class DotField:
+    """A square of the monitor (left, top, side; px) and the part of the tracker's image with its
+    light (slices).
+
+    `monitor_px` is the number of monitor pixels seen in that part.
+    """
+
+    left: int
+    top: int
+    side: int
+    rows: slice
+    columns: slice
+    monitor_px: float
+
+    @property
+    def tracker_px(self) -> int:
+        """The number of the tracker's pixels in that part."""
+        height: int = self.rows.stop - self.rows.start
+        width: int = self.columns.stop - self.columns.start
+        return height * width
+
+    def lattice(self, resolution_px: tuple[int, int], period: int, patch: Patch) -> CodeImage:
+        """Every `period`-th pixel of the square, across and down, in a patch's code and channel."""
+        codes = black(resolution_px)
+        first = period // 2
+        inside = codes[self.top : self.top + self.side, self.left : self.left + self.side]
+        inside[first::period, first::period] = patch.code
+        return in_channel(codes, patch.channel)
+
+    def lit(self, period: int) -> int:
+        """The number of lit pixels of such a lattice."""
+        return (self.side // period) ** 2
+
+
+def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple[int, ...]]:
+    """The square for lattices, and their periods from dense to sparse; `sigma_px` is the tracker's
+    PSF.
+
+    Raises InputError where too little of the monitor is seen.
+    """
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    sides = *(ratio * size for size in geometry.monitor.resolution_px), *geometry.tracker.resolution_px
+    side = min(SHARE * min(sides), MAX_SIDE_TRACKER_PX) / ratio
+    sparsest = 2 ** math.ceil(math.log2(max(APART_TRACKER_PX / ratio, 1.0)))
+    cells = int(side // sparsest)
+    if cells < MIN_DOTS:
+        raise InputError("the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches")
+    (x,), (y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px))
+    corner = []  # the top left of a square about the middle of what is seen, kept on the screen
+    for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
+        wanted = middle if math.isfinite(middle) else (size - 1) / 2
+        corner.append(int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest)))
+    left, top = corner
+    margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
+    rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
+    periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
+    return DotField(left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)), periods
+
+
+def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float) -> tuple[slice, slice]:
+    """The rows and columns of the tracker's image that the square and its wings cover."""
+    along = np.linspace(0, side - 1, 33)
+    low, high = np.zeros_like(along), np.full_like(along, side - 1)
+    x = corner[0] + np.concatenate([along, along, low, high])
+    y = corner[1] + np.concatenate([low, high, along, along])
+    place = geometry.to_tracker(x, y)
+    if not all(np.isfinite(part).all() for part in place):
+        raise InputError("the middle of the tracker's field sees no screen; run the geometry again")
+    ends = []
+    for part, size in zip(place, geometry.tracker.resolution_px, strict=True):
+        first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
+        if first < 0 or last > size:
+            raise InputError("the dots are not whole in the tracker's field; look at [collimator] and run the geometry again")
+        ends.append(slice(first, last))
+    return ends[1], ends[0]
+
+
+def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
+    """The number of monitor pixels that a part of the tracker's image sees, those beyond the
+    screen's edge not counted.
+
+    Each tracker pixel is a quadrangle on the monitor. A tilted screen and a wide field make them
+    differ by several percent.
+    """
+    y, x = np.mgrid[rows.start : rows.stop + 1, columns.start : columns.stop + 1] - 0.5
+    corner_x, corner_y = (part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel()))
+    # Half the cross product of a quadrangle's diagonals.
+    down_x, down_y = corner_x[1:, 1:] - corner_x[:-1, :-1], corner_y[1:, 1:] - corner_y[:-1, :-1]
+    up_x, up_y = corner_x[:-1, 1:] - corner_x[1:, :-1], corner_y[:-1, 1:] - corner_y[1:, :-1]
+    area = np.nan_to_num(np.abs(down_x * up_y - down_y * up_x)) / 2
+    width, height = geometry.monitor.resolution_px
+    middle_x = (corner_x[1:, 1:] + corner_x[:-1, :-1]) / 2
+    middle_y = (corner_y[1:, 1:] + corner_y[:-1, :-1]) / 2
+    on_screen = np.abs(middle_x - (width - 1) / 2) <= width / 2
+    on_screen &= np.abs(middle_y - (height - 1) / 2) <= height / 2
+    return float(area[on_screen].sum())
+
+
+def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
+    """The share of a lit pixel's light along one axis, at PHASES places of a tracker pixel between
+    two of a lattice's dots.
+
+    `ratio` is tracker px per monitor px. A monitor pixel counts as a Gaussian of its own variance.
+    """
+    sigma = math.hypot(sigma_px, ratio / math.sqrt(12))
+    step = period * ratio
+    neighbours = math.ceil(MARGIN_SIGMAS * sigma / step) + 1
+    reach = np.arange(-neighbours, neighbours + 1) * step
+    place = np.linspace(-0.5, 0.5, PHASES)[:, None] * step + reach
+    return np.asarray((ndtr((place + 0.5) / sigma) - ndtr((place - 0.5) / sigma)).sum(axis=1))
+
+
+def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
+    """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is
+    tracker px per monitor px.
+    """
+    return np.array([float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods])
+
+
+class Range(NamedTuple):
+    """A lattice, every `period`-th pixel lit, and how many times longer than the exposure for white
+    it is exposed.
+    """
+
+    period: int
+    times: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LatticeRatio:
+    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where
+    light is additive.
+
+    `ratio` is the mean of `pairs`, of one pair of images each, and `error` its standard error.
+    Where `times` is not (1, 1), the dense lattice was exposed so many times longer, and then the
+    sparse one.
+    """
+
+    patch: Patch
+    dense: int
+    sparse: int
+    ratio: float
+    pairs: tuple[float, ...] = ()
+    error: float = 0.0
+    times: tuple[int, int] = (1, 1)
+
+    @property
+    def sigmas(self) -> float:
+        """How far the ratio is from 1, in its standard errors."""
+        return abs(self.ratio - 1) / self.error if self.error else 0.0
+
+    @property
+    def words(self) -> str:
+        """The ratio for a person."""
+        more, less = (_exposed(times) for times in self.times)
+        ratio = f"{self.ratio:.5f} +- {self.error:.5f} times"
+        code = f"code {self.patch.code} of {self.patch.channel}"
+        return f"{code}: a pixel of every {self.dense}{more} is {ratio} one of every {self.sparse}{less}"
+
+
+def _exposed(times: int) -> str:
+    return f", exposed {times} times longer" if times > 1 else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how
+    lattices agree.
+
+    `above_black` (n,) is without it, and may be negative by noise, which `light` is not. `period`
+    (n,) is each one's lattice. `black_known` says whether the black level was measured; else it is
+    the bench file's. `sigma` (n,) is each reading's own standard error, DN/s. `common` (n, causes)
+    is what one standard error of a cause does to all of them, DN/s: of the ratios of ranges, of
+    rounding, of the black level.
+    """
+
+    patches: list[Patch]
+    light: FloatArray
+    exposure_s: float
+    links: list[LatticeRatio]
+    black_known: bool
+    images: tuple[Path, ...]
+    above_black: FloatArray
+    period: IntArray
+    sigma: FloatArray
+    common: FloatArray
+
+    def write(self, path: Path) -> None:
+        """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
+        light = "light of one monitor pixel in the tracker, DN/s, by dots on lattices"
+        head = [f"# {light}; exposed for {self.exposure_s:.6g} s"]
+        head += [f"# {link.words}" for link in self.links]
+        columns = ["order", "code", "channel", "value", "sigma"]
+        columns += [f"{COMMON}{cause}" for cause in range(1, self.common.shape[1] + 1)]
+        rows = []
+        for order, patch in enumerate(self.patches):
+            value = float(self.light[order])
+            cells = [str(order + 1), str(patch.code), patch.channel, repr(value)]
+            cells += [f"{error:.5g}" for error in (self.sigma[order], *self.common[order])]
+            rows.append(",".join(cells))
+        write_whole(path, "\n".join([*head, ",".join(columns), *rows]) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """The bench file's light above black by channel and code (2^bits,), relative to white, and its
+    black level.
+    """
+
+    light: dict[str, FloatArray]
+    black: float
+
+
+class Look(NamedTuple):
+    """The sum over a lattice's field, DN, and its brightest pixel relative to full scale."""
+
+    sum_dn: float
+    fill: float
+
+
+@dataclass
+class PixelScatter:
+    """The noise of sums over the field, from images of one pattern that were taken again.
+
+    By exposure: the variance of a black image's sum, DN^2. `dn_per_e` is that of a lit one over it,
+    for each DN of light.
+    """
+
+    default_dn_per_e: float
+    _before: dict[tuple[Patch, Range], FloatArray] = field(default_factory=dict)
+    _squares: dict[tuple[Patch, Range], list[float]] = field(default_factory=dict)
+    _sums: dict[tuple[Patch, Range], float] = field(default_factory=dict)
+
+    def add(self, patch: Patch, at: Range, image: FloatArray) -> None:
+        """Take in an image (h, w), DN."""
+        place = (patch, at) if patch.code else (BLACK, Range(1, at.times))
+        before = self._before.get(place)
+        if before is not None:
+            # Half the square of a difference is the variance of each of the two, where pixels'
+            # noise is their own.
+            variance = float(((image - before) ** 2).sum()) / 2
+            self._squares.setdefault(place, []).append(variance)
+        self._before[place] = image
+        self._sums[place] = float(image.sum())
+
+    def dark_dn2(self, times: int) -> float:
+        """The variance of the sum of a black image, exposed so many times longer."""
+        squares = self._squares.get((BLACK, Range(1, times)), [])
+        if not squares:
+            for (patch, _), more in self._squares.items():
+                squares = squares + more * (not patch.code)
+        return float(np.mean(squares)) if squares else 0.0
+
+    @property
+    def dn_per_e(self) -> float:
+        """The variance of light over light, DN: by the images of lit patterns; as the detector is
+        stated without repeats.
+        """
+        variance, light = 0.0, 0.0
+        for (patch, at), squares in self._squares.items():
+            dark = self._sums.get((BLACK, Range(1, at.times)))
+            if not patch.code or dark is None:
+                continue
+            variance += sum(squares) - len(squares) * self.dark_dn2(at.times)
+            light += len(squares) * (self._sums[patch, at] - dark)
+        return max(variance / light, 0.0) if light > 0 else self.default_dn_per_e
+
+    def sum_dn2(self, light_dn: float, times: int, blacks: float = 1.0) -> float:
+        """The variance of a sum above black; `blacks` is the variance of the black sum relative to
+        that of one image.
+        """
+        return self.dn_per_e * max(light_dn, 0.0) + (1 + blacks) * self.dark_dn2(times)
+
+
+class _Reading(NamedTuple):
+    """A lit patch as it was read: its range, and its light above black, DN, summed over the field
+    in that range's exposure.
+
+    `blacks` is the variance of the black sum under it relative to that of one image.
+    """
+
+    patch: Patch
+    at: Range
+    light_dn: float
+    blacks: float
+
+
+class _Values(NamedTuple):
+    """Of each patch (n,): light above black and its own standard error, DN/s; light for a DN of a
+    lit patch's sum.
+    """
+
+    light: FloatArray
+    sigma: FloatArray
+    per_dn: FloatArray
+
+
+class _Pair(NamedTuple):
+    """One code read in two neighbouring ranges, and the means of its light over the pairs of
+    images, as in `_Reading`.
+    """
+
+    patch: Patch
+    more: Range
+    less: Range
+    light_dn: tuple[float, float]
+    ratios: tuple[float, ...]
+
+
+class Photometer:
+    """The tracker as a photometer. Raises InputError where the lattices are not whole in its field.
+
+    Ranges are compared by `pairs` pairs of images. Faint codes are exposed for up to `longest_s`,
+    where the source of images sets exposures.
+    """
+
+    def __init__(
+        self,
+        context: StepContext,
+        sigma_px: float,
+        assumed: Assumed,
+        pairs: int = 1,
+        longest_s: float = 0.0,
+    ) -> None:
+        geometry = context.real_geometry()
+        self.context, self.assumed = context, assumed
+        self.pairs, self.longest_s = pairs, longest_s
+        self.field, self.periods = field_for(geometry, sigma_px)
+        self.ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+        self.shares = peak_shares(self.periods, self.ratio, sigma_px)
+        self.profiles: dict[int, FloatArray] = {}
+        for period in self.periods:
+            self.profiles[period] = lattice_profile(period, self.ratio, sigma_px)
+        self.exposure_s = context.exposure_s
+        self.scatter = PixelScatter(1 / context.file.config.tracker.detector.gain_e_per_dn)
+        self._dark_screen = context.take(Pattern("black_screen", black(context.resolution_px)))
+        self.images = [self._dark_screen]
+        self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
+
+    def read(self, planned: list[Patch]) -> Readings:
+        """Show and read the planned patches. Raises InputError where white saturates the tracker."""
+        peaks = self._peaks(planned, self._expose())
+        chosen = {patch: self._range(peaks[patch]) for patch in planned if patch.code}
+        blacks, sums = self._sums(planned, chosen)
+        pairs: list[_Pair] = []
+        for channel in self.assumed.light:
+            pairs += self._pairs(channel, chosen, peaks)
+        links = [self._link(pair) for pair in pairs]
+        lit = _lit(planned, chosen, blacks, sums)
+        values = self._values(planned, lit, blacks[1], self._factors(links))
+        causes = [
+            self._of_ratios(values.light, lit, links),
+            self._of_rounding(values, lit, pairs, links),
+        ]
+        with_black, black_error = self._with_black(planned, values.light)
+        if black_error is not None:
+            causes.append(np.full((len(planned), 1), black_error))
+        period = np.full(len(planned), self.periods[-1], dtype=np.intp)
+        for order, reading in lit.items():
+            period[order] = reading.at.period
+        return Readings(
+            planned,
+            np.maximum(with_black, 0.0),
+            self.exposure_s,
+            links,
+            black_error is not None,
+            tuple(self.images),
+            values.light,
+            period,
+            values.sigma,
+            np.hstack(causes),
+        )
+
+    def _expose(self) -> float:
+        """Choose an exposure in which white does not saturate, first the bench file's; returns a
+        white dot's peak, DN.
+        """
+        brightest = max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1]))
+        white = Patch(self.context.white, brightest)
+        sparsest = Range(self.periods[-1])
+        for probe in range(MAX_PROBES):
+            # Another exposure is no repeat: it tells nothing of the scatter.
+            fill = self._filled(self._part(self._take(f"white_{probe:02}", sparsest, white)))
+            if fill <= MAX_FILL:
+                break
+            if not self.context.source.sets_exposure:
+                raise InputError(
+                    f"one pixel at white saturates the tracker in {self.exposure_s:g} s: let --grab set the exposure"
+                    " ({exposure_s}), turn the monitor's brightness down, or use a photometer (hilstar calibrate plan)"
+                )
+            self.exposure_s /= LESS
+        else:
+            raise InputError(f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at stray light")
+        if probe:
+            self.exposure_s *= FILL / fill
+        dark = self._part(self._take("black", Range(1), BLACK))
+        bright = self._part(self._take("white", sparsest, white))
+        share = float(self.assumed.light[white.channel][white.code])
+        return float((bright - dark)[self._cold].max(initial=1.0)) / share
+
+    def _peaks(self, planned: list[Patch], white_dn: float) -> dict[Patch, FloatArray]:
+        """The brightest pixel (periods,), DN, of each lit patch on each lattice, by the bench
+        file's response.
+        """
+        peaks: dict[Patch, FloatArray] = {}
+        for patch in planned:
+            if patch.code:
+                light = self.assumed.light[patch.channel][patch.code]
+                peaks[patch] = white_dn * light * self.shares / self.shares[-1]
+        return peaks
+
+    def _range(self, peaks: FloatArray) -> Range:
+        """The densest lattice that does not saturate by `peaks` (periods,), DN; a longer exposure
+        where it is faint there.
+        """
+        highest_dn = FILL * self.context.full_dn
+        fits = np.flatnonzero(peaks <= highest_dn)
+        place = int(fits[0]) if len(fits) else len(peaks) - 1
+        times = 1
+        longest_s = self.longest_s if self.context.source.sets_exposure else 0.0
+        while peaks[place] * times < FAINT_DN and self.exposure_s * times * LONGER <= longest_s:
+            times *= LONGER
+        return Range(self.periods[place], times)
+
+    def _sums(
+        self,
+        planned: list[Patch],
+        chosen: dict[Patch, Range],
+    ) -> tuple[dict[int, FloatArray], dict[int, float]]:
+        """The sums of black images, in turn, by how many times longer they are exposed; those of
+        lit ones by their order.
+        """
+        longer = sorted({at.times for at in chosen.values()} | {1})
+        blacks: dict[int, list[float]] = {times: [] for times in longer}
+        sums: dict[int, float] = {}
+        fixed: set[Patch] = set()
+        for order, patch in enumerate(planned):
+            if not patch.code:
+                for times in longer:
+                    look = self._look(f"patch_{order:03}_1", Range(1, times), patch)
+                    blacks[times].append(look.sum_dn)
+                continue
+            while True:
+                at = chosen[patch]
+                total, fill = self._look(f"patch_{order:03}_{at.period}", at, patch)
+                if patch in fixed or fill <= MAX_FILL or at == Range(self.periods[-1]):
+                    break
+                # Brighter than the bench file says.
+                chosen[patch] = Range(at.period) if at.times > 1 else Range(2 * at.period)
+            fixed.add(patch)
+            sums[order] = total
+        return {times: np.array(each) for times, each in blacks.items()}, sums
+
+    def _pairs(
+        self,
+        channel: str,
+        chosen: dict[Patch, Range],
+        peaks: dict[Patch, FloatArray],
+    ) -> Iterator[_Pair]:
+        """Compare each two neighbouring ranges of a channel by one code shown in both."""
+        ranges = {patch: at for patch, at in chosen.items() if patch.channel == channel}
+        used = {*ranges.values(), Range(self.periods[-1])}
+        ladder = sorted(used, key=lambda at: (-at.times, at.period))
+        for step, (more, less) in enumerate(itertools.pairwise(ladder)):
+            patch = self._brightest(f"link_{channel}_{step}", ranges, peaks, more)
+            lights: list[tuple[float, float]] = []
+            for pair in range(self.pairs):
+                name = f"link_{channel}_{step}_{pair}"
+                lights.append(self._both(name, patch, more, less))
+            scale = self._dots(less) / self._dots(more)
+            means = [float(mean) for mean in np.mean(lights, axis=0)]
+            ratios = tuple(one / other * scale for one, other in lights)
+            yield _Pair(patch, more, less, (means[0], means[1]), ratios)
+
+    def _both(self, name: str, patch: Patch, more: Range, less: Range) -> tuple[float, float]:
+        """A patch's light in two ranges, DN, as in `_Reading`."""
+        # Each pair has black images of its own: the noise of one for all would be in no scatter of
+        # the pairs.
+        dark: dict[int, float] = {}
+        for times in sorted({more.times, less.times}):
+            dark[times] = self._look(f"{name}_black", Range(1, times), BLACK).sum_dn
+        lights: list[float] = []
+        for at in (more, less):
+            look = self._look(f"{name}_{at.period}", at, patch)
+            lights.append(look.sum_dn - dark[at.times])
+        if lights[1] <= 0:
+            raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
+        return lights[0], lights[1]
+
+    def _brightest(
+        self,
+        name: str,
+        ranges: dict[Patch, Range],
+        peaks: dict[Patch, FloatArray],
+        at: Range,
+    ) -> Patch:
+        """The patch with the most light that a range holds: by the bench file's response, then by
+        an image.
+        """
+        place = self.periods.index(at.period)
+        highest_dn = FILL * self.context.full_dn
+        highest = max(patch for patch, its in ranges.items() if its == at)
+        for patch in sorted(ranges, reverse=True):
+            if patch <= highest or peaks[patch][place] * at.times > highest_dn:
+                continue
+            if self._look(f"{name}_{patch.code}", at, patch).fill <= MAX_FILL:
+                return patch
+        return highest
+
+    def _values(
+        self,
+        planned: list[Patch],
+        lit: dict[int, _Reading],
+        blacks: FloatArray,
+        factors: dict[tuple[str, Range], float],
+    ) -> _Values:
+        """Light above black of each patch, and the standard error of its own images."""
+        count = len(planned)
+        light, per_dn = np.zeros(count), np.zeros(count)
+        # On a black screen every pixel glows alike; the repeats tell how well that is known.
+        to_black = 1 / (self.field.monitor_px * self.exposure_s)
+        sigma = np.full(count, math.sqrt(self.scatter.dark_dn2(1)) * to_black)
+        dark = [order for order in range(count) if order not in lit]
+        light[dark] = (blacks - blacks.mean()) * to_black
+        for order, reading in lit.items():
+            dots = self._dots(reading.at) * factors[reading.patch.channel, reading.at]
+            per_dn[order] = 1 / (dots * self.exposure_s)
+            light[order] = reading.light_dn * per_dn[order]
+            # Light that rounding hides has shot noise, too.
+            hidden_dn = float(np.sqrt((self._rounded(reading.at, reading.light_dn) ** 2).mean()))
+            known_dn = max(reading.light_dn, 0.0) + hidden_dn
+            variance = self.scatter.sum_dn2(known_dn, reading.at.times, reading.blacks)
+            sigma[order] = math.sqrt(variance) * per_dn[order]
+        return _Values(light, sigma, per_dn)
+
+    def _dots(self, at: Range) -> int:
+        """By how many lit pixels and exposures a sum in a range has to be divided."""
+        return self.field.lit(at.period) * at.times
+
+    def _link(self, pair: _Pair) -> LatticeRatio:
+        """A ratio of ranges with its standard error."""
+        more, less = pair.light_dn
+        dark_more, dark_less = (self.scatter.dark_dn2(at.times) for at in (pair.more, pair.less))
+        variance = (self.scatter.dn_per_e * more + dark_more) / more**2
+        variance += (self.scatter.dn_per_e * less + dark_less) / less**2
+        if pair.more.times == pair.less.times:  # one black image is under both
+            variance += dark_more * (1 / more - 1 / less) ** 2
+        else:
+            variance += dark_more / more**2 + dark_less / less**2
+        ratio = float(np.mean(pair.ratios))
+        error = ratio * math.sqrt(variance / len(pair.ratios))
+        times = (pair.more.times, pair.less.times)
+        return LatticeRatio(
+            pair.patch,
+            pair.more.period,
+            pair.less.period,
+            ratio,
+            pair.ratios,
+            error,
+            times,
+        )
+
+    def _factors(self, links: list[LatticeRatio]) -> dict[tuple[str, Range], float]:
+        """A lit pixel's light in each channel and range, relative to that in the range of the
+        sparsest lattice.
+        """
+        factors = {(channel, Range(self.periods[-1])): 1.0 for channel in self.assumed.light}
+        for link in reversed(links):
+            more, less = Range(link.dense, link.times[0]), Range(link.sparse, link.times[1])
+            channel = link.patch.channel
+            factors[channel, more] = factors[channel, less] * link.ratio
+        return factors
+
+    def _of_ratios(
+        self,
+        light: FloatArray,
+        lit: dict[int, _Reading],
+        links: list[LatticeRatio],
+    ) -> FloatArray:
+        """What the error of each ratio does to light (n,): (n, ratios). Light of a range is divided
+        by all ratios below it.
+        """
+        effects = np.zeros((len(light), len(links)))
+        for place, link in enumerate(links):
+            for order, reading in lit.items():
+                if _passes(reading.patch, reading.at, link):
+                    effects[order, place] = -light[order] * link.error / link.ratio
+        return effects
+
+    def _of_rounding(
+        self,
+        values: _Values,
+        lit: dict[int, _Reading],
+        pairs: list[_Pair],
+        links: list[LatticeRatio],
+    ) -> FloatArray:
+        """What the ADC's rounding does to light where too little noise spreads it: (n, modes).
+
+        Pixels of one light are rounded alike, by where their dark level is between two steps. That
+        is not known. It is taken at STEP_PHASES places, on its own for each exposure, and the
+        covariance of readings over them is split into modes.
+        """
+        longer = sorted({reading.at.times for reading in lit.values()})
+        effects = np.zeros((len(values.light), len(longer), STEP_PHASES))
+        for order, reading in lit.items():
+            place = longer.index(reading.at.times)
+            effects[order, place] = self._rounded(reading.at, reading.light_dn) * values.per_dn[order]
+        for pair, link in zip(pairs, links, strict=True):
+            off = np.zeros((len(longer), STEP_PHASES))
+            ranges = zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True)
+            for at, light_dn, sign in ranges:
+                if at.times in longer:
+                    rounded = self._rounded(at, light_dn) / light_dn
+                    off[longer.index(at.times)] += sign * rounded
+            for order, reading in lit.items():
+                if _passes(reading.patch, reading.at, link):
+                    effects[order] -= values.light[order] * off
+        flat = effects.reshape(len(values.light), -1) / math.sqrt(STEP_PHASES)
+        modes, sizes, _ = np.linalg.svd(flat, full_matrices=False)
+        modes = modes * sizes
+        used = (np.abs(modes) > SMALL_MODE * values.sigma[:, None]).any(axis=0)
+        return np.asarray(modes[:, used])
+
+    def _rounded(self, at: Range, light_dn: float) -> FloatArray:
+        """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the
+        dark level's place.
+        """
+        dark_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
+        dots = self.field.lit(at.period)
+        along = self.profiles[at.period]
+        shares = np.outer(along, along).ravel()
+        # Dots that are rounded away may have a peak of half a step.
+        dot_dn = max(light_dn / dots, HALF_STEP_DN / float(shares.max()))
+        level_dn = dot_dn * shares
+        cell_px = (at.period * self.ratio) ** 2
+        return dots * cell_px * rounded_light(level_dn, dark_dn, self.scatter.dn_per_e)
+
+    def _with_black(self, planned: list[Patch], light: FloatArray) -> tuple[FloatArray, float | None]:
+        """Light (n,) with the black level, DN/s, and that level's standard error, None where it was
+        not measured.
+        """
+        unlit = self.context.unlit()
+        if unlit is None:
+            whites = []
+            for name in self.assumed.light:
+                white = Patch(self.context.white, name)
+                whites.append(light[[patch == white for patch in planned]].mean())
+            return light + self.assumed.black * float(np.sum(whites)), None
+        # A black screen minus one that is switched off.
+        self.images.append(unlit)
+        more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
+        seconds = self.field.monitor_px * self.context.exposure_s
+        # Each of the two images has its noise, and is rounded; the one without glow has less noise
+        # to spread it.
+        glowing_dn2 = self.scatter.dark_dn2(1)
+        dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more, 0.0), 0.0)
+        variance = glowing_dn2 + dark_dn2
+        for image_dn2 in (glowing_dn2, dark_dn2):
+            rounding_dn = rounding_rms(before_adc_dn(image_dn2 / self.field.tracker_px))
+            variance += (self.field.tracker_px * rounding_dn) ** 2
+        return light + max(more / seconds, 0.0), math.sqrt(variance) / seconds
+
+    def _look(self, name: str, at: Range, patch: Patch) -> Look:
+        """Show a lattice in a patch's code and look at it."""
+        part = self._part(self._take(name, at, patch))
+        self.scatter.add(patch, at, part)
+        return Look(float(part.sum()), self._filled(part))
+
+    def _filled(self, part: FloatArray) -> float:
+        """The brightest pixel of a part of an image relative to full scale, hot ones aside."""
+        return float(part[self._cold].max(initial=0.0)) / self.context.full_dn
+
+    def _take(self, name: str, at: Range, patch: Patch) -> Path:
+        longer = f"_{at.times}" if at.times > 1 else ""
+        codes = self.field.lattice(self.context.resolution_px, at.period, patch)
+        pattern = Pattern(name + longer, codes)
+        self.images.append(self.context.take(pattern, self.exposure_s * at.times))
+        return self.images[-1]
+
+    def _part(self, path: Path) -> FloatArray:
+        return self.context.pixels(path)[self.field.rows, self.field.columns]
+
+
+def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:
+    """Whether the light of a patch is divided by a ratio: that of its own range, or of one with
+    less light.
+    """
+    if patch.channel != link.patch.channel:
+        return False
+    return (-at.times, at.period) <= (-link.times[0], link.dense)
+
+
+def _lit(
+    planned: list[Patch],
+    chosen: dict[Patch, Range],
+    blacks: dict[int, FloatArray],
+    sums: dict[int, float],
+) -> dict[int, _Reading]:
+    """The lit patches by their order, above the black images before and after them."""
+    orders = np.flatnonzero([patch.code == 0 for patch in planned])
+    lit: dict[int, _Reading] = {}
+    for order, total in sums.items():
+        patch = planned[order]
+        at = chosen[patch]
+        under, variance = _between(order, orders, blacks[at.times])
+        lit[order] = _Reading(patch, at, total - under, variance)
+    return lit
+
+
+def _between(order: int, orders: IntArray, values: FloatArray) -> tuple[float, float]:
+    """A value between those at `orders` (n,), and its variance relative to that of one of them."""
+    if len(orders) == 1:
+        return float(values[0]), 1.0
+    after = int(np.clip(np.searchsorted(orders, order), 1, len(orders) - 1))
+    share = float(np.clip((order - orders[after - 1]) / (orders[after] - orders[after - 1]), 0, 1))
+    value = (1 - share) * values[after - 1] + share * values[after]
+    return float(value), (1 - share) ** 2 + share**2

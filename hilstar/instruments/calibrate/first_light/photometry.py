@@ -1,0 +1,197 @@
+"""The step of photometry: the tracker as a photometer, by dots on lattices that do not saturate it."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import INK, MUTED, chart
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
+from hilstar.display.calibration import (
+    Calibration,
+    add_uniformity,
+    load_calibration,
+    primary_lights,
+    primary_responses,
+)
+from hilstar.display.primaries import channel_matrix
+from hilstar.display.response import Response
+from hilstar.instruments.calibrate.first_light.context import Figure, StepContext, StepNumber, StepOutcome
+from hilstar.instruments.calibrate.first_light.photometer import LONGEST_S, Assumed, Photometer, Readings
+from hilstar.instruments.calibrate.measurements import PRIMARIES
+from hilstar.instruments.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+from hilstar.instruments.calibrate.plan import Patch, PlanSettings, plan_patches
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import bench_calibration, bench_primaries, calibration_source, named_channels
+from hilstar.server.bench.config.bench_config import drives_apart
+from hilstar.tracker.settings import DetectorSettings
+
+SEED = 0
+PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.svg", "response-before.svg")
+MIN_LEVELS = 10  # as `calibrate photometric` needs
+DITHER_DN = 0.4  # of read noise: the mean of rounded values is then off by 0.02 DN at most
+PAIRS = 2  # of images, by which two ranges are compared
+SURE_SIGMAS = 3.0  # beyond which noise does not explain a deviation
+DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
+
+
+def photometry(context: StepContext) -> StepOutcome:
+    """Measure the response and name its file in the bench file. Raises InputError."""
+    monitor = context.file.config.monitor
+    if not context.patches:
+        how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
+        return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
+    assumed = calibration_of(context)
+    apart = drives_apart(context.file.config)
+    channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing or apart else "w"
+    planned = plan_for(monitor.bits, context.patches, channels)
+    by_channel = {"w": assumed.response.light}
+    if apart:
+        responses = primary_responses(calibration_source(monitor, context.file.folder), monitor.bits)
+        shares = shares_of_white(context.file)
+        by_channel = {name: share * one.light for name, share, one in zip(channels, shares, responses, strict=True)}
+    elif channels != "w":
+        by_channel = dict(
+            zip(channels, primary_lights(calibration_source(monitor, context.file.folder), monitor.bits), strict=True)
+        )
+    light = Assumed(by_channel, assumed.response.black)
+    readings = Photometer(context, context.psf_sigma_px, light, PAIRS, LONGEST_S).read(planned)
+    measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
+    readings.write(measured)
+    instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
+    found = calibrate_photometric(
+        measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits, context.source.monitor
+    )
+    files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
+    if assumed.uniformity is not None:
+        files.append(add_uniformity(output, assumed.uniformity, assumed.uniformity_relative))
+    draw_calibration(measured, picture, monitor.bits)
+    written = load_calibration(output, monitor.bits)
+    now = written.response
+    figures = _response_figures(context, readings, found, assumed.response, now)
+    if written.weights is not None:
+        figures["shares_of_white"] = ", ".join(f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True))
+    off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
+    off_mag = response_error_mag(assumed.response, now)
+    with chart(before, f"The bench file's response is off by {off}") as (axes,):
+        axes.plot(now.light[-len(off_mag) :], off_mag, color=INK)
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set(xlabel="measured light over white [share]", ylabel="fainter than in the bench file [mag]")
+        axes.invert_yaxis()
+    return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
+
+
+def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
+    """The plan with the most levels that has at most `patches` patches. Raises InputError where they are too few."""
+    plans = [
+        plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
+        for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1)
+    ]
+    if len(plans[0]) > patches:
+        raise InputError(f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none")
+    return [planned for planned in plans if len(planned) <= patches][-1]
+
+
+def shares_of_white(file: BenchFile) -> FloatArray:
+    """Each primary's share (3,) of the electrons of white, by the spectra of a bench file. Raises InputError."""
+    primaries = bench_primaries(file.config.monitor, file.folder)
+    if primaries is None:
+        raise InputError("[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b")
+    matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
+    return np.asarray(matrix.e_per_s.sum(axis=0))
+
+
+def calibration_of(context: StepContext) -> Calibration:
+    """The calibration that the bench file names."""
+    monitor = context.file.config.monitor
+    return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)
+
+
+def _response_figures(
+    context: StepContext, readings: Readings, found: dict[str, Any], before: Response, now: Response
+) -> dict[str, Figure]:
+    off = response_error_mag(before, now)
+    held = [channel["holdout"] for channel in found["channels"].values()]
+    figures: dict[str, Figure] = {
+        "gamma": exponent(now),
+        "gamma_in_bench_file": exponent(before),
+        "bench_file_off_rms_mag": float(np.sqrt((off**2).mean())),
+        "bench_file_off_max_mag": float(np.abs(off).max()),
+        "black_level": now.black,
+        "black_level_in_bench_file": before.black,
+        "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
+        "held_out_rms_mag": max(each["rms_mag"] for each in held),
+        "held_out_p95_mag": max(MAG_PER_RELATIVE * each["p95_percent"] / 100 for each in held),
+        "held_out_p95_sigmas": max(each["p95_sigmas"] for each in held),
+        "held_out_max_mag": max(each["max_mag"] for each in held),
+        "noise_percent": 100 * found["noise_relative"],
+        "drift_percent": float("nan") if found["drift_percent"] is None else found["drift_percent"],
+        "patches": len(readings.patches),
+        "codes": found["codes"],
+        "exposure_s": readings.exposure_s,
+        "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
+        "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
+        "links_max_sigmas": max((link.sigmas for link in readings.links), default=0.0),
+        **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
+    }
+    if context.truth is not None:
+        true = bench_calibration(context.truth.config, context.truth.folder).response
+        figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
+        figures["truth_black_level"] = true.black
+    return figures
+
+
+def rounds_alike(detector: DetectorSettings) -> bool:
+    """Whether an ADC takes light of under half a DN away: nothing but enough read noise spreads it over the steps."""
+    return detector.read_noise_e < DITHER_DN * detector.gain_e_per_dn
+
+
+def _judged(
+    context: StepContext, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]
+) -> StepOutcome:
+    """The step's outcome: done, with the response named in the bench file, unless it misses the limits of [verify]."""
+    limit_mag = context.file.config.verify.flux_mag
+    monitor = context.file.config.monitor
+    line = (
+        f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f} mag rms,"
+        f" {figures['bench_file_off_max_mag']:.3f} max (gamma {figures['gamma']:.3f}, not"
+        f" {figures['gamma_in_bench_file']:.3f});"
+        f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms, {figures['held_out_max_mag']:.4f} max;"
+        f" black {figures['black_level']:.2e} of white"
+        f"{'' if figures['black_level_measured'] == 'yes' else ' as the bench file has it, not measured (--dark)'}"
+    )
+    rms_mag = float(figures["held_out_rms_mag"])
+    error = rms_mag / math.sqrt(2 * float(figures["codes"]))
+    number = StepNumber(rms_mag, error, "mag", "rms distance of held-out levels from the response")
+    differs = float(figures["links_max_mag"]) > limit_mag
+    if differs and float(figures["links_max_sigmas"]) > SURE_SIGMAS:
+        why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
+        line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
+        return StepOutcome("failed", line, figures, files, pictures, number=number)
+    is_off = float(figures["held_out_p95_mag"]) > limit_mag
+    if is_off and float(figures["held_out_p95_sigmas"]) > SURE_SIGMAS:
+        why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
+        if context.truth is not None and rounds_alike(context.truth.config.tracker.detector):
+            why += "; the virtual tracker's ADC rounds faint codes alike: write the truth's [tracker.detector] read_noise_e"
+        line = f"{line}: the levels do not make one smooth response; {why}"
+        return StepOutcome("failed", line, figures, files, pictures, number=number)
+    changes = context.names("monitor", "calibration", context.session / "response.toml")
+    return StepOutcome("done", line, figures, files, pictures, changes, number)
+
+
+def response_error_mag(assumed: Response, true: Response) -> FloatArray:
+    """How much fainter each code is than assumed (n,), magnitudes, from three decades below white to white."""
+    seen = true.light[1:] >= DIM_LIGHT
+    return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
+
+
+def exponent(response: Response) -> float:
+    """The exponent of a power law fitted to the response over three decades."""
+    light = response.light[1:]
+    used = light >= DIM_LIGHT
+    signal = np.arange(1, len(response.light))[used] / response.white
+    return float(np.polyfit(np.log(signal), np.log(light[used]), 1)[0])

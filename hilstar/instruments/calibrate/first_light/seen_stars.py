@@ -1,0 +1,448 @@
+"""Stars on the screen as the tracker sees them: fields with the most readable stars, and each one's place, light and noise.
+
+A star is as wide as the PSF and the monitor's pixels make it, so window, margins and noise follow its sigma: the light in the
+window is corrected for what lies outside, and the noise of place and light is that of photons, background and PRNU.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.special import ndtr
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_matrix, to_matrix
+from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
+from hilstar.display.quantise import shown_light
+from hilstar.display.response import Levels
+from hilstar.instruments.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern
+from hilstar.instruments.calibrate.scale import STAR_MAG
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.cameras import display_psf, tracker_camera
+from hilstar.server.bench.frame import Bench, Frame
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light
+
+RANDOM_ATTITUDES, POINTED_ATTITUDES, SEED = 40, 60, 3  # at random, and at bright stars: a narrow field has few others
+FIELDS, MAX_FIELDS, ENOUGH_STARS = 3, 8, 20  # fields shown: more than three until so many stars can be read
+MIN_STARS = 5
+MIN_REACH_PX = 3.0  # tracker px, as in `verify`
+MIN_EDGE_PX, MIN_RADIUS_PX, RADIUS_SIGMAS = 12.0, 4, 3.0
+ALONE_RADII, BESIDE_SHARE = 2.0, 1e-3  # stars within so many windows have together less than this share of a star's light
+THRESHOLD_SIGMA = 8.0
+READ_MAG, SURE_MAG = 0.1, 0.01  # noise of a star that can be read, and of one whose light is judged by itself
+SURE_STARS = 10  # the stars with the least noise that are judged where few are sure
+LOST_MARGIN = 3.0  # times the threshold: a star whose peak should be so high and is not there is lost
+MOST = 0.5  # a share of the variance this large is named as its cause
+FAR = 3.0  # times their errors: more scatter than this has another cause
+ONE_SIDED = 1.645  # sigmas of 95 %
+
+
+@dataclass(frozen=True)
+class StarSpot:
+    """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector adds.
+
+    The image is the mean of `frames`.
+    """
+
+    sigma_px: tuple[float, float]
+    gain_e_per_dn: float
+    prnu: float
+    frames: int = 1
+
+    @classmethod
+    def of(cls, context: StepContext) -> "StarSpot":
+        """The spot of the bench file's sprite, with the PSF of the step `focus`. Raises InputError."""
+        geometry = context.geometry()
+        ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+        sprite = display_psf(context.file.config, context.file.folder, geometry.monitor).width_px
+        # A sprite's shares are those of whole pixels, and each pixel is a square of light: a twelfth of its area each.
+        drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
+        own = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
+        x, y = (math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True))
+        detector = context.file.config.tracker.detector
+        return cls((x, y), detector.gain_e_per_dn, detector.prnu)
+
+    @property
+    def mean_sigma_px(self) -> float:
+        """The geometric mean of both sigmas."""
+        return math.sqrt(math.prod(self.sigma_px))
+
+    @property
+    def radius_px(self) -> int:
+        """Half the side of the window, without its middle pixel."""
+        return max(MIN_RADIUS_PX, math.ceil(RADIUS_SIGMAS * max(self.sigma_px)))
+
+    @property
+    def settings(self) -> CentroidSettings:
+        """How stars are found and their places measured, in a window as wide as they are."""
+        return CentroidSettings(
+            THRESHOLD_SIGMA,
+            2,
+            window_sigma_px=max(1.0, self.mean_sigma_px),
+            window_radius_px=self.radius_px,
+            psf_sigma_px=self.sigma_px,
+        )
+
+    @property
+    def window_share(self) -> float:
+        """The share of a star's light that is in the window."""
+        half = self.radius_px + 0.5
+        return math.prod(float(ndtr(half / sigma) - ndtr(-half / sigma)) for sigma in self.sigma_px)
+
+    @property
+    def peak_share(self) -> float:
+        """The share of a star's light in the pixel that it is in the middle of."""
+        return math.prod(float(ndtr(0.5 / sigma) - ndtr(-0.5 / sigma)) for sigma in self.sigma_px)
+
+    @cached_property
+    def _shares(self) -> tuple[FloatArray, FloatArray]:
+        """Shares of a star's light in its window (k, k), and pixels' offsets along x (k,)."""
+        offset = np.arange(-self.radius_px, self.radius_px + 1.0)
+        x, y = (ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma) for sigma in self.sigma_px)
+        return np.outer(y, x), offset
+
+    def light_noise_mag(self, dn: FloatArray, noise_dn: float) -> FloatArray:
+        """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of `noise_dn` in a pixel."""
+        shares, _ = self._shares
+        light = np.maximum(dn, 1e-9)
+        photons = light * self.window_share / (self.gain_e_per_dn * self.frames)
+        variance = photons + shares.size * noise_dn**2
+        variance += (self.prnu * light) ** 2 * float((shares**2).sum())
+        variance += (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
+        return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / (light * self.window_share))
+
+    def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
+        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
+
+        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's, in the mean of the
+        frames.
+        """
+        shares, _ = self._shares
+        dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
+        rounded = np.zeros((len(dn), STEP_PHASES))
+        for star, light_dn in enumerate(dn.tolist()):
+            rounded[star] = rounded_light(light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn)
+        return shares.size * rounded
+
+    def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
+        """The noise (n,) of the places of such stars along one axis, px: that of the window's first moment."""
+        shares, offset = self._shares
+        sigma2 = self.settings.window_sigma_px**2
+        window = np.exp(-0.5 * (offset**2 + offset[:, None] ** 2) / sigma2)
+        pull2 = (window * offset) ** 2
+        slope = float((shares * window * (1 - offset**2 / sigma2)).sum())
+        light = np.maximum(dn, 1e-9)
+        photons = light / (self.gain_e_per_dn * self.frames)
+        variance = noise_dn**2 * float(pull2.sum()) + photons * float((pull2 * shares).sum())
+        variance += (self.prnu * light) ** 2 * float((pull2 * shares**2).sum())
+        return np.asarray(np.sqrt(variance) / (light * slope))
+
+
+class Beyond(NamedTuple):
+    """What residuals have beyond their noise: a standard deviation, and its bounds of 95 % below and above."""
+
+    sigma: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, residual: FloatArray, noise: FloatArray) -> "Beyond":
+        """Of residuals (n,) and the noise (n,) of each: the weighted mean of what their squares have more."""
+        weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
+        more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
+        at_least = max(more, 0.0)
+        error = math.sqrt(2 * float((weight**2 * (noise**2 + at_least) ** 2).sum())) / float(weight.sum())
+        bounds = (more, more - ONE_SIDED * error, more + ONE_SIDED * error)
+        sigma, low, high = (math.sqrt(max(each, 0.0)) for each in bounds)
+        return cls(sigma, low, high)
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedStars:
+    """Stars drawn whole and isolated: places (n, 2), tracker px, and light (n,), e-/s.
+
+    `screen` (n, 2) is the place on the screen, -1 to 1 along each axis; `codes_mag` (n,) how much too faint the codes are.
+    """
+
+    hip: npt.NDArray[np.int32]
+    place_px: FloatArray
+    e_per_s: FloatArray
+    screen: FloatArray
+    codes_mag: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class StarsSeen:
+    """Isolated stars that the tracker sees: places by the sky (n, 2), tracker px, and the residuals of their images (n, 2).
+
+    `place_noise_px` (n,) is the noise of a residual along one axis. `dn` is the whole light of each (n,), `e_per_s` the light
+    asked for, `noise_mag` its error, infinite where the tracker saturated. `rounding_mag` (n, STEP_PHASES) is the part of it
+    that the ADC's rounding does to all stars together. `screen` (n, 2) is the place on the screen, -1 to 1;
+    `codes_mag` (n,) how much too faint the codes are. `frames` images of each field were averaged.
+    """
+
+    hip: npt.NDArray[np.int32]
+    place_px: FloatArray
+    residual_px: FloatArray
+    place_noise_px: FloatArray
+    dn: FloatArray
+    e_per_s: FloatArray
+    noise_mag: FloatArray
+    rounding_mag: FloatArray
+    screen: FloatArray
+    codes_mag: FloatArray
+    lost: int
+    frames: int
+    images: tuple[Path, ...]
+
+    @property
+    def sure(self) -> npt.NDArray[np.bool_]:
+        """A mask of the stars whose light is known well enough (n,): those under SURE_MAG, or the few with the least noise."""
+        few = np.sort(self.noise_mag)[min(SURE_STARS, len(self.noise_mag)) - 1]
+        return np.asarray(self.noise_mag <= float(np.clip(few, SURE_MAG, READ_MAG)))
+
+    @property
+    def beyond_px(self) -> Beyond:
+        """What places have beyond their noise, along one axis."""
+        return Beyond.of(self.residual_px.ravel(), np.repeat(self.place_noise_px, 2))
+
+    def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> "Scatter":
+        """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and its errors."""
+        left = off_mag - self.codes_mag[used]
+        left = left - np.median(left)
+        error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
+        x, y = self.screen[used].T
+        return Scatter(
+            rms_mag=float(np.sqrt((left**2).mean())),
+            error_mag=float(np.sqrt((error**2).mean())),
+            by_place=_explained(left, x, y, x**2 + y**2),
+            by_light=_explained(left, np.log(self.e_per_s[used])),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """The rms scatter of stars' light and its expected error, without codes and common zero point.
+
+    `by_place` and `by_light` are the shares of the variance that follow the place on the screen and the light asked for.
+    """
+
+    rms_mag: float
+    error_mag: float
+    by_place: float
+    by_light: float
+
+    @property
+    def finding(self) -> str:
+        """What is wrong and what to do where the scatter is far above its error; else ""."""
+        if self.rms_mag <= FAR * self.error_mag:
+            return ""
+        told = f"the light of stars scatters by {self.rms_mag:.3f} mag rms where they are known to {self.error_mag:.3f}"
+        if max(self.by_place, self.by_light) < MOST:
+            why = "it follows neither place nor light: look at stray light, local dimming, and whether the light is steady"
+        elif self.by_place > self.by_light:
+            why = f"{self.by_place:.0%} of it follows the place on the screen: measure that (--again uniformity)"
+        else:
+            why = (
+                f"{self.by_light:.0%} of it follows the light asked for: measure the response (--again photometry, --patches N)"
+            )
+        return f"{told}; {why}"
+
+
+def _explained(off: FloatArray, *shapes: FloatArray) -> float:
+    """The share of the variance of `off` (n,) that a linear fit of `shapes` (n,) explains, corrected for chance."""
+    design = np.stack([np.ones_like(off), *shapes], axis=1)
+    free = len(off) - design.shape[1]
+    total = float(((off - off.mean()) ** 2).sum())
+    if free < 1 or not total:
+        return 0.0
+    left = off - design @ np.linalg.lstsq(design, off, rcond=None)[0]
+    return float(1 - (left**2).sum() / free / (total / (len(off) - 1)))
+
+
+def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
+    """Show the fields with the most readable stars, `frames` images of each, and measure them.
+
+    Raises InputError where too few stars can be compared.
+    """
+    spot = StarSpot.of(context)
+    dark, dark_paths = _mean_dark(context, frames)
+    with open_bench(context.file) as bench:
+        shown = []
+        for q_icrs_to_cam in _fields(bench, context, spot, math.sqrt(2) * noisiest_background(dark).noise):
+            frame = bench.frame(q_icrs_to_cam)
+            levels: tuple[Levels, ...] = (frame.levels,)
+            exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)  # with `temporal` the frames of an exposure
+            if len(exposed) > 1:
+                levels = tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
+            codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
+            shown.append((codes, _alone(bench, context, frame, levels, spot)))
+    fields = []
+    for number, (codes, wanted) in enumerate(shown):
+        names = [f"stars_{number:03}", *(f"stars_{number:03}_{again:02}" for again in range(1, frames))]
+        looked = [context.look(Pattern(name, codes[0], codes[1:]), dark) for name in names]
+        fields.append(_compared(context, looked, wanted, spot))
+    arrays = [field.name for field in dataclasses.fields(StarsSeen) if field.name not in {"lost", "frames", "images"}]
+    seen = StarsSeen(
+        **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
+        lost=sum(each.lost for each in fields),
+        frames=frames,
+        images=(*dark_paths, *(path for each in fields for path in each.images)),
+    )
+    if len(seen.dn) < MIN_STARS:
+        raise InputError(_why_few(seen, spot, len(shown)))
+    return seen
+
+
+def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
+    told = f"{len(seen.dn)} stars can be seen where the sky has them, in {fields} fields, and {MIN_STARS} are needed"
+    if seen.lost:
+        return (
+            f"{told}; {seen.lost} that should be bright enough are not there: measure the response (--again photometry), look"
+            " at [render] flux_at_white_e_per_s, or run the geometry again (--again geometry)"
+        )
+    wide = f"a star's sigma is {spot.mean_sigma_px:.1f} px" if spot.mean_sigma_px > 2 else "the field has few bright stars"
+    return (
+        f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag, so that faint stars are shown"
+        " brighter, or a larger [sky] faintest_v_mag"
+    )
+
+
+def _mean_dark(context: StepContext, frames: int) -> tuple[FloatArray, tuple[Path, ...]]:
+    """The mean of `frames` images of a black screen (h, w), and their files."""
+    paths = [context.dark(number) for number in range(frames)]
+    return np.asarray(np.mean([context.read(path) for path in paths], axis=0)), tuple(paths)
+
+
+def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float) -> list[FloatArray]:
+    """Attitudes (4,) of the fields with the most stars that can be read, of random ones and of those at bright stars."""
+    stars, rng = bench.stars, np.random.default_rng(SEED)
+    per_e = context.exposure_s / spot.gain_e_per_dn
+    dn = stars.electrons_per_s * per_e
+    readable = (stars.row >= 0) & (spot.light_noise_mag(dn, noise_dn) < READ_MAG)
+    readable &= stars.electrons_per_s * bench.psf.peak_share <= bench.flux_at_white_e_per_s
+    readable &= dn * spot.peak_share < MAX_FILL * context.full_dn
+    attitudes = [np.asarray(q / np.linalg.norm(q)) for q in rng.normal(size=(RANDOM_ATTITUDES, 4))]
+    which = np.flatnonzero(readable)
+    brightest = which[np.argsort(-dn[which], kind="stable")][:POINTED_ATTITUDES]
+    for boresight, other in zip(stars.directions(brightest), rng.normal(size=(len(brightest), 3)), strict=True):
+        right = np.cross(other, boresight)
+        right /= np.linalg.norm(right)
+        attitudes.append(from_matrix(np.stack([right, np.cross(boresight, right), boresight])))
+    camera = tracker_camera(context.file.config.tracker, context.file.folder)
+    margin = spot.radius_px + MIN_EDGE_PX
+    counts = []
+    vectors = stars.directions(which)
+    for q in attitudes:
+        in_cam = vectors @ to_matrix(q).T
+        with np.errstate(invalid="ignore", over="ignore"):
+            inside = in_cam[:, 2] > 0
+            for one, edge in ((camera, margin), (bench.camera, MIN_EDGE_PX)):
+                x, y = one.project(in_cam @ one.cam_to_image.T)
+                width, height = one.resolution_px
+                inside &= (x > edge) & (x < width - edge) & (y > edge) & (y < height - edge)
+        counts.append(int(inside.sum()))
+    order = np.argsort(-np.array(counts), kind="stable")[:MAX_FIELDS]
+    before = np.concatenate([[0], np.cumsum(np.array(counts)[order])[:-1]])
+    return [attitudes[k] for place, k in enumerate(order) if place < FIELDS or before[place] < ENOUGH_STARS]
+
+
+def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], spot: StarSpot) -> ExpectedStars:
+    """The isolated stars of a frame that are drawn whole, with their expected places in the tracker's image."""
+    camera = tracker_camera(context.file.config.tracker, context.file.folder)
+    truth, vectors = frame.rows, bench.stars.directions(frame.star)
+    place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
+    width, height = camera.resolution_px
+    screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
+    limits = np.array(context.resolution_px) - 1 - MIN_EDGE_PX
+    edge_px = max(MIN_EDGE_PX, spot.radius_px + 2.0)
+    # No planets: their light is known to 0.05 mag only, and a disc may be wide.
+    kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
+    kept &= bench.stars.row[frame.star] >= 0
+    kept &= (place > edge_px).all(axis=1) & (place < np.array([width, height]) - 1 - edge_px).all(axis=1)
+    kept &= (screen > MIN_EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
+    finite = np.where(np.isfinite(place), place, -1e6)
+    light = np.asarray(truth["electrons_per_s"], dtype=np.float64)
+    near = cKDTree(finite).query_ball_point(finite, ALONE_RADII * spot.radius_px + 2)
+    beside = np.array([light[each].sum() for each in near]) - light if len(light) else light
+    kept &= beside < BESIDE_SHARE * light
+    middle = (np.array(context.resolution_px) - 1) / 2
+    return ExpectedStars(
+        hip=truth["hip"][kept],
+        place_px=place[kept],
+        e_per_s=light[kept],
+        screen=(screen[kept] - middle) / middle,
+        codes_mag=_codes_mag(bench, context, frame, levels, screen[kept], spot),
+    )
+
+
+def _codes_mag(
+    bench: Bench,
+    context: StepContext,
+    frame: Frame,
+    levels: tuple[Levels, ...],
+    screen_px: FloatArray,
+    spot: StarSpot,
+) -> FloatArray:
+    """How much fainter the codes are than the light asked for (n,), magnitudes, within the tracker's window."""
+    shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)
+    geometry = context.geometry()
+    reach = math.ceil((spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px)
+    off = []
+    for x, y in np.rint(screen_px).astype(np.intp):
+        part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
+        wanted = float(frame.linear[part].sum(dtype=np.float64))
+        off.append(magnitude(float(shown[part].sum()) / wanted) if wanted > 0 else 0.0)
+    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))  # such a star is not shown, and will not be found
+
+
+def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot) -> StarsSeen:
+    """The stars found in the mean of a field's images, against those that should be there."""
+    image = np.asarray(np.mean([each.image for each in looked], axis=0))
+    background = noisiest_background(image, 1 / len(looked))
+    found, noise_dn = find_stars(image, spot.settings, background), background.noise
+    seen = np.stack([found.x_px, found.y_px], axis=1)
+    count = len(wanted.e_per_s)
+    far, nearest = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
+    if len(seen) and count:
+        far, nearest = (np.asarray(part) for part in cKDTree(seen).query(wanted.place_px))
+    near = far < max(MIN_REACH_PX, spot.mean_sigma_px)
+    expected_dn = wanted.e_per_s * context.exposure_s / spot.gain_e_per_dn
+    brighter = 1.0
+    if near.sum() >= MIN_STARS:  # the screen may give more or less light than the bench file says
+        brighter = float(np.median(found.flux[nearest[near]] / spot.window_share / expected_dn[near]))
+    matched = near.copy()
+    dn = found.flux[nearest[near]] / spot.window_share
+    matched[near] = spot.light_noise_mag(dn, noise_dn) < READ_MAG
+    peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
+    chosen = nearest[matched]
+    dn = found.flux[chosen] / spot.window_share
+    shared = dataclasses.replace(spot, frames=len(looked))
+    noise_mag = shared.light_noise_mag(dn, noise_dn)
+    whole_dn = np.maximum(dn * spot.window_share, 1e-9)
+    rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
+    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked[0].floor_dn
+    return StarsSeen(
+        hip=wanted.hip[matched],
+        place_px=wanted.place_px[matched],
+        residual_px=seen[chosen] - wanted.place_px[matched],
+        place_noise_px=shared.place_noise_px(dn, noise_dn),
+        dn=dn,
+        e_per_s=wanted.e_per_s[matched],
+        noise_mag=np.where(saturated, np.inf, noise_mag),
+        rounding_mag=MAG_PER_RELATIVE * rounded,
+        screen=wanted.screen[matched],
+        codes_mag=wanted.codes_mag[matched],
+        lost=int((~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)).sum()),
+        frames=len(looked),
+        images=tuple(each.path for each in looked),
+    )

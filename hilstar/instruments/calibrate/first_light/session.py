@@ -1,0 +1,406 @@
+"""The session: its steps in order, each done once, and again when what it depends on has changed."""
+
+import datetime
+import hashlib
+import math
+import os
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.basics.files import clear_parts, lock_alone, write_whole
+from hilstar.basics.units import NS_PER_S
+from hilstar.basics.version import __version__
+from hilstar.instruments.calibrate.first_light.context import (
+    KIND,
+    Figure,
+    SessionFile,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    StepRecord,
+    read_session,
+    rewrite,
+    sha256_of,
+    write_session,
+)
+from hilstar.instruments.calibrate.first_light.focus import focus
+from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
+from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
+from hilstar.instruments.calibrate.first_light.photometry import photometry
+from hilstar.instruments.calibrate.first_light.stars import scale, verify
+from hilstar.instruments.calibrate.first_light.uniformity import uniformity, warm_up
+from hilstar.instruments.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.doctor import examine
+from hilstar.server.sync import BeatSummary, beat_of
+
+WATCHED_S = 5.0  # about 150 edges at 60 Hz
+AGREE_MS = 0.05  # a smaller difference neither changes the bench file nor casts doubt on a scan-out
+
+
+def latency(context: StepContext) -> StepOutcome:
+    """Measure the panel's delay and set it in the bench file. Raises InputError, MachineError."""
+    monitor = context.file.config.monitor
+    if not monitor.photodiode_px:
+        return StepOutcome("skipped", "not measured: [monitor] photodiode_px is 0, so no square is shown for a photodiode")
+    watched = context.source.diode(context.file, WATCHED_S)
+    if watched is None:
+        how = "--diode serial:/dev/ttyX@BAUD, with the display on this machine; or `hilstar latency` with the ledger of a run"
+        return StepOutcome("skipped", f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}")
+    paired = pair(watched.seen, watched.shown, NS_PER_S / monitor.refresh_hz)
+    found = summarise(paired, context.file.config)
+    picture = context.session / "latency.svg"
+    draw_latency(picture, paired, found)
+    delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
+    error_ms = found["panel_delay_u_ms"]
+    figures: dict[str, Figure] = {
+        "panel_delay_ms": delay_ms,
+        "error_ms": error_ms,
+        "in_bench_file_ms": monitor.panel_delay_ms,
+        "swap_to_light_p50_ms": found["latency_ms"]["p50"],
+        "swap_to_light_p99_ms": found["latency_ms"]["p99"],
+        "swap_to_square_ms": found["swap_to_square_ms"],
+        "jitter_ms": found["jitter_ms"],
+        "edges": found["edges"],
+        "edges_without_a_frame": found["unmatched"],
+    }
+    figures |= {name: found[name] for name in ("rise_ms", "fall_ms") if found[name] is not None}
+    if context.truth is not None:
+        figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
+    line = (
+        f"the panel's delay is {delay_ms:g} +- {error_ms:.3f} ms, the bench file has {monitor.panel_delay_ms:g};"
+        f" a swap is light at the square after {found['latency_ms']['p50']:.2f} ms,"
+        f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
+    )
+    agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
+    changes = (
+        *context.change("monitor", "panel_delay_ms", delay_ms),
+        *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
+    )
+    number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
+    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else changes, number)
+
+
+MS_PER_S = 1000.0
+
+
+def machine(context: StepContext) -> StepOutcome:
+    """Check the machine. Raises MachineError for what it lacks."""
+    found = examine()
+    missing = [check for check in found.checks if check.required and not check.ok]
+    if missing:
+        raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
+    figures = {check.name: check.detail for check in found.checks}
+    passed = sum(check.required for check in found.checks)  # all of them
+    number = StepNumber(passed, None, f"of {passed}", "checks passed of what hilstar needs")
+    return StepOutcome("done", f"OpenGL by {figures['opengl']}", figures, number=number)
+
+
+def display(context: StepContext) -> StepOutcome:
+    """Measure the display. Raises MachineError for one that is not as the bench file has it."""
+    timing = context.source.gate(context.file)
+    if timing is None:
+        return StepOutcome("skipped", f"no display of this program's own ({context.source.identity.partition(':')[0]})")
+    figures: dict[str, Figure] = {"period_ms": timing.period_ms, "dropped": timing.dropped}
+    if timing.paced_by_screen:
+        figures["refresh_hz"] = MS_PER_S / timing.period_ms
+    if timing.modes_hz:
+        figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
+    paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
+    forced = "".join(f"; forced: {each}" for each in context.source.forced)
+    line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}"
+    number = StepNumber(timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next")
+    return StepOutcome("done", line, figures, number=number)
+
+
+PROGRESS_S = 3.0
+BEFORE_FILE = "bench-before.toml"
+LOCK_FILE = ".lock"
+
+
+class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and what it wants back.
+
+    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set, `needs` the steps before it.
+    Those of `unless_failed` may be skipped: what the bench file says stands in for them.
+    """
+
+    measures: str
+    cure: str
+    wants: str
+    shows: str = ""
+    needs: tuple[str, ...] = ()
+    unless_failed: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
+    writes: tuple[str, ...] = ()
+    name: str = ""
+
+
+STEPS_FILE = Path(__file__).with_name("steps.toml")
+STEPS = tuple(
+    msgspec.structs.replace(step, name=name)
+    for name, step in msgspec.toml.decode(STEPS_FILE.read_bytes(), type=dict[str, SessionStep]).items()
+)
+NAMES = tuple(step.name for step in STEPS)
+RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
+    run.__name__.replace("_", "-"): run
+    for run in (machine, display, orientation, focus, warm_up, geometry, uniformity, photometry, scale, latency, verify)
+}
+
+
+class Progress:
+    """Tells every PROGRESS_S what a step is at, from a thread of its own: a fit takes as long as an image."""
+
+    def __init__(self, tell: Callable[[str], object]) -> None:
+        self._tell, self._stage, self._images = tell, "", 0
+
+    def shows(self, pattern: Pattern) -> None:
+        """A pattern is shown, and its image taken."""
+        self._images += 1
+        self._stage = f"image {self._images}, {pattern.name}"
+
+    def stage(self, words: str) -> None:
+        """Something begins that may take long."""
+        self._stage = words
+
+    @contextmanager
+    def of(self, step: str) -> Iterator[None]:
+        """Tell of a step while this is open."""
+        self._stage, self._images = "begins", 0
+        begun_s, ended = time.monotonic(), threading.Event()
+
+        def tell() -> None:
+            while not ended.wait(PROGRESS_S):
+                self._tell(f"{step:12} {time.monotonic() - begun_s:.0f} s: {self._stage}")
+
+        thread = threading.Thread(target=tell, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+
+class FirstLightSession:
+    """A session in a directory, with at most `patches` readings of the response; `watch` is called with each pattern.
+
+    White is watched for `watched_s` at most, 0 for not at all; `frames` images of each field of stars are averaged, 0: as many
+    as it takes. `progress` is called with a line every few seconds while a step runs, from a thread of its own.
+    Raises InputError for a directory with another bench's session.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        file: BenchFile,
+        source: ImageSource,
+        patches: int,
+        watch: Callable[[Pattern], object] = lambda pattern: None,
+        *,
+        watched_s: float = 0.0,
+        frames: int = 0,
+        progress: Callable[[str], object] = lambda line: None,
+    ) -> None:
+        self._watch, self._watched_s, self._frames, self._progress = watch, watched_s, frames, Progress(progress)
+        self.folder, self.file, self.source, self.patches = folder, file, source, patches
+        bench = str(file.path.resolve())
+        found = read_session(folder)
+        if found is not None and found.bench != bench:
+            raise InputError(f"{folder}: is the session of {found.bench}; write another directory for {file.path}")
+        self.records = {} if found is None else {record.name: record for record in found.steps if record.name in NAMES}
+        self.unfinished = {} if found is None else dict(found.unfinished)
+
+    def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
+        """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises Stopped at a closed display."""
+        clear_parts(self.folder)
+        before = self.folder / BEFORE_FILE
+        if not before.exists():
+            write_whole(before, self.file.path.read_bytes())
+        for number, step in enumerate(STEPS):
+            if step.name not in again and self._is_done(number):
+                say(f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}")
+                continue
+            record = self._run(number, step.name in again, say)
+            self.records[step.name] = record
+            write_session(self.folder, self.as_file())
+            say(f"{step.name:12} {record.verdict}: {record.line}")
+        return max(record.exit_code for record in self.records.values())
+
+    def _is_done(self, number: int) -> bool:
+        """Whether a step need not run: it is done, or skipped for good, and nothing it depends on has changed."""
+        step = STEPS[number]
+        record = self.records.get(step.name)
+        if record is None or record.verdict == "failed" or step.name in self.unfinished or self._unmet(step) is not None:
+            return False
+        if record.verdict == "skipped" and step.needs:
+            return False  # it lacked a step that has been done by now
+        if record.state_sha256 != self._state(number):
+            return False
+        paths = ((self.folder / name, digest) for name, digest in record.files.items())
+        return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
+
+    def _unmet(self, step: SessionStep) -> str | None:
+        for name in step.unless_failed:
+            record = self.records.get(name)
+            if record is not None and record.verdict == "failed":
+                return name
+        for name in step.needs:
+            record = self.records.get(name)
+            if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
+                return name
+        return None
+
+    def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> StepRecord:
+        step, start_s, exit_code = STEPS[number], time.monotonic(), 0
+        unmet = self._unmet(step)
+        if unmet is not None:
+            outcome = StepOutcome("skipped", f"needs {unmet}, which is not done")
+        else:
+            say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
+            # An interrupted attempt's images can be used where nothing they depend on has changed.
+            goes_on = not afresh and self.unfinished.get(step.name) == self._attempt(number)
+            context = self._context(step, goes_on)
+            self.unfinished[step.name] = self._attempt(number)
+            write_session(self.folder, self.as_file(step.name))
+            outcome, exit_code = self._tried(step, context)
+        return StepRecord(
+            name=step.name,
+            verdict=outcome.verdict,
+            line=outcome.line,
+            exit_code=exit_code,
+            state_sha256=self._state(number),
+            figures={name: _finite(value) for name, value in outcome.figures.items()},
+            files={os.path.relpath(path, self.folder): sha256_of(path) for path in outcome.files},
+            pictures=[os.path.relpath(path, self.folder) for path in outcome.pictures],
+            changes=list(outcome.changes),
+            ended=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            seconds=round(time.monotonic() - start_s, 3),
+            number=outcome.number,
+        )
+
+    def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
+        try:
+            with self._progress.of(step.name):
+                outcome = RUNS[step.name](context).checked()
+            self.file = rewrite(self.file, outcome.changes)
+        except Stopped:
+            raise
+        except HilstarError as error:
+            # Bad data for one step is not a wrong command: the session continues and ends with exit code 1.
+            code = 1 if isinstance(error, InputError) else error.exit_code
+            if not isinstance(error, NoImage | MachineError):
+                del self.unfinished[step.name]
+            return StepOutcome("failed", one_line(str(error))), code
+        del self.unfinished[step.name]
+        return outcome, 1 if outcome.verdict == "failed" else 0
+
+    def _attempt(self, number: int) -> str:
+        # Every pattern depends on the collimator, even where the step's result does not.
+        return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
+
+    def _context(self, step: SessionStep, goes_on: bool) -> StepContext:
+        attempts = self.folder / "images"
+        number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
+        folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
+        known: dict[str, Figure] = {
+            f"{name}.{key}": value
+            for name, record in self.records.items()
+            if record.verdict == "done"
+            for key, value in record.figures.items()
+        }
+        kept = complete_images(folder)
+        return StepContext(
+            self.file,
+            self.folder,
+            folder,
+            self.source,
+            known,
+            kept,
+            self.patches,
+            watch=self._shows,
+            stage=self._progress.stage,
+            watched_s=self._watched_s,
+            frames=self._frames,
+        )
+
+    def _shows(self, pattern: Pattern) -> None:
+        self._progress.shows(pattern)
+        self._watch(pattern)
+
+    def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
+        """The SHA-256 of what a step depends on: its tables without later steps' keys, files they name, the source."""
+        step = STEPS[number]
+        later = {key for other in STEPS[number + 1 :] for key in other.writes}
+        config = msgspec.to_builtins(self.file.config)
+        kept = {
+            table: {key: value for key, value in config[table].items() if f"{table}.{key}" not in later}
+            for table in tables or step.tables
+        }
+        named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
+        monitor = self.source.monitor
+        shown_on = f" on {monitor.name()}" if monitor is not None and monitor.edid_sha256 else ""
+        seen_by = self.source.identity + shown_on if step.tables else platform.python_version()
+        return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
+
+    def as_file(self, running: str | None = None) -> SessionFile:
+        """The contents of session.json."""
+        return SessionFile(
+            kind=KIND,
+            hilstar=__version__,
+            bench=str(self.file.path.resolve()),
+            bench_sha256=self.file.sha256,
+            seen_by=self.source.identity,
+            running=running,
+            steps=[self.records[name] for name in NAMES if name in self.records],
+            unfinished=self.unfinished,
+            beat=self.beat(),
+            forced=list(self.source.forced),
+        )
+
+    def beat(self) -> BeatSummary:
+        """The beat of the tracker's exposures with the display, at its measured rate and modes where they are known."""
+        record = self.records.get("display")
+        figures = {} if record is None else record.figures
+        refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
+        return beat_of(self.file.config, None if refresh_hz is None else float(refresh_hz), [float(hz) for hz in modes])
+
+
+def _finite(value: Figure) -> Figure:
+    """The figure, or "not known" where JSON has no such number."""
+    if not isinstance(value, float):
+        return value
+    return float(value) if math.isfinite(value) else "not known"  # msgspec does not encode NumPy's floats
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from _texts(inner)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Lock a directory against a second session (InputError); a kill releases the lock."""
+    lock = lock_alone(folder / LOCK_FILE, "another first-light session works there; wait for its end")
+    try:
+        yield
+    finally:
+        os.close(lock)

@@ -1,0 +1,417 @@
+"""A geometric calibration from centroids to a file: matching, fit, checks, summary, notes and chart."""
+
+import datetime
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import hilstar
+from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.charts import BLUE, SMALL_PT, chart
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.display.identity import MonitorIdentity
+from hilstar.instruments.calibrate.geometric import fit as fits
+from hilstar.instruments.calibrate.geometric.dots import MIN_DOTS, DotPlan, SeenScreen, read_plan
+from hilstar.instruments.calibrate.geometric.match import (
+    FirstLook,
+    first_look,
+    match_by_geometry,
+    match_by_maps,
+    refuse_motion,
+    turned,
+)
+from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images, read_observed
+from hilstar.optics.camera import Lens
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
+
+SEED = 1  # for the random samples of dots: one calibration gives one file
+KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
+# In a part of the screen, of so many dots that should be seen the share that is: two or three may be lost to neighbours.
+MIN_CELL_DOTS, MIN_CELL_SHARE = 4, 0.33
+CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
+SCREEN_PLACES = 17  # along each side of the screen, by which it is known whether the tracker sees all of it
+REACH_PX = 0.5  # tracker px: a centroid this close to a dot's fitted place is that dot
+REACH_SIGMAS = 8.0
+MATCH_ROUNDS = 2
+DEFAULT_NOISE_PX = 0.05
+# A held-out error this many times that of the centroids' noise alone is no lens: a dot's mean is off by noise / sqrt(frames).
+MAX_MISFIT = 4.0
+MISFIT_FLOOR_ARCSEC = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and the centroids' fate."""
+
+    problem: fits.Problem
+    data: fits.MatchedDots
+    fit: fits.Fit
+    models: list[fits.Candidate]
+    chosen: fits.Candidate
+    uncertainty: fits.Uncertainty
+    centroids: int
+    tracker_known: bool
+
+    @property
+    def plan(self) -> DotPlan:
+        """The dots that were shown."""
+        return self.problem.plan
+
+    @property
+    def recognised(self) -> int:
+        """Dots that were recognised."""
+        return len(np.unique(self.data.dot))
+
+    @property
+    def lost(self) -> int:
+        """Lit dots in the tracker's field that have no centroid."""
+        expected = sum(int(self.plan.lit[inside].sum()) for inside in self.measurable)
+        return expected - len(self.data)
+
+    @property
+    def measurable(self) -> list[BoolArray]:
+        """For each pose, a mask of the dots (dots,) whose windows are in the tracker's image."""
+        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.seen.edge_px)
+
+    @property
+    def false(self) -> int:
+        """Centroids that are no dot."""
+        return self.centroids - len(self.data)
+
+    @property
+    def noise_arcsec(self) -> float:
+        """The error of one centroid along one axis."""
+        return self.problem.noise_px * ARCSEC_PER_RAD / self.problem.nominal.tracker.focal_length_px
+
+    @property
+    def held_out_noise_arcsec(self) -> float:
+        """The rms that noise alone would give held-out dots."""
+        count = np.bincount(self.data.dot)
+        return float(np.sqrt(2 * np.mean(1 / count[count > 0])) * self.noise_arcsec)
+
+
+def calibrate_files(
+    file: BenchFile, observed: Sequence[Path], plan: Path, dark: Path | None, *, tracker_is_ideal: bool
+) -> Calibrated:
+    """Fit the geometry of a bench file to a table of centroids, or to the tracker's images. Raises InputError."""
+    config = file.config
+    dots = read_plan(plan)
+    width, height = config.monitor.resolution_px
+    if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
+        raise InputError(f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew")
+    if observed[0].suffix.lower() == ".csv":
+        if len(observed) > 1:
+            raise InputError(f"{observed[1]}: one table is read; write all centroids into {observed[0]}")
+        seen = read_observed(observed[0])
+    else:
+        seen = measure_images(observed, dark, config.tracker.resolution_px, dot_sigma_px(file))
+    return calibrate_seen(file, dots, seen, tracker_is_ideal=tracker_is_ideal)
+
+
+def calibrate_seen(file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool) -> Calibrated:
+    """Fit the geometry of a bench file to centroids of planned dots. Raises InputError."""
+    known = tracker_is_ideal or file.config.tracker.distortion is not None
+    return calibrate_geometry(plan, nominal_of(file), seen, np.random.default_rng(SEED), tracker_known=known)
+
+
+def nominal_of(file: BenchFile) -> fits.Nominal:
+    """The geometry that a bench file has without its geometry file. Raises InputError."""
+    config = file.config
+    q_cam_to_mon = np.array(config.collimator.q_cam_to_mon)
+    return fits.Nominal(ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder))
+
+
+def seen_screen_of(file: BenchFile) -> SeenScreen:
+    """What the tracker sees of the screen by a bench file: surely by its geometry file, else about. Raises InputError."""
+    tracker = tracker_camera(file.config.tracker, file.folder)
+    monitor, is_sure = bench_camera(file.config, file.folder), file.config.collimator.geometry is not None
+    return SeenScreen(monitor, tracker, is_sure, psf_sigma_of(file))
+
+
+def dot_sigma_px(file: BenchFile) -> float:
+    """The sigma of a dot in the tracker's image by the bench file, tracker px. Raises InputError."""
+    nominal = nominal_of(file)
+    return SeenScreen(nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)).dot_sigma_px
+
+
+def psf_sigma_of(file: BenchFile) -> float:
+    """How wide the tracker sees a point of the screen by the bench file, its sigma in tracker px. Raises InputError."""
+    psf = before_detector(file.config, file.folder, ideal_monitor(file.config))
+    return float(np.mean(psf.width_px))
+
+
+def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen:
+    """Which part of the screen the tracker sees, by a few dots: enough to put the others there. Raises InputError."""
+    nominal = nominal_of(file)
+    look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
+    problem, data = matched(plan, nominal, seen, look)
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
+    rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
+    return SeenScreen(rough.monitor, rough.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(file))
+
+
+def _too_few(data: fits.MatchedDots) -> InputError:
+    return InputError(
+        f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed: look at focus, exposure and stray light,"
+        " and at whether the tracker sees the part of the screen where the dots are (plan.csv)"
+    )
+
+
+def calibrate_geometry(
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, rng: np.random.Generator, *, tracker_known: bool
+) -> Calibrated:
+    """Fit a bench's geometry to what the tracker saw of the dots.
+
+    With `tracker_known` the tracker's own lens is held as it is; else it is fitted too, which takes two poses or more.
+    Raises InputError, with the cure, for an image that is mirrored or turned, for codes or frames that match nothing, for too
+    few dots, and for a fit that its data contradict.
+    """
+    poses = int(seen.pose.max()) + 1
+    if not tracker_known and poses == 1:
+        raise InputError(
+            "with one pose the tracker's own distortion cannot be told from the collimator's; give its flight model as"
+            " [tracker] distortion, take a second pose (turn the tracker by 90 or 180 degrees about its boresight),"
+            " or add --tracker-is-ideal"
+        )
+    tracker_names = () if tracker_known else tuple(fits.TRACKER_STEPS)
+    look = first_look(plan, nominal, seen, rng)
+    problem, data = matched(plan, nominal, seen, look, tracker_names)
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
+    models = fits.candidates(problem, data, tracker_names)
+    chosen = fits.best_of(models)
+    final = bounded_to_field(problem, fits.fit(problem, chosen.model, chosen.field_degree, data))
+    uncertainty = fits.uncertainty_of(problem, final, data)
+    calibrated = Calibrated(problem, data, final, models, chosen, uncertainty, len(seen), tracker_known)
+    _refuse_gaps(calibrated)
+    expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
+    if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
+        raise InputError(
+            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the centroids makes {expected:.2g}:"
+            " something moved between the frames, or the tracker's flight model is wrong"
+        )
+    return calibrated
+
+
+def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
+    """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
+    geometry, monitor = fit.geometry, fit.geometry.monitor
+    # By places over the whole screen, not by the dots: those stand where the tracker sees it.
+    sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
+    x_px, y_px = (part.ravel() for part in np.meshgrid(*sides))
+    if all(inside.all() for inside in _in_view(fit, x_px, y_px)):
+        return fit
+    width, height = geometry.tracker.resolution_px
+    corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
+    reach = 0.0
+    for pose in range(len(geometry.q_poses)):
+        rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
+        reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
+    # A pinhole is bounded, too: a tilt that it could not see within the field is 23 arcsec off at the screen's far end.
+    lens = replace(monitor.lens or Lens(), max_tangent=KNOWN_MARGIN * reach)
+    return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
+
+
+def matched(
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
+) -> tuple[fits.Problem, fits.MatchedDots]:
+    """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to fit, and its data.
+
+    Raises InputError where the image moved between frames.
+    """
+    data = match_by_maps(plan, nominal, seen, look)
+    refuse_motion(data)
+    nominal = turned(plan, nominal, look)
+    for _ in range(MATCH_ROUNDS):
+        problem = fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX)
+        # The largest model that these centroids can determine.
+        names = next((names for names in (fits.BROWN_CONRADY, fits.RADIAL) if len(data) > 2 * len(names)), fits.PINHOLE)
+        model = fits.Model(names, tracker_names if names is fits.BROWN_CONRADY else (), len(look.q_poses))
+        rough = fits.fit(problem, model, 0, data)
+        reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
+        data = match_by_geometry(plan, seen, rough.geometry, reach_px)
+        if len(data) < MIN_DOTS:
+            break
+    return fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX), data
+
+
+def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0) -> list[BoolArray]:
+    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than `edge_px` from its edge."""
+    geometry = fit.geometry
+    directions = geometry.monitor.rays(x_px, y_px)
+    width, height = geometry.tracker.resolution_px
+    found = []
+    for q in geometry.q_poses:
+        x, y = geometry.tracker.project(directions @ to_matrix(q).T)
+        across = (x > edge_px) & (x < width - 1 - edge_px)
+        found.append(across & (y > edge_px) & (y < height - 1 - edge_px))
+    return found
+
+
+def _refuse_gaps(calibrated: Calibrated) -> None:
+    """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
+    plan, problem = calibrated.plan, calibrated.problem
+    wanted = np.any(calibrated.measurable, axis=0)
+    found = np.zeros(len(plan), dtype=bool)
+    found[np.unique(calibrated.data.dot)] = True
+    width, height = problem.nominal.monitor.resolution_px
+    column, row = (np.clip((place * 3 / size).astype(int), 0, 2) for place, size in ((plan.x_px, width), (plan.y_px, height)))
+    for r, vertical in enumerate(CELLS[1]):
+        for c, sideways in enumerate(CELLS[0]):
+            here = (column == c) & (row == r) & wanted
+            if here.sum() >= MIN_CELL_DOTS and found[here].sum() < MIN_CELL_SHARE * here.sum():
+                part = "middle" if vertical == sideways else f"{vertical} {sideways}"
+                raise InputError(
+                    f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part} of the screen: look for what"
+                    " covers or dims it, and take new frames"
+                )
+
+
+ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
+COLLIMATOR_ALONE = "one pose, with the tracker's lens as its flight model says: this file holds the collimator alone"
+ROUND = "poses turned about the boresight do not tell apart distortions that are round about it; they are in the stated error"
+WIDE_INCH = 5.6  # width of a panel
+ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
+
+
+class FittedParameter(NamedTuple):
+    """A parameter's value and one sigma, in the unit of its name."""
+
+    value: float
+    sigma: float
+
+
+def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
+    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its own lens."""
+    chosen, error = found.chosen, found.uncertainty
+    return {
+        "model": chosen.name,
+        "poses": len(found.problem.q_poses),
+        "dots": {"planned": len(found.plan), "recognised": found.recognised},
+        "centroids": {"given": found.centroids, "matched": len(found.data), "lost": found.lost, "false": found.false},
+        "noise_px": found.problem.noise_px,
+        "noise_arcsec": found.noise_arcsec,
+        "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
+        "error": _both(error),
+        "models": [{"name": model.name, **_both(model)} for model in found.models],
+        "parameters": {name: each._asdict() for name, each in parameters_of(found).items()},
+        "tracker": "held" if found.tracker_known else "fitted",
+        "notes": notes_for_a_person(found),
+        "written": written,
+    }
+
+
+def _both(error: fits.Candidate | fits.Uncertainty) -> dict[str, float]:
+    return {"rms_arcsec": error.rms_arcsec, "max_arcsec": error.max_arcsec}
+
+
+def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
+    """What the figures alone do not say."""
+    if len(found.problem.q_poses) == 1:
+        notes: tuple[str, ...] = (ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,)
+    else:
+        notes = () if found.tracker_known else (ROUND,)
+    lens = found.fit.geometry.monitor.lens
+    if lens is None or not math.isfinite(lens.max_tangent):
+        return notes
+    known_deg = math.degrees(math.atan(lens.max_tangent))
+    return (*notes, f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out")
+
+
+def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
+    """Each parameter's value and one sigma, in its own unit."""
+    monitor, sigma = found.fit.geometry.monitor, found.uncertainty.sigma
+    lens = monitor.lens or Lens()
+    focal, pitch = monitor.focal_length_px, ARCSEC_PER_RAD
+    values = {
+        "focal_length_px": (focal, focal * sigma.get("log_focal", 0.0)),
+        "principal_point_x_px": (monitor.principal_point_px[0], sigma.get("centre_x", 0.0)),
+        "principal_point_y_px": (monitor.principal_point_px[1], sigma.get("centre_y", 0.0)),
+        "rotation_x_arcsec": (0.0, pitch * sigma["rotation_x"]),
+        "rotation_y_arcsec": (0.0, pitch * sigma["rotation_y"]),
+        "rotation_z_arcsec": (0.0, pitch * sigma["rotation_z"]),
+        "tilt_x_deg": (math.degrees(lens.tilt_rad[0]), math.degrees(sigma.get("tilt_x", 0.0))),
+        "tilt_y_deg": (math.degrees(lens.tilt_rad[1]), math.degrees(sigma.get("tilt_y", 0.0))),
+    }
+    for name, value in zip(("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True):
+        values[name] = (value, sigma.get(name, 0.0))
+    own = found.fit.geometry.tracker.lens or Lens()
+    for name, value in zip(fits.TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
+        if name in found.fit.model.tracker_names:
+            values[name] = (value, sigma[name])
+    return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
+
+
+def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity: MonitorIdentity | None = None) -> list[str]:
+    """Write the geometry file with its errors and its monitor, and its chart if `plot`; their names. Raises InputError."""
+    geometry, chosen, uncertainty = found.fit.geometry, found.chosen, found.uncertainty
+    error = ErrorTable(
+        model=chosen.name,
+        held_out_rms_arcsec=chosen.rms_arcsec,
+        held_out_max_arcsec=chosen.max_arcsec,
+        noise_px=found.problem.noise_px,
+        rms_arcsec=uncertainty.rms_arcsec,
+        max_arcsec=uncertainty.max_arcsec,
+        map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)],
+        modes_arcsec=[[float(f"{value:.5g}") for value in mode] for mode in uncertainty.modes_arcsec],
+    )
+    sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
+    when = datetime.datetime.now(datetime.UTC).date().isoformat()
+    made = MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses))
+    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity))
+    if plot is not None:
+        draw_geometry(plot, found)
+    return [str(each) for each in (path, plot) if each is not None]
+
+
+def lines_of(found: Calibrated) -> list[str]:
+    """The calibration as lines of text."""
+    chosen, error, noise = found.chosen, found.uncertainty, found.held_out_noise_arcsec
+    rows = [
+        ("dots", f"{found.recognised} of {len(found.plan)} recognised in {len(found.problem.q_poses)} pose(s)"),
+        ("centroids", f"{len(found.data)} matched, {found.lost} lost, {found.false} false"),
+        ("centroid noise", f"{found.problem.noise_px:.4f} px, {found.noise_arcsec:.2f} arcsec"),
+        *((m.name, f"{m.rms_arcsec:.3f} / {m.max_arcsec:.3f} arcsec (rms / max of held-out dots)") for m in found.models),
+        ("chosen", chosen.name),
+        ("held-out dots", f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max; noise: {noise:.3f}"),
+        ("a star's place", f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)"),
+    ]
+    width = max(len(name) for name, _ in rows) + 2
+    return [f"{name:{width}}{text}" for name, text in rows] + list(notes_for_a_person(found))
+
+
+def draw_geometry(path: Path, found: Calibrated) -> None:
+    """Draw the error of a star's place over the screen, and the dots' residuals as arrows."""
+    error, (width, height) = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px
+    finding = (
+        f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
+        f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
+    )
+    dot, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
+    residual = fits.residuals_px(found.problem, found.fit.geometry, found.data)
+    right, down = (np.bincount(place, part) / count for part in residual)
+    to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
+    median = max(float(np.median(np.hypot(right, down))), 1e-9)
+    with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (places, residuals):
+        image = places.imshow(error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis")
+        places.figure.colorbar(image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5)
+        places.set_title("Error of a star's place")
+        x, y = found.plan.x_px[dot], found.plan.y_px[dot]
+        look = {"angles": "xy", "scale_units": "xy", "width": 0.002, "color": BLUE}
+        arrows = residuals.quiver(x, y, right, down, scale=median / (ARROW_SHARE * width), **look)
+        key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
+        residuals.quiverkey(arrows, 0.75, 1.05, median, f"{median * to_arcsec:.2g} arcsec", **key)
+        residuals.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="monitor x [px]")
+        residuals.set_title("Mean residual of each dot; key: their median")
+        for axes in (places, residuals):
+            axes.set_ylabel("monitor y [px]")
+            axes.grid(visible=False)

@@ -1,0 +1,328 @@
+"""Frames of dots, each of which blinks its own code: a dot in the tracker's image identifies itself.
+
+Every dot is lit in the same number of frames, which shows lost and false centroids. Two codes differ in as many frames as the
+number of dots allows. Dots stand where the tracker sees the screen: a tracker before a large screen may see 2 % of it.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.charts import write_csv
+from hilstar.basics.errors import InputError
+from hilstar.basics.text_tables import read_rows
+from hilstar.instruments.calibrate.geometric.observed import dot_centroids
+from hilstar.optics.camera import Camera
+from hilstar.server.bench.config import Monitor
+
+LIT_SHARE = 0.4  # share of the frames that a dot is lit in
+MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in
+MIN_FRAMES = 8
+MAX_PLAN_BYTES = 20_000_000
+DOT_PX = 3  # side of a dot, monitor px
+EDGE_PX = 6  # from a dot's centre to the edge of the screen
+TRIES = 400  # random codes for each dot, at each distance
+PLAN_COLUMNS = ("frame", "dot", "x_px", "y_px")
+GOLDEN = 1.32471795724474602596  # the plastic number: its powers spread points evenly over a square (Roberts 2018)
+PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
+# Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for their wings. They stand by
+# chance, so that half of them have a neighbour at half of it: 9 sigmas, for two windows of 4 and a little light beyond.
+MIN_APART_PX, APART_SIDES, WINGS_PX, WINGS_SIGMAS = 40.0, 2.5, 20.0, 18.0
+MIN_DOTS = 12  # that the fit of a geometry needs
+MIN_LIT_DOTS, MAX_LIT_DOTS = 8, 60  # in a frame: three frames in eight light 21 dots or more
+# A geometry that was not measured: the bench file's lens may look past the screen's middle by so much of the tracker's field.
+UNSURE_SHARE = 0.15
+GRID = 65  # places along each side of the screen and of the tracker, by which the part that is seen is found
+TRIED = 40  # places of the even sequence that are tried for each dot: the part seen may be a thin strip of its box
+BORDER_DIRECTIONS = 8  # in which the outermost place that is seen has a dot, so that no corner is extrapolated
+
+
+@dataclass(frozen=True, slots=True)
+class DotPlan:
+    """Dots on the monitor: places (n,), whole px, and the frames in which each is lit (n, frames)."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    lit: BoolArray
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return int(self.lit.shape[1])
+
+    @property
+    def extent_px(self) -> float:
+        """The longer side of the part of the screen that the dots stand on, monitor px."""
+        return float(max(np.ptp(self.x_px), np.ptp(self.y_px)))
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+
+def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
+    """Plan dots over the whole screen, about `dots_per_frame` lit in each frame. Raises InputError where that is impossible."""
+    count = dots_of_frames(frames, dots_per_frame)
+    lit = _codes(count, frames, rng)
+    x_px, y_px = _places(resolution_px, count)
+    return DotPlan(x_px, y_px, lit)
+
+
+def dots_of_frames(frames: int, dots_per_frame: int) -> int:
+    """How many dots there are where so many are lit in each of the frames. Raises InputError for too few frames."""
+    if frames < MIN_FRAMES:
+        raise InputError(f"--frames {frames}: the dots' codes need {MIN_FRAMES} frames or more")
+    return round(dots_per_frame * frames / _weight(frames))
+
+
+def _weight(frames: int) -> int:
+    return int(np.clip(round(LIT_SHARE * frames), MIN_LIT, MAX_LIT))
+
+
+def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
+    """Codes (count, frames) of one weight, as far apart as random search finds them. Raises InputError for too many."""
+    weight = _weight(frames)
+    tried = (_codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2))
+    lit = next((codes for codes in tried if codes is not None), None)
+    if lit is None:
+        raise InputError(
+            f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames or fewer --dots"
+        )
+    return lit
+
+
+@dataclass(frozen=True, slots=True)
+class SeenScreen:
+    """The part of a screen that a tracker sees: `monitor` and `tracker` map cam to their pixels.
+
+    `is_sure` says that this is known: by a fit, or by the figure of the step `orientation`. Else a wider part is taken.
+    `psf_sigma_px` is how wide the tracker sees a point: the window of a dot near the detector's edge would leave the image.
+    """
+
+    monitor: Camera
+    tracker: Camera
+    is_sure: bool
+    psf_sigma_px: float
+
+    @property
+    def tracker_px_a_monitor_px(self) -> float:
+        """Tracker pixels per monitor pixel, on the axis."""
+        return self.tracker.focal_length_px / self.monitor.focal_length_px
+
+    @property
+    def dot_sigma_px(self) -> float:
+        """The sigma of a dot in the tracker's image: the PSF's and a square's."""
+        return math.hypot(self.psf_sigma_px, DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12))
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much a monitor pixel is turned in the tracker's image, in the middle of what is seen. Raises InputError."""
+        low, high = self.box()
+        x_px, y_px = (low + high) / 2
+        rays = self.monitor.rays(np.array([x_px, x_px + 1]), np.array([y_px, y_px]))
+        u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
+        return math.degrees(math.atan2(v[1] - v[0], u[1] - u[0]))
+
+    def shows(self, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
+        """Whether a whole dot at monitor pixels (n,) is on the screen and in the tracker's field (n,)."""
+        width, height = self.monitor.resolution_px
+        on_screen = (x_px >= EDGE_PX) & (x_px <= width - 1 - EDGE_PX) & (y_px >= EDGE_PX) & (y_px <= height - 1 - EDGE_PX)
+        rays = self.monitor.rays(x_px, y_px)
+        u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
+        wide, high = self.tracker.resolution_px
+        margin_px = -UNSURE_SHARE * max(wide, high)
+        if self.is_sure:
+            # A dot whose window leaves the image has a biased centroid, and is dropped by who measures it.
+            half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
+            margin_px = max(half_dot_px + EDGE_PX, dot_centroids(self.dot_sigma_px).radius_px + 1)
+        with np.errstate(invalid="ignore"):
+            in_field = (u >= margin_px) & (u <= wide - 1 - margin_px) & (v >= margin_px) & (v <= high - 1 - margin_px)
+        return np.asarray(on_screen & in_field)
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """The lower and upper corner (2,) of the part of the screen that is seen, monitor px. Raises InputError for none."""
+        width, height = self.monitor.resolution_px
+        wide, high = self.tracker.resolution_px
+        reach = UNSURE_SHARE * max(wide, high)
+        along_x, along_y = (np.linspace(-reach, size - 1 + reach, GRID) for size in (wide, high))
+        u, v = (part.ravel() for part in np.meshgrid(along_x, along_y))
+        rays = self.tracker.rays(u, v)
+        of_field = np.stack(self.monitor.project(rays @ self.monitor.cam_to_image.T), axis=1)
+        screen_x, screen_y = (np.linspace(EDGE_PX, size - 1 - EDGE_PX, GRID) for size in (width, height))
+        of_screen = np.stack([part.ravel() for part in np.meshgrid(screen_x, screen_y)], axis=1)
+        places = np.concatenate([of_field[np.isfinite(of_field).all(axis=1)], of_screen])
+        seen = places[self.shows(*places.T)]
+        if not len(seen):
+            raise InputError(
+                "the tracker sees no place of the screen: look at [collimator] q_cam_to_mon, focal lengths and pixel pitches"
+            )
+        return seen.min(axis=0), seen.max(axis=0)
+
+
+def lit_for(seen: SeenScreen) -> int:
+    """How many dots of a frame the tracker can tell apart on the part of the screen that it sees, through its PSF."""
+    ratio = seen.tracker_px_a_monitor_px
+    apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px))
+    low, high = seen.box()
+    x, y = (part.ravel() for part in np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))))
+    area_px = float(np.prod(high - low)) * float(seen.shows(x, y).mean()) * ratio**2
+    return int(np.clip(area_px / apart_px**2, MIN_LIT_DOTS, MAX_LIT_DOTS))
+
+
+def plan_seen_dots(seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
+    """Plan dots over the part of the screen that the tracker sees. Raises InputError where that is impossible."""
+    count = dots_of_frames(frames, dots_per_frame)
+    if count < MIN_DOTS:
+        raise InputError(
+            f"--dots {dots_per_frame}: {frames} frames then hold {count} dots, and {MIN_DOTS} are needed; write more --dots or"
+            " --frames, or no --dots for as many as the field holds"
+        )
+    lit = _codes(count, frames, rng)
+    x_px, y_px = _seen_places(seen, count)
+    return DotPlan(x_px, y_px, lit[: len(x_px)])
+
+
+def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
+    """Whole pixels (n,) spread evenly over what is seen, the outermost first; at most `count`. Raises InputError for few."""
+    low, high = seen.box()
+    k = np.arange(TRIED * count)
+    unit = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
+    edge = np.linspace(0.0, 1.0, GRID)
+    rim = np.concatenate([np.column_stack(part) for part in ((edge, 0 * edge), (edge, 1 + 0 * edge))])
+    unit = np.concatenate([unit, rim, rim[:, ::-1]])
+    places = np.rint(low + unit * (high - low))
+    is_seen = seen.shows(*places.T)
+    inside = places[: len(k)][is_seen[: len(k)]]
+    turns = 2 * np.pi * (np.arange(BORDER_DIRECTIONS) + 0.5) / BORDER_DIRECTIONS
+    directions = np.column_stack([np.cos(turns), np.sin(turns)]) / np.maximum(high - low, 1.0)
+    outermost = places[is_seen][(places[is_seen] @ directions.T).argmax(axis=0)]
+    chosen = np.unique(outermost, axis=0)[:count]
+    # Two dots at nearly one place would be taken for one dot that blinks both codes.
+    area_px = float(np.prod(high - low)) * len(inside) / len(k)
+    apart_px = 0.5 * math.sqrt(area_px / count)
+    far = np.hypot(*(inside[:, None] - chosen[None]).transpose(2, 0, 1)).min(axis=1) > apart_px
+    chosen = np.concatenate([chosen, inside[far]])[:count]
+    if len(chosen) < MIN_DOTS:
+        raise InputError(
+            f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_DOTS} are needed:"
+            " a shorter [tracker] or a longer [collimator] focal length shows it more"
+        )
+    return chosen[:, 0], chosen[:, 1]
+
+
+def joined(first: DotPlan, second: DotPlan) -> DotPlan:
+    """One plan of two: the frames and the dots of the first, then those of the second."""
+    lit = np.zeros((len(first) + len(second), first.frames + second.frames), dtype=bool)
+    lit[: len(first), : first.frames] = first.lit
+    lit[len(first) :, first.frames :] = second.lit
+    return DotPlan(np.concatenate([first.x_px, second.x_px]), np.concatenate([first.y_px, second.y_px]), lit)
+
+
+def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.random.Generator) -> BoolArray | None:
+    codes = np.zeros((count, frames), dtype=bool)
+    load = np.zeros(frames)
+    for k in range(count):
+        for _ in range(TRIES):
+            # Frames with few dots so far are more likely to be chosen.
+            chosen = np.argsort(load + rng.uniform(0.0, 2.0 + k / frames, frames))[:weight]
+            code = np.zeros(frames, dtype=bool)
+            code[chosen] = True
+            if k == 0 or int((codes[:k] != code).sum(axis=1).min()) >= distance:
+                break
+        else:
+            return None
+        codes[k] = code
+        load[chosen] += 1
+    return codes
+
+
+def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, FloatArray]:
+    """Whole pixels spread evenly over the screen, its corners first, so that no corner is extrapolated."""
+    k = np.arange(max(count - 4, 0))
+    spread = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    unit = np.concatenate([corners, spread])[:count]
+    size = np.array(resolution_px) - 1 - 2 * EDGE_PX
+    if (size < 1).any():
+        raise InputError(f"a screen of {resolution_px[0]} x {resolution_px[1]} px is too small for dots")
+    places = np.rint(EDGE_PX + unit * size)
+    return places[:, 0], places[:, 1]
+
+
+def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int) -> npt.NDArray[np.uint16]:
+    """Code values (h, w) of a frame: each lit dot is a square of DOT_PX of `white` about its place."""
+    width, height = resolution_px
+    image = np.zeros((height, width), dtype=np.uint16)
+    for x, y in zip(plan.x_px[plan.lit[:, frame]].astype(int), plan.y_px[plan.lit[:, frame]].astype(int), strict=True):
+        image[y - DOT_PX // 2 :, x - DOT_PX // 2 :][:DOT_PX, :DOT_PX] = white
+    return image
+
+
+def write_plan(path: Path, plan: DotPlan) -> None:
+    """Write plan.csv, a row for each lit dot of each frame."""
+    places = np.stack([plan.x_px, plan.y_px], axis=1).astype(int).tolist()
+    lit = ((frame, dot) for frame in range(plan.frames) for dot in np.flatnonzero(plan.lit[:, frame]).tolist())
+    write_csv(path, PLAN_COLUMNS, ((frame, dot, *places[dot]) for frame, dot in lit))
+
+
+def read_plan(path: Path) -> DotPlan:
+    """Read plan.csv. Raises InputError with the line that is wrong."""
+    rows: list[tuple[int, int, float, float]] = []
+    for line, cells in read_rows(path, PLAN_COLUMNS, PLAN_ADVICE, MAX_PLAN_BYTES, ()):
+        try:
+            frame, dot, x, y = int(cells[0]), int(cells[1]), float(cells[2]), float(cells[3])
+            if min(frame, dot) < 0 or max(frame, dot) > 10**6:
+                raise ValueError
+        except ValueError as error:
+            wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
+            raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
+        rows.append((frame, dot, x, y))
+    if not rows:
+        raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
+    place = {dot: k for k, dot in enumerate(sorted({dot for _, dot, _, _ in rows}))}
+    x_px, y_px = np.full(len(place), np.nan), np.full(len(place), np.nan)
+    lit = np.zeros((len(place), max(frame for frame, *_ in rows) + 1), dtype=bool)
+    for frame, dot, x, y in rows:
+        k = place[dot]
+        if lit[k].any() and (x_px[k], y_px[k]) != (x, y):
+            raise InputError(f"{path}: dot {dot} is at two places; {PLAN_ADVICE}")
+        x_px[k], y_px[k], lit[k, frame] = x, y, True
+    if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
+        raise InputError(f"{path}: a dot's place is no number; {PLAN_ADVICE}")
+    return DotPlan(x_px, y_px, lit)
+
+
+log = logging.getLogger(__name__)
+
+
+def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowed: bool) -> int:
+    """Show each frame until space is pressed, or for `seconds`; q quits. Returns how many were shown.
+
+    Raises MachineError without a display or where that goes away, InputError for one that is not there.
+    """
+    # Here, for `calibrate dots` without --show draws nothing and starts without OpenGL.
+    from hilstar.display.render.backend import ScreenView
+    from hilstar.display.render.presenter import Presenter, level_texture, window_context
+    from hilstar.display.window.window import Window, WindowSettings
+    from hilstar.instruments.calibrate.plan import stays_until_key
+    from hilstar.server.bench.build import orientation_of
+
+    orientation = orientation_of(monitor)
+    screen_px = orientation.screen_px(monitor.resolution_px)
+    white = 2**monitor.bits - 1
+    triples = np.array([[0, 0, 0], [white, white, white]], dtype=np.uint16)
+    with Window(WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)) as window:
+        view = ScreenView(monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples)
+        context = window_context()
+        for frame in range(plan.frames):
+            levels = dot_image(plan, frame, monitor.resolution_px, 1).astype(np.uint8)
+            texture = level_texture(context, levels)
+            log.warning("frame %d of %d (frame_%03d)", frame + 1, plan.frames, frame)
+            if not stays_until_key(window, Presenter(texture, view), seconds):
+                return frame
+            texture.release()
+    return plan.frames

@@ -1,0 +1,187 @@
+"""Centroids of the dots by frame and pose, from a table or measured in the tracker's images."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.fits_headers import FitsImage, read_fits_image
+from hilstar.basics.image_files import ImageSizeError, is_fits, opened_picture
+from hilstar.basics.reading import read_bytes
+from hilstar.basics.text_tables import read_rows
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+
+MAX_OBSERVED_BYTES = 100_000_000
+MAX_ROWS = 1_000_000
+NEEDED = ("frame", "x_px", "y_px")
+COLUMNS = ("frame", "pose", "x_px", "y_px", "sigma_px")  # of `Observed`
+ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, sigma_px and pose"
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """Centroids in the tracker's image: frame, pose (0 by default) and place in tracker px, (n,) each.
+
+    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then. Nearer than `edge_px` to the
+    detector's edge no dot is measured: its window leaves the image.
+    """
+
+    frame: IntArray
+    pose: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    sigma_px: FloatArray
+    edge_px: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def at(self, chosen: IntArray) -> "Observed":
+        """The centroids at indices `chosen`."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
+
+    def joined(self, other: "Observed") -> "Observed":
+        """These centroids and others, of other frames."""
+        joined = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in COLUMNS}
+        return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
+
+
+def read_observed(path: Path) -> Observed:
+    """Read a table of centroids. Raises InputError with the line that is wrong."""
+    rows: list[tuple[float, ...]] = []
+    for line, cells in read_rows(path, NEEDED, ADVICE, MAX_OBSERVED_BYTES, ("sigma_px", "pose")):
+        try:
+            frame_number, x, y = int(cells[0]), float(cells[1]), float(cells[2])
+            sigma, pose_number = float(cells[3] or 1.0), int(cells[4] or 0)
+            finite = math.isfinite(x) and math.isfinite(y) and 0 < sigma < math.inf
+            if not (finite and 0 <= frame_number < 10**6 and 0 <= pose_number < 1000):
+                raise ValueError
+        except ValueError as error:
+            wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
+            raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
+        rows.append((frame_number, x, y, sigma, pose_number))
+        if len(rows) > MAX_ROWS:
+            raise InputError(f"{path}: more than {MAX_ROWS} centroids; write fewer frames")
+    if not rows:
+        raise InputError(f"{path}: has no centroid; {ADVICE}")
+    frame, x_px, y_px, sigma_px, pose = np.array(rows).T
+    return Observed(frame.astype(np.intp), pose.astype(np.intp), x_px, y_px, sigma_px)
+
+
+FITS_ENDINGS = (".fits", ".fit", ".fts")
+MAX_IMAGE_BYTES = 500_000_000
+SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
+FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
+THRESHOLD_SIGMA = 8.0
+# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter by 0.4 px in one of 1.5 px.
+MIN_WINDOW_SIGMA_PX = 1.5
+IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
+NUMBER = re.compile(r"(\d+)(?!.*\d)")
+POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
+
+
+def measure_images(
+    paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int], dot_sigma_px: float = MIN_WINDOW_SIGMA_PX
+) -> Observed:
+    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
+
+    The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0. Raises InputError for an
+    image that cannot be read, has another size than the tracker's, or is saturated.
+    """
+    paths_of = numbered(paths)
+    under = None if dark is None else read_image(dark, resolution_px)
+    settings = dot_centroids(dot_sigma_px)
+    places = [_centroids(path, resolution_px, under, settings) for path in paths_of.values()]
+    count = [len(x) for x, _ in places]
+    if not sum(count):
+        raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
+    frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True))
+    x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
+
+
+def dot_centroids(dot_sigma_px: float) -> CentroidSettings:
+    """How the places of dots of about `dot_sigma_px` in the tracker's image are measured."""
+    window_sigma_px = max(dot_sigma_px, MIN_WINDOW_SIGMA_PX)
+    return CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px)
+
+
+def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
+    """Images by frame and pose, as `measure_images` takes them from their names. Raises InputError."""
+    found: dict[tuple[int, int], Path] = {}
+    for path in paths:  # all names before the first image, which takes a second
+        number, pose_number = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
+        if number is None or int(number[1]) > 10**6:
+            raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
+        frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
+        if (frame, pose) in found:
+            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]}; {IMAGE_ADVICE}")
+        found[frame, pose] = path
+    return found
+
+
+def _centroids(
+    path: Path, resolution_px: tuple[int, int], under: FloatArray | None, settings: CentroidSettings
+) -> tuple[FloatArray, FloatArray]:
+    image = read_image(path, resolution_px)
+    top = float(image.max())
+    saturated = int((image == top).sum())
+    if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
+        raise InputError(f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker")
+    above = image if under is None else image - under
+    found = find_stars(above, settings, noisiest_background(above))
+    kept = ~found.at_edge
+    return found.x_px[kept], found.y_px[kept]
+
+
+def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE) -> FloatArray:
+    """A grey image (h, w) as float64, first row at the top, of this (width, height) if any. Raises InputError."""
+    return read_exposed(path, resolution_px, advice)[0]
+
+
+def read_exposed(
+    path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE
+) -> tuple[FloatArray, float | None]:
+    """A grey image as `read_image` gives it, and its exposure, s, where a FITS header says it. Raises InputError."""
+    data = read_bytes(path, advice, MAX_IMAGE_BYTES)
+    exposure_s = None
+    # A grabbing script may write FITS under any name.
+    if path.suffix.lower() in FITS_ENDINGS or is_fits(data):
+        fits_image = _fits(path, data, advice, resolution_px)
+        image, exposure_s = fits_image.pixels, fits_image.exposure_s
+    else:
+        image = _picture(path, data, advice, resolution_px)
+    if image.ndim != 2:
+        raise InputError(f"{path}: is no grey image of one plane; {advice}")
+    if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
+        sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(*image.shape, *resolution_px)
+        raise InputError(f"{path}: {sizes}; give whole images, or set the key")
+    return np.asarray(image, dtype=np.float64), exposure_s
+
+
+def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> FitsImage:
+    try:
+        return read_fits_image(data, size_px)
+    except (ImageSizeError, InputError) as error:
+        raise InputError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
+
+
+def _picture(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:
+    from PIL import Image
+
+    try:
+        with opened_picture(data, size_px) as picture:
+            return np.asarray(picture)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: cannot be read as a picture ({error}); {advice}") from error

@@ -1,0 +1,248 @@
+"""Warm-up: from readings of white against time, when white is stable to 0.2 %, and the drift that remains.
+
+White is stable at a time t when it changes by less than 0.2 % in the ten minutes after t. That change is taken from the law
+that explains the readings best (Akaike's criterion), fitted by least squares:
+
+    line          white = w + s t
+    exponential   white = w + a exp(-t / tau)
+
+Where neither explains them (a step, a second time constant at the start), the first eighth of the readings is left out, then
+the second, and so on. A law is refused where successive residuals are alike (von Neumann 1941) or one of them jumps.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import stdtrit
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import MAD_TO_SIGMA, NS_PER_S
+
+STABLE = 2e-3  # relative change of white
+AHEAD_S = 600.0  # in which white may not change by more
+EVERY_S, LONGEST_S = 10.0, 1800.0
+MIN_READINGS, PARTS = 12, 8
+ALIKE_SIGMAS, JUMP_SIGMAS = 3.0, 6.0  # beyond which a law is refused
+CONFIDENCE = 0.975  # one-sided bound: both sides together leave 5 %
+FLOOR = 1e-6  # relative: an instrument's rounding, below which residuals say nothing
+LIKELY = 6.0  # Akaike's criterion above the best law's: one in twenty as likely
+TAUS, MAX_TAU = 12, 3.0  # time constants that are tried, from a step between readings to 3 times their span
+END_SHARE = 0.01  # of the step between two time constants: nearer to the last one is at the end
+S_PER_H = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUp:
+    """When white is stable, and how it drifts at the last reading, relative to white there; errors are standard errors.
+
+    `stable_after_s` is on the clock of the readings: infinite where the law never is stable, after the last reading where
+    it will be. `ahead` is the relative change in the next ten minutes; `is_stable` says that it is within `limit` at 95 %.
+    `law` explains the readings from `from_s` on; it is "none" where no law does, and then the figures are not known (nan).
+    """
+
+    law: str
+    is_stable: bool
+    limit: float
+    stable_after_s: float = math.inf
+    stable_after_error_s: float = math.nan
+    drift_percent_per_h: float = math.nan
+    drift_error_percent_per_h: float = math.nan
+    ahead: float = math.nan
+    ahead_error: float = math.nan
+    tau_s: float = math.nan
+    noise: float = math.nan
+    dof: int = 0
+    from_s: float = 0.0
+
+    @property
+    def bound(self) -> float:
+        """The relative change in the next ten minutes that is not exceeded at 95 %; nan where no law is found."""
+        return abs(self.ahead) + float(stdtrit(self.dof, CONFIDENCE)) * self.ahead_error
+
+    @property
+    def line(self) -> str:
+        """The finding in a sentence."""
+        limit = f"{100 * self.limit:g} %"
+        if self.law == "none":
+            return f"white is not stable to {limit}: the last readings follow neither a line nor an exponential"
+        drift = f"it drifts by {self.drift_percent_per_h:+.2f} +- {self.drift_error_percent_per_h:.2f} %/h at the end"
+        after = f"{self.stable_after_s:.0f} +- {self.stable_after_error_s:.0f} s"
+        if self.is_stable:
+            first = f"from the first reading, at {self.from_s:.0f} s, on"
+            return f"white is stable to {limit} {first if self.stable_after_s <= self.from_s else f'after {after}'}; {drift}"
+        if self.law == "exponential":
+            return f"white is not yet stable to {limit}: by its exponential it is after {after}; {drift}"
+        return f"white is not shown to be stable to {limit}: {drift}"
+
+    @property
+    def cure(self) -> str:
+        """What to do where white is not stable."""
+        if self.law == "exponential" and math.isfinite(self.stable_after_s):
+            return "wait until then, and watch it again"
+        return "watch it for longer (--warm-up), and look at dynamic contrast, local dimming and stray light"
+
+
+@dataclass(frozen=True, slots=True)
+class _Law:
+    """A law's parameters (w, s) or (w, a, tau), their covariance, and relative residuals (n,).
+
+    `at_end` says that the time constant is at an end of those that are tried: the readings do not have it.
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    dof: int
+    at_end: bool = False
+
+    @property
+    def criterion(self) -> float:
+        return len(self.residual) * math.log(float(np.mean(self.residual**2)) + FLOOR**2) + 2 * len(self.parameters)
+
+    @property
+    def is_refused(self) -> bool:
+        if self.at_end:
+            return True
+        steps, n = np.diff(self.residual), len(self.residual)
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
+        ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (float(self.residual @ self.residual) / self.dof + FLOOR**2)
+        return ratio < 1 - ALIKE_SIGMAS / math.sqrt(n) or float(np.abs(steps).max()) > JUMP_SIGMAS * scatter + 10 * FLOOR
+
+    @property
+    def noise(self) -> float:
+        return math.sqrt(float(self.residual @ self.residual) / self.dof)
+
+    def died_away(self, at_s: float) -> bool:
+        """Whether an exponential is far below a reading's noise by a time."""
+        return len(self.parameters) == 3 and abs(self.parameters[1]) * math.exp(-at_s / self.parameters[2]) < self.noise / 3
+
+    def foretold(self, span_s: float, limit: float) -> tuple[list[float], list[float]]:
+        """At `span_s`: slope, 1/s, and change in the next ten minutes, relative; when white is stable, s; and their errors."""
+        at = self._figures(self.parameters, span_s, limit)
+        steps = 1e-4 * np.sqrt(np.diag(self.covariance))  # small where an error is: the figures are linear there
+        slopes = np.stack([(self._figures(self.parameters + step, span_s, limit) - at) / step.sum() for step in np.diag(steps)])
+        return at.tolist(), np.sqrt(np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)).tolist()
+
+    @staticmethod
+    def _figures(parameters: FloatArray, span_s: float, limit: float) -> FloatArray:
+        w, a, *rest = (float(value) for value in parameters)
+        if not rest:
+            slope = a / (w + a * span_s)
+            return np.array([slope, slope * AHEAD_S, 0.0])
+        falls, ends = -math.expm1(-AHEAD_S / rest[0]), a * math.exp(-span_s / rest[0])
+        white = w + ends
+        stable_s = rest[0] * math.log(max(abs(a) * falls / white, 1e-300) / limit)
+        return np.array([-ends / white / rest[0], -ends / white * falls, stable_s])
+
+
+def watch_white(
+    read: Callable[[], float], clock_ns: Callable[[], int], wait: Callable[[float], object], longest_s: float = LONGEST_S
+) -> tuple[FloatArray, FloatArray]:
+    """Times (n,), s from the first, and readings (n,) of white, every EVERY_S until it is stable or `longest_s` are over.
+
+    `wait` lets seconds pass. At least 12 readings are taken. Raises InputError for a reading without light.
+    """
+    t_s: list[float] = []
+    light: list[float] = []
+    first_ns = clock_ns()
+    while True:
+        begun_ns = clock_ns()
+        value = float(read())
+        ended_ns = clock_ns()
+        t_s.append(((begun_ns + ended_ns) / 2 - first_ns) / NS_PER_S)
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"white reads {value:g} after {t_s[-1]:.0f} s; look at what the instrument sees")
+        light.append(value)
+        over = (ended_ns - first_ns) / NS_PER_S + EVERY_S > longest_s
+        if len(light) >= MIN_READINGS and (over or judge_warm_up(np.array(t_s), np.array(light)).is_stable):
+            return np.array(t_s), np.array(light)
+        wait(max(EVERY_S - (ended_ns - begun_ns) / NS_PER_S, 1e-3))
+
+
+def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> WarmUp:
+    """When white is stable to `limit`, by readings (n,) at times (n,). Raises InputError for fewer than 12, or no readings."""
+    if len(light) < MIN_READINGS or not (np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()):
+        raise InputError(f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at rising times")
+    for first in (part * len(light) // PARTS for part in range(PARTS)):
+        if len(light) - first < MIN_READINGS:
+            break
+        laws = sorted((law for law in _laws(t_s[first:], light[first:]) if not law.is_refused), key=lambda law: law.criterion)
+        found = [_judged(law, t_s[first:], light[first:], limit) for law in laws if law.criterion < laws[0].criterion + LIKELY]
+        if found:  # white is stable only if it is by each law that is likely
+            return replace(found[0], is_stable=all(each.is_stable for each in found))
+    return WarmUp("none", False, limit)
+
+
+def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> WarmUp:
+    """The figures of a law of readings (n,) at `t_s` (n,)."""
+    span_s, half = float(t_s[-1] - t_s[0]), len(t_s) // 2
+    # An exponential that has died away says nothing of the drift: a line through the last half of the readings does.
+    end = _line(t_s[half:], light[half:]) if law.died_away(float(t_s[half] - t_s[0])) else law
+    (_, _, stable_s), (_, _, stable_error_s) = law.foretold(span_s, limit)
+    (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(span_s if end is law else 0.0, limit)
+    linear = len(law.parameters) == 2
+    stable_s = (0.0 if abs(ahead) < limit else math.inf) if linear else max(stable_s, 0.0)
+    return WarmUp(
+        law="line" if linear else "exponential",
+        is_stable=bool(abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error < limit),
+        limit=limit,
+        stable_after_s=float(t_s[0]) + stable_s,
+        stable_after_error_s=stable_error_s if stable_s else 0.0,
+        drift_percent_per_h=100 * S_PER_H * slope,
+        drift_error_percent_per_h=100 * S_PER_H * slope_error,
+        ahead=ahead,
+        ahead_error=ahead_error,
+        tau_s=math.nan if linear else float(law.parameters[2]),
+        noise=law.noise,
+        dof=end.dof,
+        from_s=float(t_s[0]),
+    )
+
+
+def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArray:
+    """White (n,) by the law that was found in these readings (n,), in their unit, for a chart; nan before `from_s`."""
+    drawn, used = np.full(len(t_s), np.nan), t_s >= found.from_s
+    if found.law != "none":
+        law = _laws(t_s[used], light[used])[found.law == "exponential"]
+        drawn[used] = light[used] - float(np.median(light[used])) * law.residual
+    return drawn
+
+
+def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
+    """The line and the exponential that fit readings (n,) best."""
+    time, value = t_s - t_s[0], light / np.median(light)
+
+    def misfit(log_tau: float) -> float:
+        residual = _law(time, value, math.exp(log_tau)).residual
+        return float(residual @ residual)
+
+    tried = np.linspace(math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS)
+    best = int(np.argmin([misfit(each) for each in tried]))
+    bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
+    log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    margin = END_SHARE * (tried[1] - tried[0])
+    at_end = not tried[0] + margin < log_tau < tried[-1] - margin
+    return _line(t_s, light), replace(_law(time, value, math.exp(log_tau)), at_end=at_end)
+
+
+def _line(t_s: FloatArray, light: FloatArray) -> _Law:
+    return _law(t_s - t_s[0], light / np.median(light))
+
+
+def _law(time: FloatArray, value: FloatArray, tau: float | None = None) -> _Law:
+    """Least squares at times (n,) from 0 on: a line, or an exponential of a time constant."""
+    shape = time if tau is None else np.exp(-time / tau)
+    columns = np.stack([np.ones_like(time), shape], axis=1)
+    found = np.linalg.lstsq(columns, value, rcond=None)[0]
+    residual = value - columns @ found
+    if tau is not None:
+        columns = np.column_stack([columns, found[1] * shape * time / tau**2])
+        found = np.append(found, tau)
+    dof, size = len(value) - columns.shape[1], np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    scaled = columns / size
+    noise2 = float(residual @ residual) / dof + FLOOR**2
+    return _Law(found, noise2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(size, size), residual, dof)

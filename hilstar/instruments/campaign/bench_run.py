@@ -1,0 +1,425 @@
+"""A campaign before the real tracker (`through = "bench"`): the display shows each case, and `[answers]` says what it answered.
+
+One process and one frame loop, which never waits for the tracker. Laws:
+
+1. The order of the cases is drawn from the seed. Those that need another renderer stand together. A check case, always the same
+   attitude, comes before each `check_every` of them and at the end.
+2. A case has its row once it is over, and not before: one that a kill interrupts is shown again, in its place in the order.
+3. An answer belongs to a case whose frames alone were lit over its exposure. Until a case's first right answer, one that
+   fits the case before better than this one is late, and counts for neither.
+4. A tracker that falls silent within a case is waited for, up to `silent_s` after its last message. The case then begins again.
+"""
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import write_csv
+from hilstar.basics.errors import MachineError
+from hilstar.basics.files import write_whole
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.interrupts import stop_on_signal
+from hilstar.basics.units import NS_PER_S
+from hilstar.instruments.campaign.cases import AXES, Case, CaseMaker, Q, first_row, spread_row
+from hilstar.instruments.campaign.plan import SCENARIO, Design, Plan
+from hilstar.instruments.campaign.store import Directory, Journal, Row
+from hilstar.optics.layers.fault_kinds import Now as FaultNow
+from hilstar.optics.layers.view import View
+from hilstar.server.answers.answer import Answer, AnswerSource
+from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged
+from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.fault_views import display_view
+from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.scenario import Timetable
+from hilstar.server.loop import FaultyFrames, FrameLoop, Limit
+from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
+from hilstar.server.screen.screen import DisplayPacer, Screen
+from hilstar.server.serve import Follower, Running
+
+ORDER_STREAM = 4  # stream of a plan's seed for the order of its cases
+BRIGHTEST = 5  # reported stars whose light is a case's signal
+MAX_SILENCE_S = 1.0  # at the end of a case: a tracker that said nothing for longer is silent
+NO_ANSWER = "no-answer"
+RUNS, NOW, CHECKS = "runs.csv", "now.json", "checks.csv"
+CHECK_COLUMNS = ("check", "begun_utc", "run", "answers", *(f"error_{axis}_arcsec" for axis in AXES), "signal_mag")
+
+
+class OpenDisplay(NamedTuple):
+    """An open bench with its screen (None: headless), a sink for its frames, and who follows the run."""
+
+    bench: Bench
+    screen: Screen | None = None
+    sink: FrameSink = ignore
+    follower: Follower = lambda running: None
+
+
+Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
+
+
+class BenchOrder:
+    """The order in which cases (and, from `cases` on, check cases) are shown; `keys` are the varied keys of the renderer."""
+
+    def __init__(self, plan: Plan, cases: int, maker: CaseMaker, design: Design) -> None:
+        self.plan, self.maker, self.cases = plan, maker, cases
+        self._design, self._every = design, plan.check_every
+        self._keys = [
+            key for key in (each.key for each in maker.parameters) if key.split(".")[0] in ("sky", "render", "spacecraft")
+        ]
+        self._keys += [SCENARIO] if any(each.key == SCENARIO for each in maker.parameters) else []
+        order = np.random.default_rng((plan.seed, ORDER_STREAM)).permutation(cases)
+        if self._keys:
+            group: dict[str, int] = {}
+            rank = np.array([group.setdefault(self.renderer(int(number)), len(group)) for number in order])
+            order = order[np.argsort(rank, kind="stable")]
+        self.order = order
+        self._at_rest = self.case(0).first
+
+    @property
+    def checks(self) -> int:
+        """How many check cases there are."""
+        return -(-self.cases // self._every) + 1 if self._every else 0
+
+    def case(self, number: int) -> Case:
+        """The case of a number; a check case is the attitude of case 0, at rest."""
+        if number < self.cases:
+            return self.maker.case(number, self._design.points(number, number + 1)[0])
+        return Case(number, {}, 0, View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns))
+
+    def renderer(self, number: int) -> str:
+        """What a case's renderer depends on, as a text that is the same for all cases of one renderer."""
+        values = self.case(number).values
+        return msgspec.json.encode([values.get(key) for key in self._keys]).decode() if self._keys else ""
+
+    def turns(self) -> Iterator[tuple[str, int, int]]:
+        """Renderer, number and place in the order of each case, check cases among them with the renderer of the next one."""
+        renderer = ""
+        for place, number in enumerate(self.order.tolist()):
+            renderer = self.renderer(number)
+            if self._every and place % self._every == 0:
+                yield renderer, self.cases + place // self._every, place
+            yield renderer, number, place
+        if self._every:
+            yield renderer, self.cases + self.checks - 1, self.cases
+
+
+@dataclass(slots=True)
+class Tally:
+    """A case on the display, and its answers so far; times are of the host, ns. `begun_ns` None: nothing is lit yet."""
+
+    case: Case
+    place: int
+    begun_ns: int | None = None
+    begun_utc: str = ""
+    first_frame: int = 0
+    received: int = 0
+    late: int = 0
+    wrong: int = 0
+    worst_deg: float | None = None
+    first_attitude_s: float | None = None
+    recovery_s: float | None = None
+    fault_end_s: float | None = None
+    answered: Judged | None = None
+    errors: list[FloatArray] = field(default_factory=list)
+    stars: list[int] = field(default_factory=list)
+    signals: list[float] = field(default_factory=list)
+
+    def take(self, judged: Judged, right: bool) -> None:
+        """Take an answer into the case's figures."""
+        self.received += 1
+        if judged.residual is None:
+            return
+        if right:
+            self.errors.append(judged.residual)
+        else:
+            self.wrong += 1
+            self.worst_deg = max(self.worst_deg or 0.0, float(np.linalg.norm(judged.residual)) / 3600)
+        self.answered = self.answered or judged
+        if judged.answer.star_count is not None:
+            self.stars.append(judged.answer.star_count)
+        light = sorted(star.dn for star in judged.answer.centroids if star.dn is not None and star.dn > 0)[-BRIGHTEST:]
+        if light:
+            self.signals.append(-2.5 * math.log10(sum(light)))
+
+
+class BenchRun:
+    """Shows the missing cases of a campaign, and keeps the row of each. Raises InputError and MachineError."""
+
+    def __init__(
+        self,
+        order: BenchOrder,
+        columns: dict[str, Any],
+        directory: Directory,
+        *,
+        source: AnswerSource,
+        rules: AnswerRules,
+        notices: Notices,
+        on_done: Callable[[int], None],
+    ) -> None:
+        self.journal: Journal = directory.journal(order.cases + order.checks)
+        self._order, self._plan, self._maker, self._columns = order, order.plan, order.maker, columns
+        self._source, self._rules, self._notices, self._on_done = source, rules, notices, on_done
+        self._done = self.journal.done
+        self._now_path, runs = directory.path / NOW, directory.path / RUNS
+        begun = runs.read_text().splitlines()[1:] if runs.exists() else []
+        self._run = len(begun) + 1
+        starts: list[list[Any]] = [*(line.split(",") for line in begun), [self._run, f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"]]
+        write_csv(runs, ("run", "begun_utc"), starts)
+        self._base = self._next = 0  # frame numbers go on from one renderer to the next
+        self._frames: LitFrames | None = None
+        self._judge: AnswerJudge | None = None
+        self._heard_ns: int | None = None
+        self._refused = 0
+        self._waiting = False
+        self._before_q: FloatArray | None = None
+        self._shown_q: FloatArray | None = None
+        self._turns: list[tuple[int, int]] = []
+        self._now: Tally | None = None
+        self._dark_until_ns = 0
+        self._file_sha256 = ""
+        self._light_ns = self._last_row_ns = 0  # from a swap to the light of the middle row, and from there to the last one
+
+    def run(self, display: Display) -> bool:
+        """Show the missing cases, each renderer's on a display of its own; False where a signal ended the run first."""
+        self._on_done(self._done)
+        missing = {number for block in range(self.journal.blocks) for number in self.journal.missing(block)}
+        for _, group in groupby((turn for turn in self._order.turns() if turn[1] in missing), lambda turn: turn[0]):
+            turns = [(number, place) for _, number, place in group]
+            first = next((number for number, _ in turns if number < self._order.cases), 0)
+            with display(self._maker.bench(self._order.case(first))) as opened:
+                if not self.show(turns, opened):
+                    return False
+        self._now_path.unlink(missing_ok=True)
+        return True
+
+    def _keep(self, row: Row) -> None:
+        self._done += self.journal.append([row])
+        self._on_done(self._done)
+
+    def show(self, turns: list[tuple[int, int]], opened: OpenDisplay) -> bool:
+        """Show cases (number, place) that have one renderer; whether all of them are over, and no signal ended the run."""
+        bench, screen = opened.bench, opened.screen
+        period_ns = NS_PER_S / bench.config.monitor.refresh_hz
+        if self._frames is None:
+            self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
+            self._judge = AnswerJudge(self._rules, self._frames)
+        self._base = self._next
+        self._light_ns, self._file_sha256 = 0 if screen is None else screen.swap_to_light_ns, bench.file.sha256
+        self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
+        pacer = Pacer(period_ns) if screen is None else DisplayPacer(screen, self._notices)
+        faults = self._faults(bench, turns)
+
+        def sink(shown: Shown) -> None:
+            self._lit(shown)
+            opened.sink(shown)
+
+        loop = FrameLoop(bench, sink, pacer, None, self._notices, faults)
+        opened.follower(Running(loop, PacketCounts()))
+        self._turns, over = list(reversed(turns)), False
+
+        def draw_slot(moment: Moment) -> Shown | None:
+            nonlocal over
+            now_ns = loop.pacer.clock.now_ns()
+            self._listen(now_ns)
+            if self._now is None and now_ns >= self._dark_until_ns:
+                if not self._turns:
+                    over = True
+                    loop.stop.set()
+                else:
+                    self._begin(*self._turns.pop())
+            light_ns = moment.light_if_begun_at(now_ns)
+            view = self._view(light_ns)
+            if view is None:
+                return loop.draw(moment.slot, 0, None, moment)
+            attitude = Attitude(view.q_icrs_to_cam, 0, False, rate_cam_rad_s=view.turn.rate_cam_rad_s)
+            return loop.draw(moment.slot, view.t_ns or 0, attitude, moment)
+
+        with stop_on_signal(loop.stop), loop.watch:
+            bench.warm_up()
+            loop.paced(Limit(), draw_slot)
+        if screen is not None and screen.window.gone is not None:
+            raise MachineError(f"the run ended early: {screen.window.gone}")
+        return over
+
+    def _faults(self, bench: Bench, turns: list[tuple[int, int]]) -> FaultyFrames | None:
+        """The faults of the scenario that all of these cases have."""
+        scenario = next((s for number, _ in turns if (s := self._maker.scenario(self._order.case(number))) is not None), None)
+        if scenario is None:
+            return None
+        view = display_view(bench, scenario)
+        timetable = Timetable(scenario, view.prepare, bench.config.tracker.exposure_s)
+
+        def on(t_ns: int) -> tuple[FaultNow, ...]:
+            is_case = self._now is not None and self._now.case.number < self._order.cases
+            return timetable.on(t_ns - self._maker.begin_ns) if is_case else ()
+
+        return FaultyFrames(on, view)
+
+    def _begin(self, number: int, place: int) -> None:
+        case = self._order.case(number)
+        end_s = self._maker.fault_end_s(case, self._plan.limit_s) if number < self._order.cases else None
+        self._now = Tally(case, place, fault_end_s=end_s)
+        self._waiting = False
+
+    def _view(self, light_ns: int) -> View | None:
+        """What a frame shows whose light leaves at a host time; None for a dark one."""
+        now = self._now
+        if now is None:
+            return None
+        elapsed_ns = 0 if now.begun_ns is None else max(light_ns - now.begun_ns, 0)
+        return (
+            now.case.first
+            if now.case.number >= self._order.cases
+            else self._maker.after(now.case, elapsed_ns, self._rules.exposure_s)
+        )
+
+    def _lit(self, shown: Shown) -> None:
+        """Take a frame that was shown."""
+        assert self._frames is not None
+        attitude, on_screen, now = shown.attitude, shown.on_screen, self._now
+        seen = attitude is not None and not on_screen.operator and not on_screen.hidden
+        host_ns = shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
+        q = attitude.q_icrs_to_cam if attitude is not None and seen else None
+        number = self._base + shown.number
+        self._next = number + 1
+        self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
+        self._shown_q = q if q is not None else self._shown_q
+        if now is not None and now.begun_ns is None and not on_screen.operator and not on_screen.hidden:
+            now.begun_ns, now.first_frame = host_ns, number
+            now.begun_utc = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
+            first = now.case.first
+            told = {"case": now.case.number, "order": now.place, "q_icrs_to_cam": first.q_icrs_to_cam.tolist()}
+            rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
+            told |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
+            write_whole(self._now_path, msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}))
+
+    def _listen(self, now_ns: int) -> None:
+        """Take the answers that have come, and end the case that has enough of them or whose time is over."""
+        assert self._judge is not None
+        self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
+        refused = sum(self._source.refusals().values())
+        answers = self._source.take()
+        if answers or refused != self._refused:
+            self._heard_ns, self._refused = now_ns, refused
+            if self._waiting and self._now is not None:  # the tracker is back: its case begins again
+                self._notices.tell("tracker-back", f"the tracker answers again; case {self._now.case.number} begins again")
+                self._begin(self._now.case.number, self._now.place)
+        for answer in answers:
+            self._count(self._judge.judge(answer), answer)
+        now, plan = self._now, self._plan
+        if now is None or now.begun_ns is None:
+            return
+        if now.received < plan.asked:
+            if now_ns - now.begun_ns < plan.limit_s * NS_PER_S:
+                return
+            silent_s = (now_ns - self._heard_ns) / NS_PER_S
+            if min(MAX_SILENCE_S, plan.limit_s / 2) < silent_s < plan.silent_s:
+                if not self._waiting:
+                    self._notices.tell("tracker-silent", f"the tracker is silent: waited for, up to {plan.silent_s:g} s")
+                self._waiting = True
+                return
+        self._keep(self._row(now))
+        self._before_q, self._now, self._waiting = self._shown_q, None, False
+        self._dark_until_ns = now_ns + round(plan.blank_s * NS_PER_S)
+
+    def _count(self, judged: Judged, answer: Answer) -> None:
+        """Count an answer for the case on the display, if it is of that case."""
+        now, plan = self._now, self._plan
+        if now is None or now.begun_ns is None or not self._is_of(now, judged, answer):
+            return
+        off = None if judged.residual is None else float(np.linalg.norm(judged.residual))
+        right = off is not None and off <= plan.wrong_above_arcsec
+        after_s = (answer.host_ns - now.begun_ns) / NS_PER_S
+        if right:
+            now.first_attitude_s = after_s if now.first_attitude_s is None else now.first_attitude_s
+            fault_end_s, seen_s = now.fault_end_s, (judged.middle_ns - now.begun_ns) / NS_PER_S
+            if fault_end_s is not None and now.recovery_s is None and seen_s >= fault_end_s:
+                now.recovery_s = after_s - fault_end_s
+        settled = now.received > 0 or off is not None if plan.settle_s is None else after_s >= plan.settle_s
+        if settled and now.received < plan.asked:
+            now.take(judged, right)
+
+    def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
+        """Whether an answer is of the case on the display; one of the case before that comes late is counted."""
+        half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
+        if judged.middle_ns - half_ns < (now.begun_ns or 0) + self._last_row_ns:
+            return False
+        if judged.lit is None or judged.residual is None or answer.q_icrs_to_cam is None:
+            return judged.verdict == "invalid"
+        if judged.lit.first < now.first_frame:
+            return False
+        if now.first_attitude_s is None and self._before_q is not None:
+            before = float(np.linalg.norm(residual_arcsec(answer.q_icrs_to_cam, self._before_q)))
+            if before <= self._plan.wrong_above_arcsec and before < float(np.linalg.norm(judged.residual)):
+                now.late += 1
+                return False
+        return True
+
+    def _row(self, now: Tally) -> Row:
+        row = first_row(now.case, self._columns) | {"order": now.place, "run": self._run, "begun_utc": now.begun_utc}
+        row |= {"bench_sha256": self._file_sha256, "frames": self._plan.asked, "received": now.received, "late": now.late}
+        row |= {"solved": len(now.errors) + now.wrong, "wrong": now.wrong, "wrong_deg": now.worst_deg}
+        row |= {"first_attitude_s": now.first_attitude_s}
+        if "recovery_s" in row:
+            row |= {"fault_end_s": now.fault_end_s, "recovery_s": now.recovery_s}
+        if now.answered is not None and now.answered.lit is not None and now.answered.answer.q_icrs_to_cam is not None:
+            row |= dict(zip((f"solved_{name}" for name in Q), now.answered.answer.q_icrs_to_cam.tolist(), strict=True))
+            row |= dict(zip((f"lit_{name}" for name in Q), now.answered.lit.q.tolist(), strict=True))
+        if now.stars:
+            row["stars"] = float(np.mean(now.stars))
+        if now.signals:
+            row["signal_mag"] = float(np.mean(now.signals))
+        if not row["solved"]:
+            silent = (self._heard_ns or 0) < (now.begun_ns or 0)
+            row |= {"status": NO_ANSWER, "why": "the tracker was silent" if silent else "the tracker had no attitude"}
+        return row | spread_row(now.errors)
+
+
+def write_checks(path: Path, rows: list[Row], cases: int) -> None:
+    """Write the check cases' rows as checks.csv."""
+    told = [(row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows]
+    write_csv(path, CHECK_COLUMNS, [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)])
+
+
+def drift_of(path: Path) -> dict[str, Any] | None:
+    """The bench's drift over a campaign, by straight lines through the check cases of checks.csv; None for fewer than two.
+
+    `arcsec` (about x, y, z, cam) and `mag` are last minus first along that line, with their standard errors (None: two checks).
+    """
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    at_s = np.array([datetime.fromisoformat(row["begun_utc"]).timestamp() for row in rows])
+    found = {name: _line(at_s, [float(row[name]) if row[name] else None for row in rows]) for name in CHECK_COLUMNS[4:]}
+    each = [line for axis in AXES if (line := found[f"error_{axis}_arcsec"]) is not None]
+    if len(each) < len(AXES):
+        return None
+    mag = found["signal_mag"] or (None, None)
+    arcsec = {"arcsec": [change for change, _ in each], "sigma_arcsec": [sigma for _, sigma in each]}
+    return {"checks": len(rows), **arcsec, "mag": mag[0], "sigma_mag": mag[1]}
+
+
+def _line(at_s: FloatArray, values: list[float | None]) -> tuple[float, float | None] | None:
+    """The change of values along a straight line from the first to the last time, and its standard error."""
+    known = np.array([value is not None for value in values])
+    if known.sum() < 2:
+        return None
+    t, y = at_s[known] - at_s[known].mean(), np.array([value for value in values if value is not None])
+    span, power = float(np.ptp(at_s)), float(t @ t)
+    if not power:
+        return None
+    slope = float(t @ y) / power
+    left = y - y.mean() - slope * t
+    sigma = math.sqrt(float(left @ left) / (len(y) - 2) / power) * span if len(y) > 2 else None
+    return slope * span, sigma

@@ -1,0 +1,379 @@
+"""A case: its attitude and bench file, from its number and its point in the design; and its row, from its answers."""
+
+import dataclasses
+import hashlib
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.logs.log_file import log_timeline, open_log
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import parse_toml
+from hilstar.basics.rotation import (
+    conjugate,
+    from_radec_roll_deg,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    propagate,
+    to_radec_roll_deg,
+    to_rotation_vector,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
+from hilstar.instruments.campaign.solvers import CentroidErrors, SolverAnswer
+from hilstar.instruments.campaign.store import Row
+from hilstar.instruments.simulate.batch import faulty_exposure, view_at
+from hilstar.instruments.simulate.simulator import Exposure, FaultyExposure, Simulator
+from hilstar.optics.layers.view import View
+from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
+from hilstar.server.bench.scenario import Scenario, read_scenario
+
+ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
+AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
+SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
+ON_BENCH = ("sky", "render", "spacecraft", "rate_deg_s", "time_s", "scenario")  # what varies on a real bench
+Kind = Literal["int64", "float64", "bool", "text"]
+
+DONE, FAILED = "done", "failed"
+AXES = ("x", "y", "z")
+
+Q = ("qw", "qx", "qy", "qz")
+TEXTS = {"status", "why", "bench_sha256", "image_sha256", "image", "begun_utc"}
+WHOLE = {"case", "noise_seed", "t_ns", "frames", "stars_in_view", "solved", "wrong"}
+WHOLE |= {"stars", "found", "matched", "false", "measured", "order", "run", "received", "late"}
+BEFORE = (
+    *("case", "status", "why", "noise_seed", "bench_sha256", "image_sha256", "image", "t_ns"),
+    *(*Q, "ra_deg", "dec_deg", "roll_deg"),
+)
+AFTER = (
+    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", "first_attitude_s", *(f"solved_{name}" for name in Q)),
+    *(f"{what}_{axis}_arcsec" for what in ("error", "scatter") for axis in AXES),
+)
+BENCH_BEFORE = ("case", "status", "why", "order", "run", "begun_utc", "bench_sha256", *BEFORE[BEFORE.index("t_ns") :])
+BENCH_AFTER = (
+    *("frames", "received", "late", "solved", "wrong", "wrong_deg", "first_attitude_s", "stars", "signal_mag"),
+    *(f"{what}_{name}" for what in ("solved", "lit") for name in Q),
+    *AFTER[AFTER.index("error_x_arcsec") :],
+)
+RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario
+CENTROIDS = (
+    *("stars", "found", "matched", "false", "measured"),
+    *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A case before its bench is made: its values by key, the seed of its noise, and the view of its first exposure."""
+
+    number: int
+    values: dict[str, Any]
+    noise_seed: int
+    first: View
+
+
+@dataclass(frozen=True, slots=True)
+class _Log:
+    timeline: Timeline
+    span_ns: tuple[int, int]
+    scale: str | None
+
+
+class CaseMaker:
+    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for a fault of the plan."""
+
+    def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
+        self.plan, self.file = plan, file
+        self._tables = parse_toml(file.path, file.text)
+        self._log = None if plan.attitudes.log is None else _read_log(folder / plan.attitudes.log, file)
+        if self._log is not None:
+            self.file = dated(file, self._log.scale, self._log.span_ns[0])
+        self.parameters: list[Parameter] = parameters(plan, file)
+        named = [str(name) for parameter in self.parameters if parameter.key == SCENARIO for name in parameter.values if name]
+        self._scenarios = {name: read_scenario(folder / name) for name in named}
+        _check_through(plan, self.parameters, file)
+
+    @property
+    def attitude_dimensions(self) -> int:
+        """How many of a point's coordinates, its first, set the attitude."""
+        return ATTITUDE_DIMENSIONS[self.plan.attitudes.kind]
+
+    def case(self, number: int, point: FloatArray) -> Case:
+        """The case of this number at a point (dimensions,) of the design."""
+        look, rest = point[: self.attitude_dimensions], point[self.attitude_dimensions :]
+        values = {parameter.key: parameter.value(float(u)) for parameter, u in zip(self.parameters, rest, strict=True)}
+        seed = values.get("noise_seed")
+        if seed is None:
+            state = np.random.SeedSequence((self.plan.seed, number)).generate_state(1, np.uint64)
+            seed = int(state[0]) >> 64 - SEED_BITS
+        return Case(number, values, int(seed), self._first(number, look, values))
+
+    def bench(self, case: Case) -> BenchFile:
+        """The bench file with the case's values. Raises InputError where they do not go together."""
+        file = changed_bench(self.file, self._tables, case.values)
+        if self._log is not None:
+            file = dated(file, self._log.scale, self._log.span_ns[0])
+        turn_arcsec = [float(case.values.get(f"misalignment_arcsec.{axis}", 0.0)) for axis in "xyz"]
+        return _misaligned(file, np.array(turn_arcsec)) if any(turn_arcsec) else file
+
+    def view(self, case: Case, frame: int, exposure_s: float) -> View:
+        """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along the log."""
+        return self.after(case, round(frame * self.plan.step_s * NS_PER_S), exposure_s)
+
+    def after(self, case: Case, step_ns: int, exposure_s: float = 0.0) -> View:
+        """The view so long after the case's begin."""
+        first = case.first
+        if self._log is not None and first.t_ns is not None:
+            t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
+            along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
+            if not any(key.startswith("rate_deg_s.") for key in case.values):
+                return along
+            return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
+        q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
+        return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
+
+    def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
+        """The faults of the case's scenario in an exposure, at the case's time or the log's since its beginning."""
+        scenario = self.scenario(case)
+        return None if scenario is None else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
+
+    @property
+    def begin_ns(self) -> int:
+        """The time of a case's view from which its scenario counts: 0, or the log's begin."""
+        return 0 if self._log is None else self._log.span_ns[0]
+
+    def scenario(self, case: Case) -> Scenario | None:
+        """The case's scenario."""
+        return self._scenarios.get(str(case.values.get(SCENARIO, "")))
+
+    def fault_end_s(self, case: Case, length_s: float) -> float | None:
+        """When the last fault of the case's scenario ends, after the case's begin; None outside its `length_s`."""
+        scenario = self.scenario(case)
+        if scenario is None:
+            return None
+        end_s = scenario.end_s - ((case.first.t_ns or 0) - self.begin_ns) / NS_PER_S
+        return end_s if 0 < end_s <= length_s else None
+
+    def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
+        rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
+        across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
+        if across:
+            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(0.0, 2 * math.pi)
+            rate_rad_s += across * np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+        if self._log is not None:
+            begin_ns, end_ns = self._log.span_ns
+            t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
+            return View.exposure(view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
+        t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
+        return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
+
+
+def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
+    """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): uniform over the sphere or the field's cap, and over the rolls."""
+    low_deg, high_deg = attitudes.roll_deg
+    roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
+    if attitudes.kind == "all-sky" or attitudes.radec_deg is None:
+        return from_radec_roll_deg(360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg)
+    off = math.acos(1 - float(look[1]) * (1 - math.cos(math.radians(attitudes.radius_deg))))
+    angle = 2 * math.pi * float(look[0])
+    ra, dec = (math.radians(degrees) for degrees in attitudes.radec_deg)
+    east = np.array([-math.sin(ra), math.cos(ra), 0.0])
+    north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
+    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    x, y, z = math.cos(off) * middle + math.sin(off) * (math.sin(angle) * east + math.cos(angle) * north)
+    return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg)
+
+
+def _read_log(path: Path, file: BenchFile) -> _Log:
+    read = open_log(path, stated_in(file.config))
+    max_rate_rad_s = math.radians(file.config.attitude.max_rate_deg_s)
+    timeline = log_timeline(read.samples, Policy(0, NS_PER_S, max_rate_rad_s))
+    return _Log(timeline, (read.samples[0].t_ns, read.samples[-1].t_ns), read.conventions.scale)
+
+
+def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
+    """The file with the display's true mounting turned from the assumed one by small angles (3,) about cam's axes."""
+    config = file.config
+    assumed = np.array(config.verify.true_q_cam_to_mon or config.collimator.q_cam_to_mon)
+    true = normalise(multiply(assumed, from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD)))
+    w, x, y, z = true.tolist()
+    verify = msgspec.structs.replace(config.verify, true_q_cam_to_mon=(w, x, y, z))
+    return dataclasses.replace(file, config=msgspec.structs.replace(config, verify=verify))
+
+
+def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
+    """Refuse (InputError) parameters that would change nothing."""
+    for parameter in varied:
+        table = parameter.key.split(".")[0]
+        if plan.through == "bench" and table not in ON_BENCH:
+            raise InputError(
+                f'[[vary]] key = "{parameter.key}": cannot be changed on a real bench; write a key of [sky], [render] or'
+                " [spacecraft], rate_deg_s.*, time_s or scenario, or leave it out"
+            )
+        if plan.through == "tracker" and table in {"monitor", "collimator", "render", "verify", "misalignment_arcsec"}:
+            raise InputError(
+                f'[[vary]] key = "{parameter.key}": changes nothing for through = "tracker", which sees no display; write'
+                ' through = "display", or leave it out'
+            )
+        if plan.attitudes.kind == "log" and parameter.key == "time_s":
+            raise InputError('[[vary]] key = "time_s": with a log the times are the log\'s; leave it out')
+        if plan.through == "display" and parameter.key == SCENARIO:
+            raise InputError('[[vary]] key = "scenario": faults are of through = "tracker"; write that')
+        if parameter.key == SCENARIO and not parameter.values:
+            raise InputError('[[vary]] key = "scenario": is a file; write values = ["faults.toml", ""]')
+        if table == "misalignment_arcsec" and (file.config.collimator.geometry or file.config.verify.true_geometry):
+            raise InputError(
+                f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own alignment counts; vary'
+                " verify.true_geometry over several files instead"
+            )
+
+
+def bench_columns(parameters: list[Parameter]) -> dict[str, Kind]:
+    """The columns of the rows of a campaign on the bench, in their order."""
+    names = columns(parameters, False)
+    varied = [name for name in names if name.startswith("vary.")]
+    kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {"stars": "float64"}
+    return kinds | {name: names[name] for name in (*varied, *RECOVERY) if name in names}
+
+
+def columns_kind(name: str) -> Kind:
+    """The kind of a column that is not varied."""
+    return "text" if name in TEXTS else "int64" if name in WHOLE else "float64"
+
+
+def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
+    """The columns of a campaign's rows, in their order."""
+    varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
+    found: dict[str, Kind] = {}
+    recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
+    for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
+        found[name] = varied.get(name) or columns_kind(name)
+    return found
+
+
+def value_kind(parameter: Parameter) -> Kind:
+    """The column type of a parameter's values."""
+    if not parameter.values:
+        return "int64" if parameter.whole else "float64"
+    kinds = {type(value) for value in parameter.values}
+    if kinds == {bool}:
+        return "bool"
+    if kinds == {int} and all(abs(value) < 2**63 for value in parameter.values):
+        return "int64"
+    return "float64" if kinds <= {int, float} else "text"
+
+
+def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
+    """The row of a case before its exposures: columns of results are None."""
+    row: Row = dict.fromkeys(plan_columns)
+    q = case.first.q_icrs_to_cam
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
+    row |= {"case": case.number, "status": DONE, "why": "", "noise_seed": case.noise_seed, "t_ns": case.first.t_ns}
+    row |= dict(zip(Q, q.tolist(), strict=True))
+    row |= {"ra_deg": ra_deg, "dec_deg": dec_deg, "roll_deg": roll_deg}
+    for key, value in case.values.items():
+        name = f"vary.{key}"
+        row[name] = str(value) if plan_columns[name] == "text" else value
+    return row
+
+
+def failed(row: Row, why: str) -> Row:
+    """The row of a case that failed."""
+    return row | {"status": FAILED, "why": why}
+
+
+def spread_row(errors_arcsec: list[FloatArray]) -> Row:
+    """The mean of a case's errors (3,), and their standard deviation where there are several."""
+    row: Row = {}
+    if errors_arcsec:
+        errors = np.array(errors_arcsec)
+        row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip(AXES, errors.mean(axis=0), strict=True)}
+        if len(errors) > 1:
+            scatter = errors.std(axis=0, ddof=1)
+            row |= {f"scatter_{axis}_arcsec": float(value) for axis, value in zip(AXES, scatter, strict=True)}
+    return row
+
+
+@dataclass(slots=True)
+class CaseTally:
+    """The exposures and answers of a case so far."""
+
+    with_centroids: bool
+    wrong_above_arcsec: float
+    fault_end_s: float | None = None
+    first_attitude_s: float | None = None
+    recovery_s: float | None = None
+    frames: int = 0
+    stars_in_view: int = 0
+    errors_arcsec: list[FloatArray] = field(default_factory=list)
+    why: str = ""
+    star_errors: list[CentroidErrors] = field(default_factory=list)
+    wrong: int = 0
+    first_q: FloatArray | None = None
+    _digest: Any = field(default_factory=hashlib.sha256)
+
+    def see(self, exposure: Exposure) -> None:
+        """Count an exposure."""
+        self.frames += 1
+        self.stars_in_view += len(exposure.truth)
+        self._digest.update(np.ascontiguousarray(exposure.dn))
+
+    def hear(self, exposure: Exposure, answer: SolverAnswer, end_s: float) -> None:
+        """Count the answer to an exposure that ends so long after the case's begin."""
+        if answer.star_errors is not None:
+            self.star_errors.append(answer.star_errors)
+        if answer.q_icrs_to_cam is None:
+            self.why = self.why or answer.why
+            return
+        error = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
+        if self.frames == 1:
+            self.first_q = answer.q_icrs_to_cam
+        if np.linalg.norm(error) > self.wrong_above_arcsec:
+            self.wrong += 1
+        else:
+            self.errors_arcsec.append(error)
+            self.first_attitude_s = end_s if self.first_attitude_s is None else self.first_attitude_s
+            if (
+                self.fault_end_s is not None
+                and self.recovery_s is None
+                and end_s - exposure.view.exposure_s / 2 >= self.fault_end_s
+            ):
+                self.recovery_s = end_s - self.fault_end_s
+
+    def into(self, row: Row) -> Row:
+        """The case's row with its results. Errors are those of answers that are not wrong."""
+        row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
+        row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
+        row["first_attitude_s"] = self.first_attitude_s
+        if "recovery_s" in row:
+            row |= {"fault_end_s": self.fault_end_s, "recovery_s": self.recovery_s}
+        if self.first_q is not None:
+            row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
+        row |= spread_row(self.errors_arcsec)
+        return row | self._centroids() if self.with_centroids and self.star_errors else row
+
+    def _centroids(self) -> Row:
+        dx_px, dy_px = (np.concatenate([getattr(seen, name) for seen in self.star_errors]) for name in ("dx_px", "dy_px"))
+        v_mag = np.concatenate([seen.v_mag for seen in self.star_errors])
+        row: Row = {
+            name: sum(getattr(seen, name) for seen in self.star_errors) for name in ("stars", "found", "matched", "false")
+        }
+        row["measured"] = len(dx_px)
+        if len(dx_px):
+            row |= {"centroid_dx_px": float(dx_px.mean()), "centroid_dy_px": float(dy_px.mean())}
+            row["limit_v_mag"] = float(v_mag.max())
+        if len(dx_px) > 1:
+            row |= {"centroid_sigma_x_px": float(dx_px.std(ddof=1)), "centroid_sigma_y_px": float(dy_px.std(ddof=1))}
+        return row
+
+
+def attitude_error_arcsec(q_commanded: FloatArray, q_reported: FloatArray) -> FloatArray:
+    """The rotation vector (3,), arcsec, cam axes, from the commanded to the reported attitude."""
+    return to_rotation_vector(multiply(q_reported, conjugate(q_commanded))) * ARCSEC_PER_RAD

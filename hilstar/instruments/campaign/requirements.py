@@ -1,0 +1,355 @@
+"""Requirements of a plan against its cases: for each a figure, the bound that the cases support, and a verdict.
+
+Each figure has a one-sided limit on either side at the requirement's confidence c. A maximum is **met** where the upper limit
+is within it, **not met** where the lower one exceeds it, else **not shown**; a minimum the other way round. The limits:
+
+- rates by Clopper & Pearson (1934). Answers of one case go together, so their number is divided by the design effect, the
+  variance between cases over the binomial one (Korn & Graubard 1998); where all or none are right, cases are counted;
+- quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case that never had an attitude
+  has an infinite time;
+- a bias by Student's t, across the boresight the larger of x and y;
+- a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap over blocks of cases;
+- field-of-view and pixel error by the bootstrap. What the noise alone could hide is added to their upper limit.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.instruments.assess.budget import Decomposed, assess_cases
+from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.plan import Require, checked_conditions
+from hilstar.instruments.campaign.results import MAX_FITTED_CASES, Columns, attitudes_of
+
+AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
+COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
+    **{"<=": operator.le, "<": operator.lt, ">=": operator.ge, ">": operator.gt, "==": operator.eq, "!=": operator.ne}
+}
+MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown"
+TIME_SHARE = 0.95  # a time's share where `share` is not given
+MAX_BLOCKS, DRAWS = 200, 1000  # the bootstrap's
+MIN_TESTED, GAUSSIAN_P = 20, 0.01  # values, and the probability below which they are not Gaussian
+MAX_MORE = 10_000_000  # cases: more are not worth a figure
+WAVE_COLUMNS = 2 * len(HARMONICS)
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementVerdict:
+    """A requirement's verdict. `value` is the figure itself, None where it is not known, and `more` the cases still wanted."""
+
+    require: Require
+    cases: int
+    value: float | None
+    bound: float | None
+    verdict: str
+    more: int | None
+    method: str
+
+    @property
+    def words(self) -> str:
+        """The verdict in a line."""
+        require = self.require
+        said = f"{require.words}: {self.verdict}"
+        if self.bound is not None and self.value is not None:
+            side = "not more" if (self.verdict == NOT_MET) == (require.minimum is not None) else "not less"
+            said += f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at {100 * require.confidence:g} %"
+        if self.verdict == NOT_SHOWN:
+            said += f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
+        return said
+
+
+@dataclass(frozen=True, slots=True)
+class _Figure:
+    """A figure with its one-sided limits; `rate` (count, of) is what decides how many cases are wanted."""
+
+    value: float
+    low: float
+    high: float
+    cases: int
+    method: str
+    rate: tuple[float, float] | None = None
+
+
+class _TooFew(Exception):
+    """Why a figure is not known, with how many more cases could give it (None: cases alone cannot)."""
+
+    def __init__(self, why: str, cases: int, more: int | None = None) -> None:
+        super().__init__(why)
+        self.cases, self.more = cases, more
+
+
+def verdicts_of(
+    requires: list[Require], cases: Columns, scale: Scale, seed: int, bench_arcsec: tuple[float, float] | None = None
+) -> list[RequirementVerdict]:
+    """The verdict of each requirement over the cases. Raises InputError for a condition on a column that is not there.
+
+    `bench_arcsec` is how far the bench's own attitude may be off, across and about: it is taken off an error's limit.
+    """
+    cases = cases.some(np.arange(len(cases.numbers["frames"])) % -(-len(cases.numbers["frames"]) // MAX_FITTED_CASES) == 0)
+    decomposed: dict[str, Decomposed | InputError] = {}
+
+    def parts(condition: str, some: Columns) -> Decomposed:
+        if condition not in decomposed:
+            try:
+                decomposed[condition] = assess_cases(*attitudes_of(some), scale, np.random.default_rng(seed))
+            except InputError as error:
+                decomposed[condition] = error
+        found = decomposed[condition]
+        if isinstance(found, InputError):
+            answers = int(np.isfinite(some.numbers["error_x_arcsec"]).sum())
+            raise _TooFew(str(found), answers, max(30 - answers, 0) or None)
+        return found
+
+    found = []
+    for require in requires:
+        chosen = chosen_cases(require.condition, cases)
+        some = cases.some(chosen)
+        try:
+            figure = _figure(require, some, partial(parts, require.condition, some), np.random.default_rng(seed))
+        except _TooFew as few:
+            found.append(RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few)))
+            continue
+        found.append(_judged(require, figure, bench_arcsec))
+    return found
+
+
+def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
+    """Which cases (n,) meet a condition. Raises InputError for a key that is neither varied nor a column."""
+    kinds = dict.fromkeys(cases.numbers, "float64") | dict.fromkeys(cases.texts, "text")
+    chosen = np.ones(len(cases.numbers["frames"]), dtype=np.bool_)
+    for name, comparison, value in checked_conditions(condition, kinds):
+        column: Any = np.array(cases.texts[name], dtype=object) if name in cases.texts else cases.numbers[name]
+        chosen &= np.asarray(COMPARISONS[comparison](column, value), dtype=np.bool_)
+    return chosen
+
+
+def _judged(require: Require, figure: _Figure, bench_arcsec: tuple[float, float] | None) -> RequirementVerdict:
+    limit, maximum = require.limit, require.minimum is None
+    own = 0.0  # what of the error the bench could have made, or hidden
+    if bench_arcsec is not None and require.of_axis and maximum:
+        own = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
+        share = f"{100 * min(own / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
+        told = f"{own:.2g} arcsec taken off for the bench, which could have made {share} of it"
+        figure = replace(figure, method=f"{figure.method}; {told}")
+    met = figure.high <= limit - own if maximum else figure.low >= limit
+    missed = figure.low > limit + own if maximum else figure.high < limit
+    verdict = MET if met else NOT_MET if missed else NOT_SHOWN
+    bound = figure.high if maximum != missed else figure.low
+    more = _more(require, figure) if verdict == NOT_SHOWN else None
+    value = figure.value if math.isfinite(figure.value) else None
+    return RequirementVerdict(
+        require, figure.cases, value, bound if math.isfinite(bound) else None, verdict, more, figure.method
+    )
+
+
+def _more(require: Require, figure: _Figure) -> int | None:
+    """How many more cases would decide, if the figure stays as it is; None where no number of cases would."""
+    limit, maximum, c = require.limit, require.minimum is None, require.confidence
+    if figure.rate is not None:
+        count, of = figure.rate
+        share, allowed = count / of, limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require)
+
+        def decided(cases: int) -> bool:
+            n = cases * of / figure.cases
+            low, high = clopper_pearson(round(share * n), n, c)
+            return high <= allowed or low > allowed or (not maximum and (low >= allowed or high < allowed))
+
+        if share == allowed or not decided(MAX_MORE):
+            return None
+        few, enough = figure.cases, MAX_MORE  # by halves: a count's steps move the end by a case or two
+        while enough - few > 1:
+            middle = (few + enough) // 2
+            few, enough = (few, middle) if decided(middle) else (middle, enough)
+        return enough - figure.cases
+    away = abs(limit - figure.value)
+    width = figure.high - figure.value if limit > figure.value else figure.value - figure.low
+    if not away or not math.isfinite(width) or width <= 0:
+        return None
+    more = math.ceil(figure.cases * (width / away) ** 2) - figure.cases
+    return max(more, 1) if more <= MAX_MORE else None
+
+
+def _share(require: Require) -> float:
+    return TIME_SHARE if require.share is None else require.share
+
+
+def _figure(require: Require, cases: Columns, parts: Callable[[], Decomposed], rng: np.random.Generator) -> _Figure:
+    quantity, c = require.quantity, require.confidence
+    axes, count = AXIS_INDICES[require.axis or "cross"], len(cases.numbers["frames"])
+    if not count:
+        raise _TooFew("no case meets its condition", 0)
+    if quantity in ("availability", "wrong-rate"):
+        solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
+        asked = np.nan_to_num(cases.numbers["frames"])
+        return _rate(wrong, solved, c) if quantity == "wrong-rate" else _rate(solved - wrong, asked, c)
+    if quantity in ("time-to-first-attitude", "recovery"):
+        return _time(require, cases)
+    if quantity == "nea" and np.nansum(cases.numbers["frames"] > 1):
+        return _within(cases, axes, require, rng)
+    found = parts()
+    figure = _of_parts(found, axes, require, rng)
+    return replace(figure, method=f"{figure.method}; {len(found.wrong)} wild answers left out") if len(found.wrong) else figure
+
+
+def _of_parts(found: Decomposed, axes: list[int], require: Require, rng: np.random.Generator) -> _Figure:
+    """A figure of the error budget's parts."""
+    quantity, c = require.quantity, require.confidence
+    n, components = len(found.row), found.components
+    if quantity == "bias":
+        total = components.left + components.fov.fitted + components.pixel.fitted
+        return _bias(components.mean[axes], total[:, axes].std(axis=0, ddof=1), n, c)
+    if quantity in ("noise", "nea"):
+        freedom = n - 1 - components.fov.freedom - components.pixel.freedom
+        return _noise(components.left[:, axes] * math.sqrt(n / max(freedom, 1.0)), freedom, require, rng)
+    part = components.fov if quantity == "fov-error" else components.pixel
+    if part.reason:
+        raise _TooFew(part.reason, n)
+    return _repeating(part, components.noise_variance, axes, require, rng)
+
+
+def clopper_pearson(count: float, of: float, confidence: float) -> tuple[float, float]:
+    """The one-sided limits of a rate of which `count` in `of` were seen, each at this confidence."""
+    low = 0.0 if count <= 0 else float(stats.beta.ppf(1 - confidence, count, of - count + 1))
+    high = 1.0 if count >= of else float(stats.beta.ppf(confidence, count + 1, of - count))
+    return low, high
+
+
+def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
+    """The rate of hits (n,) among what was asked (n,) of each case."""
+    hits, asked = hits[asked > 0], asked[asked > 0]
+    cases, total = len(asked), float(asked.sum())
+    if not cases:
+        raise _TooFew("there is no answer", 0)
+    share, effective, method = float(hits.sum()) / total, total, "Clopper-Pearson"
+    if total > cases:
+        method += " of cases"
+        effective = float(cases)
+        if 0 < share < 1 and cases > 1:
+            between = cases / (cases - 1) * float(((hits - share * asked) ** 2).sum()) / total**2
+            effect = max(between / (share * (1 - share) / total), 1.0)
+            effective, method = max(total / effect, 1.0), f"Clopper-Pearson, design effect {effect:.3g}"
+    low, high = clopper_pearson(share * effective, effective, confidence)
+    return _Figure(share, low, high, cases, method, (share * effective, effective))
+
+
+def quantile_limits(values: FloatArray, share: float, confidence: float) -> tuple[float, float]:
+    """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite where there are too few."""
+    ordered, n = np.sort(values), len(values)
+    upper = int(stats.binom.ppf(confidence, n, share))  # the smallest k with P(count <= k) >= confidence
+    lower = int(stats.binom.ppf(1 - confidence, n, share))
+    lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
+    return float(ordered[lower - 1]) if lower > 0 else -math.inf, float(ordered[upper]) if upper < n else math.inf
+
+
+def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> _Figure:
+    share = _share(require)
+    low, high = quantile_limits(values, share, require.confidence)
+    ordered = np.sort(values)
+    value = float(ordered[min(math.ceil(share * len(values)), len(values)) - 1])
+    beyond = float((values > require.limit).sum())
+    return _Figure(value, max(low, 0.0), high, cases, method, (beyond, float(len(values))))
+
+
+def _time(require: Require, cases: Columns) -> _Figure:
+    numbers = cases.numbers
+    column, known = ("first_attitude_s", "frames") if require.quantity != "recovery" else ("recovery_s", "fault_end_s")
+    if column not in numbers or known not in numbers:
+        why = "the table has no such column: a plan that varies scenario has" if column == "recovery_s" else "no such column"
+        raise _TooFew(f"{column}: {why}", 0)
+    seen = np.isfinite(numbers[known])
+    if not seen.any():
+        raise _TooFew("no fault ended within a case", 0)
+    times = np.where(np.isfinite(numbers[column]), numbers[column], math.inf)[seen]
+    return _quantile(times, require, len(times), "order statistics")
+
+
+def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> _Figure:
+    standard, size = sigma / math.sqrt(n), np.abs(mean)
+    upper = stats.t.ppf(confidence, n - 1)
+    lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)  # Bonferroni: of several axes any one may be the larger
+    low = max(float((size - lower * standard).max()), 0.0)
+    return _Figure(float(size.max()), low, float((size + upper * standard).max()), n, "Student's t")
+
+
+def _sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[float, float]:
+    low, high = (variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence))
+    return math.sqrt(low), math.sqrt(high)
+
+
+def _noise(left: FloatArray, freedom: float, require: Require, rng: np.random.Generator) -> _Figure:
+    """The noise of errors (n, axes) that already have the spread of the noise itself."""
+    n, c = len(left), require.confidence
+    if require.share is not None:
+        return _quantile(np.abs(left).ravel(), require, n, "order statistics")
+    variance, freedom = float((left**2).mean()), max(freedom, 1.0)
+    # Few values cannot show that they are not Gaussian.
+    if n < MIN_TESTED or float(stats.kurtosistest(left.ravel()).pvalue) > GAUSSIAN_P:
+        low, high = _sigma_limits(variance, freedom * left.shape[1], c)
+        return _Figure(math.sqrt(variance), low, high, n, "chi-square, Gaussian")
+    low, high = np.sqrt(_drawn((left**2).mean(axis=1), np.ones(n), rng, c))
+    return _Figure(math.sqrt(variance), float(low), float(high), n, "bootstrap, not Gaussian")
+
+
+def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Generator) -> _Figure:
+    """The noise between the frames of a case, over all cases."""
+    scatter = cases.vectors("scatter_{}_arcsec", "xyz")[:, axes]
+    answers = cases.numbers["solved"] - cases.numbers["wrong"]
+    some = np.isfinite(scatter).all(axis=1) & (answers > 1)
+    if not some.any():
+        raise _TooFew("no case has two right answers", 0)
+    square, freedom = (scatter[some] ** 2).mean(axis=1), answers[some] - 1
+    variance, n, method = float(square @ freedom / freedom.sum()), int(some.sum()), "chi-square, Gaussian"
+    factor = 1.0 if require.share is None else float(stats.norm.ppf((1 + require.share) / 2))
+    excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
+    if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):  # 14: the variance of that square, one degree of freedom a case
+        low, high = _sigma_limits(variance, float(freedom.sum()) * len(axes), require.confidence)
+    else:
+        low, high = np.sqrt(_drawn(square * freedom, freedom, rng, require.confidence)).tolist()
+        method = "bootstrap, not Gaussian"
+    return _Figure(factor * math.sqrt(variance), factor * low, factor * high, n, method)
+
+
+def _drawn(sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float) -> FloatArray:
+    """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
+    blocks = min(MAX_BLOCKS, len(sums))
+    block = np.arange(len(sums)) * blocks // len(sums)
+    total, weight = (np.bincount(block, values, blocks) for values in (sums, weights))
+    drawn = rng.integers(0, blocks, (DRAWS, blocks))
+    ratio = total[drawn].sum(axis=1) / np.maximum(weight[drawn].sum(axis=1), 1e-300)
+    return np.asarray(np.quantile(ratio, [1 - confidence, confidence]))
+
+
+def _repeating(
+    part: Component, noise_variance: FloatArray, axes: list[int], require: Require, rng: np.random.Generator
+) -> _Figure:
+    n, c = len(part.fitted), require.confidence
+    noise, variance = float(noise_variance[axes].mean()), float(part.variance[axes].mean())
+    taken = part.freedom / n * noise
+    square = (part.fitted[:, axes] ** 2).mean(axis=1)
+    low, high = (max(each - taken, 0.0) for each in _drawn(square, np.ones(n), rng, c).tolist())
+    if part.freedom:  # the noise in the fit: its own power, and what it adds to that of the part
+        power = noise * (2 * part.freedom * noise / n + 4 * variance) / (n * len(axes))
+        hidden = float(stats.norm.ppf(c)) * math.sqrt(power)
+        method = "bootstrap over blocks of cases"
+    else:  # no waves were sure: as much power as they would have needed may be there
+        hidden = SURE_OF_MANY * math.sqrt(6 * WAVE_COLUMNS) / 3 * noise / n
+        method = "what the search for it would have missed"
+    low = max(variance - math.hypot(variance - min(low, variance), hidden), 0.0)
+    high = variance + math.hypot(max(high, variance) - variance, hidden)
+    factor = 1.0
+    if require.share is not None and variance > 0:
+        size = np.abs(part.fitted[:, axes]).ravel()
+        factor = float(np.quantile(size, require.share)) / math.sqrt(float((size**2).mean()))
+    elif require.share is not None:
+        factor = float(stats.norm.ppf((1 + require.share) / 2))
+    return _Figure(factor * math.sqrt(variance), factor * math.sqrt(low), factor * math.sqrt(high), n, method)

@@ -1,0 +1,160 @@
+"""The verdicts of a plan's requirements for their readers: requirements.csv, a chart, and one page that a person can sign."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, GREEN, INK, MUTED, ORANGE, RED, panels_of, png, svg, write_csv
+from hilstar.basics.files import write_whole
+from hilstar.basics.html_pages import Markup, escaped, page_of, picture_of, table_of
+from hilstar.basics.version import __version__
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.plan import CONDITION, Plan
+from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN, RequirementVerdict, verdicts_of
+from hilstar.instruments.campaign.results import VARY, Columns, read_cases
+from hilstar.instruments.campaign.store import file_sha256
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.certificate import bench_certificate, off_by
+
+COLUMNS = ("quantity", "axis", "condition", "limit", "bound", "confidence", "cases", "verdict")
+COLOURS = {MET: GREEN, NOT_MET: RED, NOT_SHOWN: ORANGE}
+DRAWN = ("noise", "nea", "fov-error", "pixel-error")  # one sigma across, which the chart's bins are too
+MAX_POINTS, MAX_BINS, MIN_IN_BIN = 4000, 10, 12
+MEDIAN_OF_SIGMA = float(np.sqrt(np.log(2)))  # the median of sqrt((x^2 + y^2) / 2), of Gaussian x and y of sigma 1
+SIGN = ("Name", "Role", "Date", "Signature")
+SIGN_STYLE = "display:inline-block;width:45%;border-bottom:1px solid;margin:2.2em 4% 0 0"
+
+
+def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> list[RequirementVerdict]:
+    """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises InputError."""
+    cases, tracker = read_cases(table), file.config.tracker
+    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
+    certificate = bench_certificate(file) if plan.through == "bench" else None
+    own = None if certificate is None else certificate.attitude_arcsec
+    found = verdicts_of(plan.require, cases, scale, plan.seed, own)
+    write_csv(table.with_name("requirements.csv"), COLUMNS, [[summary_of(each)[name] for name in COLUMNS] for each in found])
+    figure = _chart(cases, found)
+    write_whole(table.with_name("requirements.png"), png(figure))
+    about = [
+        ("plan", str(path)),
+        ("bench", f"{file.path}, sha256 {file.sha256}"),
+        ("cases", f"{cases.cases} through {plan.through}, in {table.name}, sha256 {file_sha256(table)}"),
+        ("program", f"hilstar {__version__}"),
+        *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
+    ]
+    counts = [(verdict, sum(each.verdict == verdict for each in found)) for verdict in (MET, NOT_MET, NOT_SHOWN)]
+    each_count = ", ".join(f"{count} {verdict}" for verdict, count in counts if count)
+    page = [
+        f"<p>{_badge(verdict_of(found))} {escaped(f'Of {len(found)} requirements {each_count}.')}</p>",
+        table_of(about),
+        "<h2>Verdicts</h2>",
+        table_of(
+            [
+                (
+                    *(each.require.words, f"{100 * each.require.confidence:g} %", each.value, each.bound, each.cases),
+                    Markup(_badge(each.verdict)),
+                    f"about {each.more} more cases" if each.verdict == NOT_SHOWN and each.more else "",
+                    each.method,
+                )
+                for each in found
+            ],
+            ("requirement", "confidence", "measured", "bound", "cases", "verdict", "", "method"),
+        ),
+        "<p>The bound is what the cases support at the stated confidence, one-sided. Met: the bound keeps the limit. Not met:"
+        " the bound on the limit's other side breaks it. Not shown: the cases decide neither. Quantities are those of"
+        " ECSS-E-ST-60-20C; errors are one sigma an axis, arcsec, camera axes; times in seconds.</p>",
+        "<h2>Error against rate</h2>",
+        picture_of(svg(figure).encode(), "svg+xml", "error across the boresight against rate, with the requirements"),
+        "<h2>Signed</h2>",
+        "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN),
+    ]
+    write_whole(table.with_name("requirements.html"), page_of(f"Requirements of {path.name}", page))
+    return found
+
+
+def summary_of(each: RequirementVerdict) -> dict[str, Any]:
+    """The JSON object of a verdict, with the columns of requirements.csv."""
+    require = each.require
+    return {
+        "quantity": require.quantity,
+        "axis": (require.axis or "cross") if require.of_axis else "",
+        "condition": require.condition,
+        "limit": require.limit,
+        "bound": each.bound,
+        "confidence": require.confidence,
+        "cases": each.cases,
+        "verdict": each.verdict,
+        "value": each.value,
+        "more_cases": each.more,
+        "method": each.method,
+    }
+
+
+def verdict_of(found: list[RequirementVerdict]) -> str:
+    """The verdict of all together: the worst."""
+    verdicts = {each.verdict for each in found}
+    return NOT_MET if NOT_MET in verdicts else NOT_SHOWN if NOT_SHOWN in verdicts else MET
+
+
+def _badge(verdict: str) -> str:
+    return f'<span class="verdict" style="white-space:nowrap;background:{COLOURS[verdict]}">{verdict}</span>'
+
+
+def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
+    """Error across the boresight against rate (or case, where no rate is varied), with the requirements of such errors."""
+    error, rate = _error_and_rate(cases)
+    rated = bool(np.isfinite(rate).any() and np.ptp(rate[np.isfinite(rate)]) > 0)
+    at = rate if rated else cases.numbers["case"]
+    known = np.flatnonzero(np.isfinite(error) & np.isfinite(at))
+    drawn = [each for each in found if each.require.quantity in DRAWN and (each.require.axis or "cross") in ("cross", "x", "y")]
+    counts = f"{sum(each.verdict == MET for each in found)} of {len(found)} requirements are met"
+    note = "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a requirement allows."
+    with panels_of(counts, 1, note=note) as (axes,):
+        if len(known):
+            some = known[np.unique(np.linspace(0, len(known) - 1, MAX_POINTS).astype(int))]
+            axes.plot(at[some], error[some], ".", ms=3, color=MUTED, alpha=0.6, rasterized=True)
+            order = known[np.argsort(at[known], kind="stable")]
+            bins = np.array_split(order, max(1, min(MAX_BINS, len(order) // MIN_IN_BIN)))
+            sigma = [float(np.median(error[each])) / MEDIAN_OF_SIGMA for each in bins]  # wild answers do not move it
+            axes.plot([float(np.median(at[each])) for each in bins], sigma, "o-", color=BLUE)
+            positive = at[known] > 0
+            if rated and positive.all() and at[known].max() > 30 * at[known].min():
+                axes.set_xscale("log")
+            low, high = float(at[known].min()), float(at[known].max())
+            top = 1.15 * max(float(np.quantile(error[known], 0.97)), *sigma, *(each.require.limit for each in drawn))
+            axes.set_ylim(0, top)
+            for each in drawn:
+                begin, end = _span(each.require.condition, low, high) if rated else (low, high)
+                axes.plot([begin, end], [each.require.limit] * 2, color=COLOURS[each.verdict], lw=2.2)
+                words = f"{each.require.quantity} {each.verdict}"
+                axes.annotate(words, (begin, each.require.limit), (2, 3), textcoords="offset points", fontsize=9, color=INK)
+        axes.set_xlabel("rate [deg/s]" if rated else "case")
+        axes.set_ylabel("error across [arcsec]")
+    return axes.figure
+
+
+def _error_and_rate(cases: Columns) -> tuple[FloatArray, FloatArray]:
+    """Each case's error across the boresight about the median, arcsec, and its rate, deg/s (NaN: none is varied): (n,) each."""
+    x, y = (cases.numbers[f"error_{axis}_arcsec"] for axis in "xy")
+    known = np.isfinite(x) & np.isfinite(y)
+    if known.any():
+        x, y = x - np.median(x[known]), y - np.median(y[known])
+    names = [name for name in cases.varied if name.startswith(f"{VARY}rate_deg_s.")]
+    rate = np.full(len(x), np.nan)
+    if names:
+        rate = np.sqrt(sum(cases.numbers[name] ** 2 for name in names))
+    return np.sqrt((x**2 + y**2) / 2), rate
+
+
+def _span(condition: str, low: float, high: float) -> tuple[float, float]:
+    """The rates to which a condition confines a requirement, within the chart's."""
+    for part in condition.split(" and "):
+        match = CONDITION.fullmatch(part)
+        if match and match[1].startswith("rate_deg_s.") and match[4]:
+            value = float(match[4])
+            low, high = (low, min(high, value)) if match[2] in ("<", "<=") else (low, high)
+            low, high = (max(low, value), high) if match[2] in (">", ">=") else (low, high)
+            low, high = (value, value) if match[2] == "==" else (low, high)
+    return low, high

@@ -1,0 +1,228 @@
+"""A worker's session: it checks that its rows would be the campaign's, and runs cases one after the other.
+
+Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves all cases of a session, and
+changes with their bench files.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import scipy
+
+import hilstar
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.basics.files import make_directory
+from hilstar.basics.reading import CHUNK_BYTES, open_regular
+from hilstar.basics.resources import resource_path
+from hilstar.instruments.campaign.cases import Case, CaseMaker, CaseTally, Kind, columns, failed, first_row
+from hilstar.instruments.campaign.display_tracker import DisplayTracker
+from hilstar.instruments.campaign.plan import SCENARIO, TRACKER_PSF, Plan, parse_plan
+from hilstar.instruments.campaign.solvers import CENTROIDS, SolverFault, choose_solver
+from hilstar.instruments.campaign.store import Row
+from hilstar.instruments.simulate.pictures import write_exposure_fits
+from hilstar.instruments.simulate.simulator import FrameNoise, Simulator
+from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from hilstar.server.bench.config import GAUSSIAN
+
+IMAGES = "images"
+OWN_THREADS = "LP_NUM_THREADS", "OMP_NUM_THREADS"  # threads that draw, and that make noise
+IMAGES_A_FOLDER = 1000
+
+
+class Identity(msgspec.Struct, frozen=True):
+    """Everything by which rows could differ between machines: program, libraries and renderer."""
+
+    hilstar: str
+    code_sha256: str
+    numpy: str
+    scipy: str
+    gl_renderer: str
+
+
+WORDS = {
+    "hilstar": "hilstar {0}, and the campaign is of {1}; install that version there",
+    "code_sha256": "hilstar's code {0:.12} under the same version, and the campaign is of {1:.12}; install the same there",
+    "numpy": "NumPy {0}, and the campaign is of {1}; install that version there",
+    "scipy": "SciPy {0}, and the campaign is of {1}; install that version there",
+    "gl_renderer": "the renderer {0}, and the campaign is of {1}: frames differ in their last bits; use machines of one kind",
+}
+
+
+@functools.cache
+def code_sha256() -> str:
+    """The digest of hilstar's code: its Python files and its shaders."""
+    digest = hashlib.sha256()
+    package, shaders = Path(hilstar.__file__).parent, resource_path("shaders", "star.vert").parent
+    for root, pattern in ((package, "*.py"), (shaders, "*")):
+        for path in sorted(root.rglob(pattern)):
+            if path.is_file():
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def difference(found: Identity, wanted: Identity) -> str | None:
+    """The first difference of a worker's identity, in words; None where there is none."""
+    for name, words in WORDS.items():
+        if getattr(found, name) != getattr(wanted, name):
+            return "has " + words.format(getattr(found, name), getattr(wanted, name))
+    return None
+
+
+def identity_of(gl_renderer: str) -> Identity:
+    """The identity of this process with a renderer."""
+    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
+
+
+class Job(msgspec.Struct, frozen=True):
+    """The message that starts a worker: the plan and the bench as they were read, the solver, and the place of images."""
+
+    plan_path: str
+    plan_text: str
+    bench_path: str
+    bench_text: str
+    bench_sha256: str
+    files_sha256: str
+    solver: str
+    solver_folder: str
+    timeout_s: float
+    directory: str
+    images: bool
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """The rows of some cases, the seconds that they took, and the worker's peak of memory."""
+
+    rows: list[Row]
+    seconds: float
+    peak_bytes: int
+
+
+Imaging = Simulator | DisplayTracker  # a tracker that exposes, of the sky or of the display
+
+
+class Session:
+    """A worker's part of a campaign. Raises InputError where the plan or the bench cannot be used here, or differ."""
+
+    def __init__(self, job: Job) -> None:
+        for name in OWN_THREADS:  # workers fill the cores
+            os.environ.setdefault(name, "1")
+        self.job = job
+        self.plan: Plan = parse_plan(Path(job.plan_path), job.plan_text)
+        self.file = bench_file_of(Path(job.bench_path), job.bench_text)
+        if self.file.sha256 != job.bench_sha256:
+            raise InputError(
+                f"its bench {self.file.sha256:.12} is not the campaign's {job.bench_sha256:.12}: a file that {job.bench_path}"
+                " names has another content there; copy it"
+            )
+        if files_sha256(self.plan, Path(job.plan_path).parent) != job.files_sha256:
+            raise InputError(
+                f"its log or scenario is not the campaign's: a file that {job.plan_path} names differs there; copy it"
+            )
+        self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
+        self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
+        self._solver = choose_solver(
+            job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s, Path(job.plan_path).parent
+        )
+        self._tracker: Imaging | None = None
+        self._at(self.maker.file)
+
+    def identity(self) -> Identity:
+        """This worker's identity."""
+        return identity_of(self._at(self.maker.file).gl_renderer)
+
+    def run(self, begin: int, points: FloatArray) -> Answered:
+        """The rows of the cases from `begin` on at their points (n, dimensions)."""
+        start_s = time.perf_counter()
+        rows = [self.row(begin + k, point) for k, point in enumerate(points)]
+        return Answered(rows, time.perf_counter() - start_s, peak_bytes())
+
+    def row(self, number: int, point: FloatArray) -> Row:
+        """The row of one case; a failed one says why."""
+        case = self.maker.case(number, point)
+        row = first_row(case, self.columns)
+        try:
+            file = self.maker.bench(case)
+            row["bench_sha256"] = file.sha256
+            return self._exposed(case, self._at(file), row)
+        except MachineError:
+            raise
+        except HilstarError as error:
+            return failed(row, one_line(str(error)))
+        except (ArithmeticError, ValueError, LookupError, MemoryError, np.linalg.LinAlgError) as error:
+            self._tracker = None
+            return failed(row, one_line(f"{type(error).__name__}: {error}"))
+
+    def _exposed(self, case: Case, tracker: Imaging, row: Row) -> Row:
+        exposure_s = tracker.config.tracker.exposure_s
+        length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
+        fault_end_s = self.maker.fault_end_s(case, length_s)
+        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec, fault_end_s)
+        noise = FrameNoise(self.plan.noise, case.noise_seed)
+        for frame in range(self.plan.frames):
+            view = self.maker.view(case, frame, exposure_s)
+            # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
+            rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
+            if isinstance(tracker, Simulator):
+                exposure = tracker.expose(view, rng, faults=self.maker.faults(case, view, tracker))
+            else:
+                exposure = tracker.expose(view, rng)
+            if self.job.images:
+                stem = f"{IMAGES}/{case.number // IMAGES_A_FOLDER:06d}/case_{case.number:09d}"
+                first, this = ("" if self.plan.frames == 1 else f"_{k:05d}" for k in (0, frame))
+                row["image"] = f"{stem}{first}.fits"
+                path = Path(self.job.directory) / f"{stem}{this}.fits"
+                make_directory(path.parent)
+                write_exposure_fits(path, tracker, exposure, noise)
+            tally.see(exposure)
+            try:
+                tally.hear(exposure, self._solver.solve(exposure, tracker), frame * self.plan.step_s + exposure_s)
+            except SolverFault as error:
+                return failed(tally.into(row), one_line(str(error)))
+        return tally.into(row)
+
+    def _at(self, file: BenchFile) -> Imaging:
+        """The tracker, switched to a bench file; where that fails, the next case gets a new one."""
+        tracker, self._tracker = self._tracker, None
+        if tracker is None:
+            tracker = Simulator(file) if self.plan.through == "tracker" else DisplayTracker(file)
+        else:
+            try:
+                tracker.change(file)
+            except BaseException:
+                with contextlib.suppress(Exception):  # parts of it may be closed already
+                    tracker.close()
+                raise
+        self._tracker = tracker
+        return tracker
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        if self._tracker is not None:
+            self._tracker.close()
+
+
+def files_sha256(plan: Plan, folder: Path) -> str:
+    """The digest of the files that a plan names beside its bench: its log, and its scenarios. Raises InputError."""
+    digest = hashlib.sha256()
+    varied = [str(name) for each in plan.vary if each.key == SCENARIO for name in each.values or () if name]
+    told = [] if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN) else [plan.centroids.psf]
+    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied, *told]:
+        with open_regular(folder / name, "give the path of a file") as file:
+            while chunk := file.read(CHUNK_BYTES):
+                digest.update(chunk)
+    return digest.hexdigest()
+
+
+def peak_bytes() -> int:
+    """This process's peak of memory (Linux: VmHWM)."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1]) * 1024
+    return 0

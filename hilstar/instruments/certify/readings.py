@@ -1,0 +1,306 @@
+"""What a certificate or a check reads of a bench: patches of light, one pattern of dots, a photodiode's edges; and by what.
+
+`VirtualReader` takes the figures straight from a truth file, with the noise that its `[certify.virtual]` states: it draws no
+image. `ImageReader` shows the patterns by a first-light image source and measures the tracker's images.
+"""
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.display.calibration import load_calibration
+from hilstar.display.identity import MonitorIdentity
+from hilstar.display.response import Response
+from hilstar.instruments.calibrate.first_light import image_sources
+from hilstar.instruments.calibrate.first_light.context import StepContext
+from hilstar.instruments.calibrate.first_light.focus import seen_sharpness
+from hilstar.instruments.calibrate.first_light.photometer import Assumed, Photometer, Readings
+from hilstar.instruments.calibrate.geometric.calibration import dot_sigma_px, psf_sigma_of
+from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen
+from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
+from hilstar.instruments.calibrate.plan import Patch
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import bench_calibration, calibration_source, open_bench, orientation_of
+from hilstar.server.bench.cameras import bench_camera, tracker_camera, tracker_psf
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+
+APART_TRACKER_PX = 12.0  # from dot to dot: a dot that moved by half of it would be taken for its neighbour
+EDGE_TRACKER_PX = 8.0
+MAX_DOTS = 4000
+MIN_DOTS = 60
+PAIRS = 4  # of images, for each ratio of two lattices
+DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
+WATCHED_S = 5.0
+THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
+NO_LIGHT_DN_PER_S = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class LightReadings:
+    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code (n,), at t_s (n,).
+
+    It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings have in common, as the
+    ratios of lattices, is in `common` (n, inputs), one sigma relative to light, with its freedom. `noise_shape` (n,) is each
+    reading's noise relative to its light, up to a factor that their scatter tells; None where all are alike.
+    """
+
+    code: IntArray
+    light: FloatArray
+    t_s: FloatArray
+    square_px: tuple[int, int, int] | None = None
+    common: FloatArray | None = None
+    common_dof: float = math.inf
+    noise_shape: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DotReadings:
+    """Dots: places on the monitor and in the tracker's image (n,), px, and relative light (n,); `psf_px` is the PSF's sigma."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    seen_x_px: FloatArray
+    seen_y_px: FloatArray
+    light: FloatArray
+    psf_px: float = math.nan
+    psf_u_px: float = 0.0
+
+
+def geometry_of(file: BenchFile) -> BenchGeometry:
+    """Monitor and tracker as a bench file has them."""
+    return BenchGeometry(bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder))
+
+
+def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
+    """Monitor pixels (n,) of a lattice of dots that the tracker sees whole. Raises InputError where it sees too few."""
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    width, height = geometry.monitor.resolution_px
+    seen = math.prod(min(ratio * s, t) for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True))
+    step = max(math.ceil(max(APART_TRACKER_PX, math.sqrt(seen / MAX_DOTS)) / ratio), 2 * DOT_PX)
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(np.arange(step // 2, width - DOT_PX, step), np.arange(step // 2, height - DOT_PX, step))
+    )
+    at_x, at_y = geometry.to_tracker(x.astype(np.float64), y.astype(np.float64))
+    wide, high = geometry.tracker.resolution_px
+    with np.errstate(invalid="ignore"):
+        kept = (at_x > EDGE_TRACKER_PX) & (at_x < wide - 1 - EDGE_TRACKER_PX)
+        kept &= (at_y > EDGE_TRACKER_PX) & (at_y < high - 1 - EDGE_TRACKER_PX)
+    if kept.sum() < MIN_DOTS:
+        raise InputError(
+            f"the tracker sees {int(kept.sum())} dots of the screen and {MIN_DOTS} are needed; look at [collimator]"
+        )
+    return x[kept], y[kept]
+
+
+def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -> FloatArray:
+    """Delays (n,) from the swap to the first row's light, ms, by a photodiode's recording. Raises InputError."""
+    if recording is None:
+        return np.zeros(0)
+    monitor = file.config.monitor
+    paired = pair(recording.seen, recording.shown, NS_PER_S / monitor.refresh_hz)
+    return np.asarray(paired.latency_ns / NS_PER_MS - swap_to_square_ms(monitor))
+
+
+class VirtualReader:
+    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError.
+
+    `identity` says it in words.
+    """
+
+    monitor: MonitorIdentity | None = None
+
+    def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
+        image_sources.refuse_other_bench(file, truth)
+        if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
+            raise InputError(f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)")
+        self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
+        self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
+        self._noise, self._t_s = truth.config.certify.virtual, 0.0
+        monitor = truth.config.monitor
+        self._response = grey_response(truth)
+        self._uniformity = bench_calibration(truth.config, truth.folder).uniformity_map(monitor.resolution_px)
+        self._white_e_per_s = white_of(truth)
+
+    def now_ns(self) -> int:
+        """The simulated clock."""
+        return round(self._t_s * NS_PER_S)
+
+    def wait(self, seconds: float) -> None:
+        """Let simulated time pass."""
+        self._t_s += seconds
+
+    def light(self, codes: IntArray) -> LightReadings:
+        """The truth's light at the middle of the screen, with drift and noise."""
+        noise, rng = self._noise, self._rng
+        t_s = self._t_s + noise.seconds_a_reading * np.arange(len(codes), dtype=np.float64)
+        self._t_s += noise.seconds_a_reading * len(codes)
+        width, height = self.truth.config.monitor.resolution_px
+        here = 1.0 if self._uniformity is None else float(self._uniformity[height // 2, width // 2])
+        warmth = 1 + noise.drift_percent_per_h / 100 * t_s / 3600
+        cold = noise.cold_percent / 100 * np.exp(-t_s / (60 * noise.warm_up_min))
+        scale = self._white_e_per_s * here * (1 + noise.instrument_error) * (warmth - cold)
+        wanted = (self._response.light[codes] + self._response.black) * scale
+        read: FloatArray = wanted * (1 + noise.reading_noise * rng.standard_normal(len(codes)))
+        return LightReadings(codes, read, t_s)
+
+    def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
+        """The dots' places by the truth's lens, with noise."""
+        x, y = x_px.astype(np.float64), y_px.astype(np.float64)
+        less = 1 / math.sqrt(images)
+        seen = geometry_of(self.truth).to_tracker(x, y)
+        light = np.ones(len(x)) if self._uniformity is None else self._uniformity[y_px, x_px].astype(np.float64)
+        light *= 1 + less * self._noise.reading_noise * self._rng.standard_normal(len(x))
+        seen_x, seen_y = (part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x)) for part in seen)
+        kept = np.isfinite(seen_x) & np.isfinite(seen_y)
+        psf_u = less * self._noise.reading_noise
+        psf = float(np.hypot(*tracker_psf(self.truth.config.tracker, self.truth.folder).width_px) / math.sqrt(2))
+        noisy = psf * (1 + psf_u * float(self._rng.standard_normal()))
+        return DotReadings(x[kept], y[kept], seen_x[kept], seen_y[kept], light[kept], noisy, psf * psf_u)
+
+    def delays_ms(self) -> FloatArray:
+        """A simulated photodiode."""
+        if not self.file.config.monitor.photodiode_px:
+            return np.zeros(0)
+        return delays_of(image_sources.virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file)
+
+
+def white_of(file: BenchFile) -> float:
+    """The light of white of a bench file, e-/s."""
+    white = file.config.render.flux_at_white_e_per_s
+    if white is not None:
+        return white
+    with open_bench(file) as bench:
+        return bench.flux_at_white_e_per_s
+
+
+def dot_settings(file: BenchFile) -> CentroidSettings:
+    """How dots are measured in the tracker's image: in a window no narrower than they are. Raises InputError."""
+    default = CentroidSettings(THRESHOLD_SIGMA, MIN_PIXELS)
+    return replace(default, window_sigma_px=max(default.window_sigma_px, dot_sigma_px(file)))
+
+
+@dataclass
+class ImageReader:
+    """Readings by the tracker's images of an image source, which go to `folder`."""
+
+    file: BenchFile
+    source: image_sources.ImageSource
+    folder: Path
+    truth: BenchFile | None = None
+    _context: StepContext = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.identity, self.monitor = self.source.identity, self.source.monitor
+        self._context = StepContext(self.file, self.folder, self.folder, self.source, {}, {}, 0)
+
+    def now_ns(self) -> int:
+        """This machine's monotonic clock."""
+        return time.monotonic_ns()
+
+    def wait(self, seconds: float) -> None:
+        """Sleep."""
+        time.sleep(seconds)
+
+    def light(self, codes: IntArray) -> LightReadings:
+        """Lattices of dots that do not saturate the tracker, read by the tracker as a photometer."""
+        sigma_px = float(np.mean(self._context.tracker_psf.width_px))
+        grey = grey_response(self.file)
+        meter = Photometer(self._context, sigma_px, Assumed({"w": grey.light}, grey.black), PAIRS)
+        gain = self.file.config.tracker.detector.gain_e_per_dn
+        start_ns = self.now_ns()
+        readings = meter.read([Patch(int(code), "w") for code in codes])
+        # Patches take the same time each.
+        t_s = np.linspace(0.0, (self.now_ns() - start_ns) / NS_PER_S, len(codes))
+        level = readings.light[codes == 0].mean()
+        return LightReadings(
+            codes,
+            (readings.above_black + level) * gain,
+            t_s,
+            square_px=(meter.field.left, meter.field.top, meter.field.side),
+            common=_common(readings),
+            noise_shape=_noise_shape(readings),
+        )
+
+    def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
+        """One image of dots, each found near where the bench file has it."""
+        context, geometry = self._context, geometry_of(self.file)
+        code = code_of_light(self.file, DOT_LIGHT)
+        dark = context.read(context.dark())
+        while True:
+            codes, half = image_sources.black(context.resolution_px), DOT_PX // 2
+            for down in range(-half, half + 1):
+                for right in range(-half, half + 1):
+                    codes[y_px + down, x_px + right] = code
+            looked = [context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark) for number in range(images)]
+            if not context.is_too_bright(looked[0]):
+                break
+            code = context.darker(code)
+        image = np.mean([each.image for each in looked], axis=0)
+        found = find_stars(image, dot_settings(self.file), noisiest_background(image))
+        from scipy.spatial import cKDTree
+
+        x, y = x_px.astype(np.float64), y_px.astype(np.float64)
+        expected = np.stack(geometry.to_tracker(x, y), axis=1)
+        if len(found) < MIN_DOTS:
+            raise InputError(
+                f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus and the exposure"
+            )
+        far, near = (np.asarray(part) for part in cKDTree(np.stack([found.x_px, found.y_px], axis=1)).query(expected))
+        kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
+        if kept.sum() < MIN_DOTS:
+            raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
+        seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(self._context.file))
+        sharp = seen_sharpness(image, seen, self.file.config.tracker.detector, len(looked))
+        at = near[kept]
+        places = x[kept], y[kept], found.x_px[at], found.y_px[at]
+        return DotReadings(*places, found.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
+
+    def delays_ms(self) -> FloatArray:
+        """The photodiode's edges, where there is one."""
+        if not self.file.config.monitor.photodiode_px:
+            return np.zeros(0)
+        return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
+
+
+def _noise_shape(readings: Readings) -> FloatArray:
+    """The noise (n,) of readings relative to their light, 1 where they are black.
+
+    A lattice of few dots collects less light in the same pixels than a dense one, and knows its light less well.
+    """
+    lit = np.flatnonzero([patch.code for patch in readings.patches])
+    shape = np.ones(len(readings.patches))
+    shape[lit] = readings.sigma[lit] / np.maximum(readings.above_black[lit], NO_LIGHT_DN_PER_S)
+    return shape
+
+
+def _common(readings: Readings) -> FloatArray:
+    """What readings share, relative to their light above black: (n, causes), one standard error of each."""
+    codes = np.array([patch.code for patch in readings.patches])
+    # What shifts black as well shifts no light above it.
+    black = readings.common[codes == 0].mean(axis=0)
+    above = np.maximum(readings.above_black, NO_LIGHT_DN_PER_S)
+    relative = (readings.common - black) / above[:, None]
+    relative[codes == 0] = 0.0
+    return np.asarray(relative)
+
+
+Reader = VirtualReader | ImageReader
+
+
+def grey_response(file: BenchFile) -> Response:
+    """The response of greys, code by code, whatever the bench's quantisation."""
+    monitor = file.config.monitor
+    return load_calibration(calibration_source(monitor, file.folder), monitor.bits).response
+
+
+def code_of_light(file: BenchFile, share: float) -> int:
+    """The grey code of about a share of white's light."""
+    return int(np.searchsorted(grey_response(file).light, share))

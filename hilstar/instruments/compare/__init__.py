@@ -1,0 +1,83 @@
+"""For your own tests: two skies compared star by star, so that a golden frame holds on another driver."""
+
+from __future__ import annotations  # docs/python-api.md shows annotations as they are written
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.instruments.compare.compare_skies import check_skies, compare_skies, read_frame_fits, read_truth_csv
+from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, finding, star_lines
+from hilstar.instruments.compare.star_fit import Truth, describes
+from hilstar.server.bench.frame import Frame
+
+__all__ = ["assert_same_sky", "compare"]
+
+MAX_LINES = 20
+
+Sky = Frame | npt.NDArray[Any] | str | Path
+
+
+def assert_same_sky(
+    frame: Sky,
+    golden: Sky,
+    *,
+    flux_mag: float = FLUX_MAG,
+    centroid_px: float = CENTROID_PX,
+    truth: Truth | str | Path | None = None,
+) -> SkyComparison:
+    """Assert that every star of two skies has the same flux (magnitudes) and place (px). Skies are those of `compare`.
+
+    Raises AssertionError with the common difference of all stars and a line for each star that differs otherwise (at most 20).
+    Raises InputError as `compare` does.
+    """
+    comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
+    if not comparison.same:
+        raise AssertionError("\n".join([finding(comparison), *star_lines(comparison, MAX_LINES, "")]))
+    return comparison
+
+
+def compare(
+    frame: Sky,
+    golden: Sky,
+    *,
+    flux_mag: float = FLUX_MAG,
+    centroid_px: float = CENTROID_PX,
+    truth: Truth | str | Path | None = None,
+) -> SkyComparison:
+    """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of `hilstar frame`.
+
+    Light of three channels (3, height, width) is compared as a sum and by channel, and with light of one as a sum.
+
+    Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else by the Frames' own.
+    Raises InputError for limits that are not above 0, images of different size or without a star, and files of another kind.
+    """
+    images = _image(frame), _image(golden)
+    same = images[0].ndim == images[1].ndim
+    light, golden_light = (image if same else _together(image) for image in images)
+    check_skies(light, golden_light)
+    own = frame.truth if isinstance(frame, Frame) else None
+    if isinstance(truth, str | Path):
+        truth = read_truth_csv(Path(truth))
+    elif truth is None and isinstance(golden, Frame):
+        truth = golden.truth
+    elif truth is None and own is not None and describes(own, _together(golden_light)):
+        truth = own
+    return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, own)
+
+
+def _together(image: FloatArray) -> FloatArray:
+    return image.sum(axis=0) if image.ndim == 3 else image
+
+
+def _image(sky: Sky) -> FloatArray:
+    if isinstance(sky, str | Path):
+        return read_frame_fits(Path(sky))
+    image = (sky.light if len(sky.light) > 1 else sky.linear) if isinstance(sky, Frame) else np.asarray(sky)
+    if image.dtype.kind != "f":
+        raise InputError(f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes")
+    return np.asarray(image, dtype=np.float64)

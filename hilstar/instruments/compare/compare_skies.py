@@ -1,0 +1,202 @@
+"""Two images of one sky compared star by star, within the limits of a change of driver; and the files they come from.
+
+Stars are found in the golden image and fitted in both (see star_fit). Where rounding of the light around a star limits the
+fit, that star's limits are wider.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.fits_headers import read_fits_image
+from hilstar.basics.image_files import ImageSizeError, unpacked
+from hilstar.basics.reading import read_bytes
+from hilstar.basics.text_tables import finite_numbers, read_rows
+from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
+from hilstar.instruments.compare import star_fit
+from hilstar.instruments.compare.sky_comparison import Limits, SkyComparison, StarDifference, common_change
+from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.optics.psf import Psf
+
+# Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe against float64.
+PIXEL_ERROR = 2e-7
+MIN_IN_VIEW = 0.01  # smallest share of a star's light on the image; the wing of a star off the image has no centroid
+MAX_ERROR = 0.25  # a star whose relative error by rounding of brighter light is larger is not compared
+MISSING_SHARE = 0.01  # share of its flux: a star 5 mag fainter is gone
+MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003  # a shift of this is first order within 1e-5 of the star's flux
+MAX_MOVE_SIGMAS = 3.0  # a star that moved farther is missing here and extra there
+UNIT, CHANNELS = "electron/s", "rgb"
+MAX_E_PER_S = 1e30  # whose square is still a number
+TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
+MAX_TRUTH_BYTES = 50_000_000
+MAX_FITS_BYTES = 600_000_000  # an 8K frame has 133 MB
+
+
+def compare_skies(
+    frame: FloatArray,
+    golden: FloatArray,
+    limits: Limits,
+    truth: star_fit.Truth | None = None,
+    frame_truth: star_fit.Truth | None = None,
+) -> SkyComparison:
+    """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
+
+    Of cubes (3, height, width) the sum of the channels, and then each. Raises InputError for images of different size or
+    with a pixel that is not finite, for a golden one without a star, and for a `truth` of another sky.
+    """
+    check_skies(frame, golden)
+    if frame.ndim == 3:
+        tables = truth, frame_truth
+        pairs = zip(CHANNELS, frame, golden, strict=True)
+        each = {name: compare_skies(one, other, limits, *tables) for name, one, other in pairs}
+        return replace(compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each)
+    psf = star_fit.star_psf(golden)
+    seeds, unmeasured = _measurable(golden, star_fit.find_seeds(golden, truth, psf), psf)
+    if not seeds.hip:
+        raise InputError("compare: no star of the golden image has enough light in view; give one that has")
+    fit = _SkyFit(golden, seeds.places_px, psf)
+    moved = fit.follow(frame)
+    stars = _differences(seeds, fit, moved, limits)
+    more, less = moved.residual - fit.residual, fit.residual - moved.residual
+    for light, table, error in ((less, truth, math.inf), (more, truth if frame_truth is None else frame_truth, -math.inf)):
+        places, flux = _unexplained(light, fit, moved)
+        stars += [
+            StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
+            for hip, (x, y), f in zip(
+                star_fit.names_at(places, table, star_fit.blend_distance_px(psf)), places, flux, strict=True
+            )
+        ]
+    return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
+
+
+def check_skies(frame: FloatArray, golden: FloatArray) -> None:
+    """Raise InputError where two images cannot be compared, as `compare_skies` does."""
+    for name, image in (("frame", frame), ("golden", golden)):
+        if not (image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)) or min(image.shape) < 2:
+            raise InputError(f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)")
+        if not np.isfinite(image).all():
+            raise InputError(f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers")
+    if frame.shape != golden.shape:
+        (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
+        raise InputError(
+            f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give images of one monitor"
+        )
+    if not (golden > 0).any():
+        raise InputError("compare: the golden image has no star; give one that has")
+
+
+def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[star_fit.Seeds, int]:
+    """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
+    count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
+    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = star_fit.Seeds(star_fit.refined(golden, seeds.places_px, psf), seeds.hip)
+    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    templates = star_fit.StarTemplates(seeds.places_px, psf, shape)
+    flux = templates.fit(golden)[:, 0]
+    seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
+    return seeds, count - seeds.stars
+
+
+class _SkyFit:
+    """All stars of one image, fitted at `places_px`: fluxes, places, and the light (height, width) that they do not explain."""
+
+    def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
+        self.light = image
+        self.psf = psf
+        self.templates = star_fit.StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
+        fitted = self.templates.fit(image)
+        self.flux = fitted[:, 0]
+        self.places_px = places_px + star_fit.shifts_px(fitted)
+        self.model = self.templates.image(fitted)
+        self.residual = image - self.model
+
+    def follow(self, frame: FloatArray) -> "_SkyFit":
+        """The same stars in another image: the same templates, except for those that moved."""
+        start = self.templates.places_px
+        fit = _SkyFit(frame, start, self.psf)
+        for _ in range(MOVE_STEPS):
+            move = fit.places_px - self.places_px
+            shift = np.hypot(*move.T)
+            moved = (fit.flux > MISSING_SHARE * self.flux) & (shift > SMALL_MOVE_PX)
+            moved &= shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px)
+            if not moved.any():
+                break
+            fit = _SkyFit(frame, start + np.where(moved[:, None], move, 0.0), self.psf)
+        return fit
+
+
+def _differences(seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> list[StarDifference]:
+    flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
+    limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
+    limit_px = np.maximum(place_error_px, limits.centroid_px)
+    shift = moved.places_px - fit.places_px
+    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px))
+    error_mag = np.where(gone, np.inf, magnitude(np.where(gone, 1.0, moved.flux / fit.flux)))
+    columns = (*fit.places_px.T, fit.flux, error_mag, *np.where(gone, 0.0, shift.T), limit_mag, limit_px)
+    return [
+        StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, Limits(own_mag, own_px))
+        for hip, (x_px, y_px, flux, mag, dx_px, dy_px, own_mag, own_px) in zip(
+            seeds.hip, np.column_stack(columns).tolist(), strict=True
+        )
+    ]
+
+
+def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[FloatArray, FloatArray]:
+    """Places (n, 2), px, and fluxes of stars in light that no star of either fit explains.
+
+    A changed star is not exactly a Gaussian: its residual is under half of its change. A star off the image may be as bright as
+    any on it, and its wing wrong by that star's rounding.
+    """
+    change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
+    floor = star_fit.RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
+    rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
+    seeds = star_fit.nameless_seeds(
+        star_fit.bright_pixels(light, star_fit.around(floor, fit.psf) + rounding), fit.psf
+    ).places_px
+    places = star_fit.refined(light, seeds, fit.psf)
+    flux = star_fit.StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    column, row = seeds.astype(np.intp).T
+    # Two stars at one place: the fit may give one too much and the other less than 0.
+    return places, np.maximum(flux, light[row, column])
+
+
+def read_frame_fits(path: Path) -> FloatArray:
+    """The linear image (height, width), or of three channels (3, height, width), electrons/s, of a FITS of `hilstar frame`.
+
+    Raises InputError for another file.
+    """
+    wanted = "give the FITS that `hilstar frame -o OUT.fits` writes"
+    data = read_bytes(path, wanted, MAX_FITS_BYTES)
+    try:
+        fits_image = read_fits_image(unpacked(data, MAX_FITS_BYTES))
+        image, header = fits_image.pixels, fits_image.header
+    except (InputError, ImageSizeError) as error:
+        raise InputError(f"{path}: {error}; {wanted}") from error
+    except Exception as error:  # astropy raises whatever a broken header causes in its layers
+        raise InputError(f"{path}: not a FITS image; {wanted}") from error
+    if header.get("BUNIT") != UNIT or image.ndim not in (2, 3) or image.dtype.kind != "f":
+        raise InputError(f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
+    light = np.asarray(image, dtype=np.float64)
+    if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
+        raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
+    return light
+
+
+def read_truth_csv(path: Path) -> star_fit.Truth:
+    """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of TRUTH_COLUMNS filled."""
+    wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
+    rows = []
+    names = []
+    # A table of stars alone may have no names.
+    for line, (*cells, name) in read_rows(path, TRUTH_COLUMNS, wanted, MAX_TRUTH_BYTES, ("name",)):
+        rows.append(tuple(finite_numbers(path, line, TRUTH_COLUMNS, cells, wanted)))
+        names.append(name)
+    truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
+    truth["name"] = names
+    for name, column in zip(TRUTH_COLUMNS, np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T, strict=True):
+        truth[name] = column
+    return truth

@@ -1,0 +1,131 @@
+"""What `hilstar compare -o DIR` writes: a table of all stars, and a chart of errors against magnitude."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilstar.basics.charts import GREEN, INK, MUTED, ORANGE, PURPLE, RED, SMALL_PT, chart, title_lines, write_csv
+from hilstar.basics.units import magnitude
+from hilstar.instruments.compare.sky_comparison import SkyComparison, StarDifference, finding
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import Bbox
+
+MAX_NAMES = 6  # stars named in each panel; the table has all
+MAX_TRIED = 60  # names that are tried for room
+ROOM_PX = 3.0  # between two names
+MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
+STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
+COLUMNS = (
+    *("kind", "hip", "x_px", "y_px", "flux_e_per_s", "flux_error_mag", "dx_px", "dy_px", "centroid_error_px"),
+    *("flux_limit_mag", "centroid_limit_px", "differs"),  # 1 where the star differs from what is common to all
+)
+
+
+def draw(path: Path, comparison: SkyComparison) -> None:
+    """Write the chart. Raises InputError where that fails."""
+    said = finding(comparison)
+    while title_lines(said).count("\n") > 1 and ";" in said:
+        said = said.rpartition(";")[0]
+    with chart(path, said, 2, height_inch=7.4) as axes:
+        names: list[list[Annotation]] = []
+        for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "place error", "px")):
+            panel = ChartPanel(comparison, unit)
+            panel.draw(axis)
+            names.append(panel.name_stars(axis))
+            less = " beyond what is common" if panel.common else ""
+            axis.set(yscale="log", ylabel=f"{what}{less} [{unit}]")
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+        axes[1].set_xlabel("magnitudes below the brightest star [mag]")
+        # Remove the names that overlap those of worse stars, and those that are too many.
+        if (figure := axes[0].get_figure(root=True)) is not None:
+            figure.draw_without_rendering()
+        for texts in names:  # worst first, of each panel
+            kept: list[Bbox] = []
+            for text in texts:
+                box = text.get_window_extent().padded(ROOM_PX)
+                if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
+                    text.remove()
+                else:
+                    kept.append(box)
+
+
+class ChartPanel:
+    """Errors and limits of one kind; stars that only one image has are in rows above."""
+
+    def __init__(self, comparison: SkyComparison, unit: str) -> None:
+        common = comparison.common
+        self.unit, self.comparison = unit, comparison
+        self.stars = comparison.stars if common is None else common.beyond + common.alone
+        self.worst = comparison.differing
+        self.brightest = max(star.flux_e_per_s for star in comparison.stars)
+        self.limit = comparison.limits.flux_mag if unit == "mag" else comparison.limits.centroid_px
+        self.common = 0.0
+        if common is not None:
+            self.common = abs(common.flux_mag) if unit == "mag" else math.hypot(*common.shift_px)
+        self.row = 4 * max([self.limit, self.common, *(max(self.point(star)[1:]) for star in self.of("same", "changed"))])
+        self.rows = {"missing": self.row, "extra": 8 * self.row}
+
+    def of(self, *kinds: str) -> list[StarDifference]:
+        """The stars of these kinds that are drawn."""
+        return [star for star in self.stars if star.kind in kinds]
+
+    def point(self, star: StarDifference) -> tuple[float, float, float]:
+        """Magnitudes below the brightest star, error, and the star's own limit."""
+        mag = magnitude(star.flux_e_per_s / self.brightest)
+        if self.unit == "mag":
+            return mag, max(abs(star.flux_error_mag), MIN_ERROR), star.limits.flux_mag
+        return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
+
+    def label(self, kind: str, drawn: int) -> str:
+        """How many stars are of a kind. Missing and extra ones are all counted, as on the terminal and in the table."""
+        count = len(self.comparison.of(kind)) if kind in self.rows else drawn
+        common = count - drawn
+        return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
+
+    def draw(self, axis: "Axes") -> None:
+        """Draw the stars, the limits and the legend."""
+        for kind, marker, colour in STYLES:
+            mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
+            heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
+            axis.plot(mags, heights, marker, color=colour, ms=5 if kind == "same" else 7, label=self.label(kind, len(mags)))
+        axis.axhline(self.limit, color=INK, ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
+        if self.common:
+            axis.axhline(self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
+        wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
+        if wider:
+            at, _, limits = zip(*wider, strict=True)
+            axis.plot(at, limits, "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}")
+        axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
+        axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
+
+    def name_stars(self, axis: "Axes") -> "list[Annotation]":
+        """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
+        names = []
+        for star in self.worst:
+            mag, error, own = self.point(star)
+            if self.unit == "mag" if star.kind in self.rows else error > own:
+                name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
+                place = mag, self.rows.get(star.kind, error)
+                names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT))
+        return names[:MAX_TRIED]
+
+
+def write_report(directory: Path, comparison: SkyComparison) -> None:
+    """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and SVG.
+
+    Raises InputError where one cannot be written.
+    """
+    odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
+    rows = [
+        (
+            *(star.kind, " ".join(map(str, star.hip)), star.x_px, star.y_px, star.flux_e_per_s),
+            *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
+            *(star.limits.flux_mag, star.limits.centroid_px, int((star.hip, star.x_px, star.y_px) in odd)),
+        )
+        for star in comparison.stars
+    ]
+    write_csv(directory / "compare.csv", COLUMNS, rows)
+    draw(directory / "compare", comparison)

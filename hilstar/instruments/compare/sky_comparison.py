@@ -1,0 +1,407 @@
+"""How two skies differ: each star, the change common to most stars (shift, turn, scale, dimming), and the verdict.
+
+The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not matter. Missing stars are
+matched with extra ones first: after a shift by more than a star's width no star is in its place.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.error_spread import ErrorSpread, error_spread
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import magnitude
+
+MORE_STARS = 0.1  # share of all stars that a motion with more parameters has to explain in addition
+ROUNDS = 40  # rounds of reweighted least squares, which converge to the minimum sum of absolute residuals
+FINEST_PX = 1e-4  # smaller residuals all weigh the same
+MIN_SHARE = 0.5  # share of the median star's displacement that a motion must explain
+
+# Displacements (n, 2), px, of places (n, 2), px from the middle of the image.
+Motion = Callable[[FloatArray], FloatArray]
+# A tenth or less of the smallest fault that must be seen (0.01 mag, 0.02 px); 500 times the largest difference between two
+# correct drivers (2e-6 mag, 1.5e-6 px), for a star that no brighter one overlaps. tests/unit/instruments/compare measures both.
+FLUX_MAG = 1e-3
+CENTROID_PX = 1e-3
+MIN_STARS, MIN_STAR_SHARE = 4, 0.5  # that must differ alike
+MAX_VOTERS, VOTE_PX, PAIR_PX = 80, 2.0, 3.0  # the brightest missing and extra ones; displacements closer than this are one
+PAIR_ROUNDS = 3
+CHANNEL_KEYS = ("stars", "flux_error_mag", "centroid_error_px", "missing", "extra", "same")
+EDGE_PX = 5.0  # a star so near to the edge, or beyond it, may come into view or leave it by a common shift
+
+
+def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) -> Motion | None:
+    """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the middle; None for none."""
+    before, limit = np.hypot(*moves.T), np.median(limits_px)
+    if np.median(before) <= limit:
+        return None
+    best: Motion | None = None
+    left = before
+    for rank in range(1, rank_for(len(places)) + 1):
+        motion = fitted_motion(places, moves, rank)
+        then = np.hypot(*(moves - motion(places)).T)
+        more = (then <= limits_px).mean() > (left <= limits_px).mean() + MORE_STARS
+        nearer = np.median(left) > limit and np.median(then) < MIN_SHARE * np.median(left)
+        if rank == 1 or more or nearer:
+            best, left = motion, then
+    return best if np.median(left) <= MIN_SHARE * np.median(before) else None
+
+
+def rank_for(stars: int) -> int:
+    """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and scale, 3 a homography."""
+    return 3 if stars >= 16 else 2 if stars >= 6 else 1
+
+
+def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
+    """The motion of a rank that has the minimum sum of absolute residuals."""
+    scale = float(np.abs(places).max()) or 1.0
+    (x, y), (u, v) = (places / scale).T, ((places + moves) / scale).T
+    ones, zeros = np.ones_like(x), np.zeros_like(x)
+    if rank == 1:
+        columns = [(ones, zeros), (zeros, ones)]
+    elif rank == 2:
+        columns = [(ones, zeros), (zeros, ones), (x, y), (-y, x)]
+    else:  # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in its eight numbers
+        columns = [(ones, zeros), (zeros, ones), (x, zeros), (y, zeros), (zeros, x), (zeros, y)]
+        columns += [(-u * x, -v * x), (-u * y, -v * y)]
+    design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+    found = _least_absolute(design, np.stack([u - x, v - y], axis=-1), FINEST_PX / scale)
+
+    def motion(at: FloatArray) -> FloatArray:
+        x, y = at.T / scale
+        right, down, *more = found
+        if rank == 1:
+            moved = np.broadcast_to(found, at.shape)
+        elif rank == 2:
+            grow, turn = more
+            moved = np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
+        else:
+            a, b, d, e, g, h = more
+            wide = 1 + g * x + h * y
+            moved = np.stack([(a * x + b * y + right + x) / wide - x, (d * x + e * y + down + y) / wide - y], axis=-1)
+        return np.asarray(moved * scale)
+
+    return motion
+
+
+def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> FloatArray:
+    """Coefficients (k,) of design (n, 2, k) to wanted (n, 2) with the minimum sum of distances."""
+    weight, found = np.ones(len(wanted)), np.zeros(design.shape[2])
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        weighted = (design * root[..., None]).reshape(-1, design.shape[2])
+        found = np.asarray(np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64)
+        weight = 1 / np.maximum(np.hypot(*(wanted - design @ found).T), finest)
+    return np.asarray(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """By how much a star may differ: magnitudes and pixels. Raises InputError where one is not above 0."""
+
+    flux_mag: float = FLUX_MAG
+    centroid_px: float = CENTROID_PX
+
+    def __post_init__(self) -> None:
+        for name in ("flux_mag", "centroid_px"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"compare: {name} = {getattr(self, name):g}; write a number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class StarDifference:
+    """One star of the golden image (an extra one: of the other image), and the other image minus the golden one.
+
+    `flux_error_mag` is positive where the star is too faint, infinite where it is missing, minus infinity where it is extra;
+    `hip` has every star of a blend, a body by its name.
+    """
+
+    hip: tuple[int | str, ...]
+    x_px: float
+    y_px: float
+    flux_e_per_s: float
+    flux_error_mag: float
+    dx_px: float
+    dy_px: float
+    limits: Limits
+
+    @property
+    def centroid_error_px(self) -> float:
+        """The distance of the star from its place, px."""
+        return math.hypot(self.dx_px, self.dy_px)
+
+    @property
+    def kind(self) -> Literal["same", "changed", "missing", "extra"]:
+        """What became of the star."""
+        if math.isinf(self.flux_error_mag):
+            return "missing" if self.flux_error_mag > 0 else "extra"
+        return "same" if self.error_over_limit <= 1 else "changed"
+
+    @property
+    def error_over_limit(self) -> float:
+        """The larger of its two errors, each divided by its limit."""
+        return max(abs(self.flux_error_mag) / self.limits.flux_mag, self.centroid_error_px / self.limits.centroid_px)
+
+    @property
+    def name(self) -> str:
+        """Its HIP number, those of its blend, or its place."""
+        if self.hip:
+            hips, bodies = ([one for one in self.hip if isinstance(one, kind)] for kind in (int, str))
+            return " + ".join([*(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)), *map(str, bodies)])
+        return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
+
+    def line(self) -> str:
+        """What is wrong with the star, for a person."""
+        place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px" if self.hip else ""
+        if self.kind in ("missing", "extra"):
+            return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
+        return (
+            f"{self.name}{place}: {self.flux_error_mag:+z.4f} mag, {self.centroid_error_px:.4f} px"
+            f" ({self.dx_px:+z.4f}, {self.dy_px:+z.4f}) off"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CommonChange:
+    """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes (positive: too faint).
+
+    A figure is 0 where the stars do not have it in common.
+    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image has. Stars that the shift
+    brought into view or took out of it are in neither.
+    """
+
+    shift_px: tuple[float, float]
+    rotation_deg: float
+    scale_error: float
+    flux_mag: float
+    beyond: list[StarDifference]
+    alone: list[StarDifference]
+
+    @property
+    def differing(self) -> list[StarDifference]:
+        """The stars that differ beyond the common change."""
+        return [star for star in self.beyond if star.kind != "same"] + self.alone
+
+    def line(self) -> str:
+        """What is common, for a person."""
+        right, down = self.shift_px
+        digits = 2 if math.hypot(right, down) >= 0.1 else 4
+        found = [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"] if any(self.shift_px) else []
+        found += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
+        found += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
+        dimmer, digits = "dimmer" if self.flux_mag > 0 else "brighter", 2 if abs(self.flux_mag) >= 0.1 else 4
+        found += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
+        odd = len(self.differing)
+        rest = "" if not odd else "; 1 star differs from that" if odd == 1 else f"; {odd} stars differ from that"
+        return f"all {', '.join(found) or 'moved alike'}{rest}"
+
+    def summary(self) -> dict[str, Any]:
+        """The figures as JSON has them."""
+        return {
+            "shift_px": self.shift_px,
+            "rotation_deg": self.rotation_deg,
+            "scale_error": self.scale_error,
+            "flux_mag": self.flux_mag,
+            "stars": sum(star.kind == "same" for star in self.beyond),
+            "differ": len(self.differing),
+        }
+
+
+def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> CommonChange | None:
+    """What most stars of images of `size_px` (width, height) differ by; None where that is nothing."""
+    both = [star for star in stars if star.kind in ("same", "changed")]
+    missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
+    pairs = dict(_pairs(missing, extra))
+    for here, there in pairs.items():  # stars that moved far are in both images
+        old, new = missing[here], extra[there]
+        error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
+        both.append(replace(old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px))
+    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * (len(both) + len(missing) - len(pairs))):
+        return None
+    middle = (np.array(size_px) - 1) / 2
+    places = _places(both) - middle
+    moves = np.array([(star.dx_px, star.dy_px) for star in both])
+    limit_px = np.array([star.limits.centroid_px for star in both])
+    motion = common_motion(places, moves, limit_px)
+    # The median flux error, where it exceeds the limit and makes up more than half of the median star's error.
+    errors_mag = np.array([star.flux_error_mag for star in both])
+    flux_mag = float(np.median(errors_mag))
+    limit_mag = np.median([star.limits.flux_mag for star in both])
+    if abs(flux_mag) <= limit_mag or np.median(np.abs(errors_mag - flux_mag)) > MIN_SHARE * abs(flux_mag):
+        flux_mag = 0.0
+    if motion is None and not flux_mag:
+        return None
+    model = motion or np.zeros_like
+    beyond = [
+        replace(star, flux_error_mag=star.flux_error_mag - flux_mag, dx_px=dx, dy_px=dy)
+        for star, (dx, dy) in zip(both, (moves - model(places)).tolist(), strict=True)
+    ]
+    alone = [star for k, star in enumerate(missing) if k not in pairs]
+    taken = set(pairs.values())
+    alone += [star for k, star in enumerate(extra) if k not in taken]
+    left = []
+    for star in alone:  # but those that the motion brought into view or took out of it
+        place = _places([star]) - middle
+        move = model(place) if star.kind == "missing" else -model(place)
+        if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
+            left.append(star)
+    # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than its limit.
+    limit, reach = float(np.median(limit_px)), float(np.hypot(*middle))
+    shift, right, down = model(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    (xx, yx), (xy, yy) = right - shift, down - shift
+    turn, grow = math.atan2(yx - xy, 2 + xx + yy), math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
+    return CommonChange(
+        (float(shift[0]), float(shift[1])) if np.hypot(*shift) > limit else (0.0, 0.0),
+        math.degrees(turn) if abs(turn) * reach > limit else 0.0,
+        grow if abs(grow) * reach > limit else 0.0,
+        flux_mag,
+        beyond,
+        left,
+    )
+
+
+def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[tuple[int, int]]:
+    """Which missing star is which extra one, by one common motion; none where they have none."""
+    old, new = _places(missing), _places(extra)
+    voters = min(MAX_VOTERS, len(old), len(new))
+    if voters < MIN_STARS:
+        return []
+    brightest = [np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS] for kind in (missing, extra)]
+    votes = (new[brightest[1]][None, :] - old[brightest[0]][:, None]).reshape(-1, 2)
+    near = cKDTree(votes).query_ball_point(votes, VOTE_PX)
+    winner = max(near, key=len)
+    if len(winner) < max(MIN_STARS, MIN_STAR_SHARE * voters):
+        return []
+    predicted = old + np.median(votes[winner], axis=0)
+    pairs: list[tuple[int, int]] = []
+    for _ in range(PAIR_ROUNDS):
+        # Those that are each other's nearest, within PAIR_PX.
+        distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
+        back = np.asarray(cKDTree(predicted).query(new)[1])
+        pairs = [(k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k]
+        here, there = (np.array([pair[k] for pair in pairs], dtype=np.intp) for k in (0, 1))
+        middle = old.mean(axis=0)
+        motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
+        predicted = old + motion(old - middle)
+    return pairs
+
+
+def _places(stars: list[StarDifference]) -> FloatArray:
+    return np.array([(star.x_px, star.y_px) for star in stars]).reshape(-1, 2)
+
+
+def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
+    return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
+
+
+@dataclass(frozen=True, slots=True)
+class SkyComparison:
+    """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light of their own in view.
+
+    `common` is the difference that most stars share, None without one. Of light of several channels this is their sum, and
+    `channels` has each by its name.
+    """
+
+    stars: list[StarDifference]
+    limits: Limits
+    unmeasured: int
+    common: CommonChange | None = None
+    channels: "dict[str, SkyComparison]" = field(default_factory=dict)
+
+    def of(self, *kinds: str) -> list[StarDifference]:
+        """The stars of these kinds."""
+        return [star for star in self.stars if star.kind in kinds]
+
+    @property
+    def bad(self) -> list[StarDifference]:
+        """The stars beyond their limits, worst first; of those missing and extra the brightest first."""
+        return _worst_first(self.of("changed", "missing", "extra"))
+
+    @property
+    def differing(self) -> list[StarDifference]:
+        """The stars that are beyond their limits once the common difference is subtracted, worst first."""
+        return self.bad if self.common is None else _worst_first(self.common.differing)
+
+    @property
+    def same(self) -> bool:
+        """Whether both images are one sky, in every channel."""
+        return not self.bad and all(one.same for one in self.channels.values())
+
+    @property
+    def star_count(self) -> int:
+        """How many stars the golden image has."""
+        return len(self.stars) - len(self.of("extra"))
+
+    @property
+    def widened(self) -> int:
+        """How many stars have limits of their own, because of the light around them or the image's edge."""
+        return sum(star.limits != self.limits for star in self.of("same", "changed"))
+
+    @property
+    def flux_error_mag(self) -> ErrorSpread:
+        """Of the stars that both images have."""
+        return error_spread(np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")]))
+
+    @property
+    def centroid_error_px(self) -> ErrorSpread:
+        """Of the stars that both images have."""
+        return error_spread(np.array([star.centroid_error_px for star in self.of("same", "changed")]))
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `hilstar compare`; infinite errors are null there."""
+        return {
+            "stars": self.star_count,
+            "flux_error_mag": asdict(self.flux_error_mag),
+            "centroid_error_px": asdict(self.centroid_error_px),
+            "limits": asdict(self.limits),
+            "missing": len(self.of("missing")),
+            "extra": len(self.of("extra")),
+            "blends": sum(len(star.hip) > 1 for star in self.stars),
+            "widened": self.widened,
+            "unmeasured": self.unmeasured,
+            "common": None if self.common is None else self.common.summary(),
+            "bad": [
+                {"kind": star.kind, "hip": star.hip, "x_px": star.x_px, "y_px": star.y_px, "flux_e_per_s": star.flux_e_per_s}
+                | {"flux_error_mag": star.flux_error_mag, "dx_px": star.dx_px, "dy_px": star.dy_px}
+                for star in self.bad
+            ],
+            "same": self.same,
+            "channels": {
+                name: {key: value for key, value in one.summary().items() if key in CHANNEL_KEYS}
+                for name, one in self.channels.items()
+            },
+        }
+
+
+def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:
+    """A line for each star that differs beyond the common difference, `max_lines` of them; `rest` says where more are."""
+    if not comparison.bad and (other := _other_channel(comparison)):
+        return star_lines(comparison.channels[other], max_lines, rest)
+    stars = comparison.differing
+    lines = [star.line() for star in stars[:max_lines]]
+    return [*lines, f"and {len(stars) - max_lines} more{rest}"] if len(stars) > max_lines else lines
+
+
+def _other_channel(comparison: SkyComparison) -> str | None:
+    """The first channel that is not the same; None where all are."""
+    return next((name for name, one in comparison.channels.items() if not one.same), None)
+
+
+def finding(comparison: SkyComparison) -> str:
+    """The verdict in one sentence."""
+    if not comparison.bad and (other := _other_channel(comparison)):
+        return f"In channel {other}: {finding(comparison.channels[other])}"
+    if comparison.same:
+        largest = comparison.flux_error_mag.max, comparison.centroid_error_px.max
+        return f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and {largest[1]:.2g} px off"
+    if comparison.common is not None:
+        odd = comparison.differing[:1]
+        return f"Not the same sky: {comparison.common.line()}" + "".join(f"; the worst is {star.line()}" for star in odd)
+    counts = {name: len(comparison.of(name)) for name in ("changed", "missing", "extra")}
+    rest = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    return f"Not the same sky: of {comparison.star_count} stars {rest}; the worst is {comparison.bad[0].line()}"

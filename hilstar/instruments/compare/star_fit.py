@@ -1,0 +1,319 @@
+"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light causes no error.
+
+Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
+shifts of all stars are one linear least-squares problem. A star that is dimmed by any amount is measured exactly, a shifted one
+to first order in its shift. Light that no star explains stays in the residual. The stars to fit come from a truth table or are
+found in the image; near ones are one blend.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.sparse import coo_array, csc_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial import cKDTree
+from scipy.special import ndtr
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.optics.psf import GaussianPsf, Psf
+
+# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu), which are no stars.
+RIPPLE_SHARE = 1e-5
+SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
+SIGMA_STEPS = 12
+MAX_SIGMA_STEP = 0.3  # largest relative step of sigma: Newton's step from a poor start stays positive
+MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
+MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
+BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last may be this far outside
+COLUMNS = (("share", "share"), ("share", "slope"), ("slope", "share"))  # along y and x: light, derivative by x, by y
+RIDGE = 1e-12  # ridge on unit columns: two equal columns share the light, where the solver would otherwise fail
+# Two stars nearer than this are one blend: apart they would be known 10 times worse than alone (at 0.4 px; 5 at 0.85 px).
+BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
+KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have
+
+# Rows of frame.truth.TRUTH_DTYPE.
+Truth = npt.NDArray[np.void]
+
+
+class StarTemplates:
+    """Stars of flux 1 at `places_px` (n, 2) on an image of `shape` (height, width), each with its derivatives along x and y.
+
+    A star's share of light that falls on the image is in `in_view` (n,).
+    """
+
+    def __init__(self, places_px: FloatArray, psf: Psf, shape: tuple[int, int]) -> None:
+        self.places_px = places_px
+        self.shape = shape
+        reach_px = psf.footprint_px // 2 + 1
+        self._x, self._y = (_Profiles(places_px[:, k], psf.width_px[k], reach_px, shape[1 - k]) for k in (0, 1))
+        self.in_view = self._x.share.sum(axis=1) * self._y.share.sum(axis=1)
+
+    @cached_property
+    def _columns(self) -> csc_array:
+        """The light of each star and its derivatives (pixels, 3 n)."""
+        size = len(self.places_px)
+        pairs = [(getattr(self._y, y), getattr(self._x, x)) for y, x in COLUMNS]
+        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1)
+        pixel = self._y.clipped[:, :, None] * self.shape[1] + self._x.clipped[:, None, :]
+        index = np.broadcast_to(pixel[:, None], data.shape).ravel()
+        ends = np.arange(3 * size + 1) * math.prod(data.shape[2:])
+        return csc_array((data.ravel(), index, ends), shape=(math.prod(self.shape), 3 * size))
+
+    @cached_property
+    def normal(self) -> csc_array:
+        """The columns' products with one another (3 n, 3 n): along x times along y, for the stars that overlap."""
+        size, width = len(self.places_px), self._x.share.shape[1]
+        middles = np.column_stack([self._x.middle, self._y.middle])
+        near = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
+        star, other = (np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1))
+        along_x, along_y = (profiles.overlaps(star, other) for profiles in (self._x, self._y))
+        entry = [(("share", "slope").index(y), ("share", "slope").index(x)) for y, x in COLUMNS]
+        blocks = np.stack([along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry], axis=1)
+        row, col = (3 * star[:, None] + np.arange(9) // 3, 3 * other[:, None] + np.arange(9) % 3)
+        return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))
+
+    @cached_property
+    def _scale(self) -> FloatArray:
+        return np.asarray(1 / np.sqrt(np.maximum(self.normal.diagonal(), np.finfo(float).tiny)))
+
+    @cached_property
+    def _solver(self) -> SuperLU:
+        unit = self.normal.copy()
+        unit.data *= self._scale[unit.indices] * np.repeat(self._scale, np.diff(unit.indptr))
+        return splu(csc_array(unit + RIDGE * eye_array(len(self._scale), format="csc")))
+
+    def fit(self, image: FloatArray) -> FloatArray:
+        """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over all pixels."""
+        if not len(self.places_px):
+            return np.zeros((0, 3))
+        wanted = np.asarray(self._columns.T @ image.ravel())
+        return (self._scale * self._solver.solve(self._scale * wanted)).reshape(-1, 3)
+
+    def image(self, fitted: FloatArray) -> FloatArray:
+        """The light (height, width) of a fit."""
+        return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
+
+    def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
+        """Errors of flux and of place, px, (n,): a pixel is off by `pixel_error` of the flux of all stars that reach it."""
+        size = len(flux)
+        blocks = np.zeros((size, 3, 3))
+        entries = self.normal.tocoo()
+        own = entries.row // 3 == entries.col // 3
+        row, col = entries.row[own], entries.col[own]
+        blocks[row // 3, row % 3, col % 3] = entries.data[own]
+        variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
+        fluxes = entries.row % 3 + entries.col % 3 == 0
+        near = np.bincount(entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size)
+        around = pixel_error * near
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
+
+
+class _Profiles:
+    """Stars along one axis (n, k): shares of light and their derivative by the place, both 0 off the image.
+
+    `middle` (n,) is each star's middle pixel, `clipped` (n, k) the pixels, those off the image moved to its edge.
+    """
+
+    def __init__(self, place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> None:
+        self.middle = np.rint(place_px).astype(np.intp)
+        pixel = self.middle[:, None] + np.arange(-reach_px, reach_px + 1)
+        near, far = ((pixel - place_px[:, None] + side) / sigma_px for side in (-0.5, 0.5))
+        inside = (pixel >= 0) & (pixel < size_px)
+        self.share = (ndtr(far) - ndtr(near)) * inside
+        self.slope = (_bell(near) - _bell(far)) / sigma_px * inside
+        self.clipped = np.clip(pixel, 0, size_px - 1)
+
+    def overlaps(self, star: IntArray, other: IntArray) -> FloatArray:
+        """Products (m, 2, 2) of share and slope of the stars `star` (m,) with share and slope of `other` (m,)."""
+        width = self.share.shape[1]
+        both = np.stack([self.share, self.slope], axis=1)
+        # The pixel of the other star that is each pixel of this one; beyond its profile are zeros.
+        place = width + np.arange(width) + (self.middle[star] - self.middle[other])[:, None]
+        padded = np.pad(both, ((0, 0), (0, 0), (width, width)))
+        return np.asarray(both[star] @ padded[other[:, None], :, place])
+
+
+def _bell(u: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * np.square(u)) / math.sqrt(2 * math.pi))
+
+
+def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
+    """Places (n, 2), px, of pixels above `floor` that no neighbour outshines, brightest first."""
+    top = (image > floor) & (image == ndimage.maximum_filter(image, 3, mode="constant"))
+    row, column = np.nonzero(top)
+    order = np.argsort(-image[row, column], kind="stable")
+    return np.column_stack([column, row])[order].astype(np.float64)
+
+
+def around(image: FloatArray, psf: Psf) -> FloatArray:
+    """The brightest pixel within a star's footprint around each pixel, the same shape."""
+    return np.asarray(ndimage.maximum_filter(image, psf.footprint_px, mode="constant"))
+
+
+def star_psf(image: FloatArray) -> GaussianPsf:
+    """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's correlation of neighbours."""
+    # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is subtracted.
+    power = np.vdot(image, image)
+    correlations = (np.vdot(image[:, 1:], image[:, :-1]) / power, np.vdot(image[1:], image[:-1]) / power)
+    x, y = (math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04)) for part in correlations)
+    sigma, first = np.array([x, y]), GaussianPsf((x, y))
+    found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
+    places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
+    reach = first.footprint_px // 2 + 1
+    padded = np.pad(image, 2 * reach)
+    for _ in range(SIGMA_STEPS):
+        steps = _sigma_steps(padded, places, sigma, reach)
+        good = np.isfinite(steps).all(axis=1)
+        if not good.any():
+            break
+        places[good] += np.clip(steps[good, :2], -0.5, 0.5)
+        sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma)
+    return GaussianPsf((float(sigma[0]), float(sigma[1])))
+
+
+def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
+    """The brightest places with neither a star nor the image's edge in their footprint; all of them if there is none."""
+    bright = places_px[: 4 * SIGMA_STARS]
+    distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
+    edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
+    alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
+    return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
+
+
+def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int) -> FloatArray:
+    """Newton's steps (n, 4) of each star by itself: x, y, sigma x, sigma y."""
+    parts, pixels = [], []
+    for axis in (0, 1):
+        pixel = np.rint(places_px[:, axis]).astype(np.intp)[:, None] + np.arange(-reach_px, reach_px + 1)
+        near, far = ((pixel - places_px[:, axis, None] + side) / sigma_px[axis] for side in (-0.5, 0.5))
+        widen = (near * _bell(near) - far * _bell(far)) / sigma_px[axis]
+        parts.append((ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px[axis], widen))
+        pixels.append(np.clip(pixel + 2 * reach_px, 0, padded.shape[1 - axis] - 1))
+    (x, slope_x, widen_x), (y, slope_y, widen_y) = parts
+    pairs = ((y, x), (y, slope_x), (slope_y, x), (y, widen_x), (widen_y, x))
+    columns = np.stack([v[:, :, None] * u[:, None, :] for v, u in pairs], axis=1).reshape(len(places_px), 5, -1)
+    light = padded[pixels[1][:, :, None], pixels[0][:, None, :]].reshape(len(places_px), -1, 1)
+    fitted = np.linalg.pinv(columns @ columns.transpose(0, 2, 1), hermitian=True) @ (columns @ light)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(fitted[:, 1:, 0] / fitted[:, :1, 0])
+
+
+def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
+    """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known well: all stars at once."""
+    start, shape = places_px, (image.shape[0], image.shape[1])
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    outwards = BEYOND_SIGMAS * np.array(psf.width_px)
+    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
+    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
+    for _ in range(MAX_PLACE_STEPS):
+        step = np.clip(shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX)
+        before, places_px = places_px, np.clip(places_px + step, low, high)
+        if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
+            break
+    return places_px
+
+
+def shifts_px(fitted: FloatArray) -> FloatArray:
+    """The shifts (n, 2) in a fit, px; 0 for a star without light."""
+    flux = fitted[:, :1]
+    return np.divide(fitted[:, 1:], flux, out=np.zeros_like(fitted[:, 1:]), where=flux > 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Seeds:
+    """Stars to be fitted: places (n, 2), px, and the HIP numbers of each (a body's name), none where no table has it."""
+
+    places_px: FloatArray
+    hip: list[tuple[int | str, ...]]
+
+    @property
+    def stars(self) -> int:
+        """How many stars there are, each of a blend counted."""
+        return sum(max(len(hip), 1) for hip in self.hip)
+
+    def only(self, kept: npt.NDArray[np.bool_]) -> "Seeds":
+        """The seeds (n,) that are `kept`."""
+        return Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
+
+
+def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
+    """The table's stars, and the image's where the table has none. Raises InputError for a table of another sky."""
+    found = bright_pixels(golden, RIPPLE_SHARE * around(golden, psf))
+    if truth is None:
+        return nameless_seeds(found, psf)
+    blend_px = blend_distance_px(psf)
+    if not _has(truth, found, blend_px):
+        raise InputError(
+            "compare: the truth table's stars are not where the golden image has them; give the table of that frame"
+        )
+    table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
+    places = _places_px(table)
+    listed = _blended(Seeds(places, [_name_of(row) for row in table]), blend_px)
+    # The light of a star off the image is brightest at the image's edge.
+    shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
+    away = _nearest(shown, found)[0] > blend_px
+    unlisted = nameless_seeds(found[away], psf)
+    return Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
+
+
+def nameless_seeds(places_px: FloatArray, psf: Psf) -> Seeds:
+    """Seeds at places (n, 2), px, brightest first; those closer than a blend are one."""
+    return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(psf))
+
+
+def blend_distance_px(psf: Psf) -> float:
+    """The distance within which two stars are one blend."""
+    return max(BLEND_SIGMAS * max(psf.width_px), BLEND_PX)
+
+
+def describes(truth: Truth, image: FloatArray) -> bool:
+    """Whether a table (TRUTH_DTYPE) has at least half of the brightest stars of a linear image (height, width)."""
+    psf = star_psf(image)
+    return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf))
+
+
+def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int | str, ...]]:
+    """The HIP number of the table's star at each place (n, 2), px, where it has one."""
+    if truth is None or not len(truth) or not len(places_px):
+        return [()] * len(places_px)
+    distance, nearest = _nearest(_places_px(truth), places_px)
+    return [_name_of(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
+
+
+def _name_of(row: np.void) -> tuple[int | str, ...]:
+    return (str(row["name"]) or int(row["hip"]),)
+
+
+def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
+    if not len(truth) or not len(found_px):
+        return False
+    return bool(np.median(_nearest(_places_px(truth), found_px[:KNOWN_STARS])[0]) <= blend_px)
+
+
+def _places_px(truth: Truth) -> FloatArray:
+    return np.column_stack([truth["x_px"], truth["y_px"]])
+
+
+def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
+    distance_px, nearest = cKDTree(known_px).query(places_px)
+    return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
+
+
+def _blended(seeds: Seeds, blend_px: float) -> Seeds:
+    """One seed for each chain of near ones, at the place of its first, which is its brightest."""
+    size = len(seeds.places_px)
+    pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+    group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp) if size else np.zeros(0, dtype=np.intp)
+    _, first = np.unique(group, return_index=True)
+    hips: dict[int, tuple[int | str, ...]] = {}
+    for label, hip in zip(group.tolist(), seeds.hip, strict=True):
+        hips[label] = hips.get(label, ()) + hip
+    return Seeds(seeds.places_px[first], [hips[label] for label in group[first].tolist()])

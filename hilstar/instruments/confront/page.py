@@ -1,0 +1,259 @@
+"""The page of a confrontation: each photograph, its prediction and residual to blink between, and charts; one file."""
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, INK, MUTED, ORANGE, panels_of
+from hilstar.basics.files import write_whole
+from hilstar.basics.html_pages import drawing_of, escaped, page_of, table_of
+from hilstar.instruments.confront.judge import LISTED_SNR, NOT_COUNTED, Verdict
+from hilstar.instruments.confront.report import Confronted
+from hilstar.instruments.confront.session import Session
+
+MAX_SIDE_PX = 960
+BLACK, WHITE = -2.0, 60.0  # sigmas of the background, between which a picture's greys lie
+RESIDUAL = 5.0
+JPEG_QUALITY = 82
+MAX_ROWS = 40
+GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
+VIEWS = ("image", "prediction", "residual")
+STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"))
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """A photograph, its prediction and its residual as JPEG, and the map of squared residuals (rows, columns)."""
+
+    views: tuple[bytes, ...]
+    chi2_map: FloatArray
+
+
+def page_pictures(session: Session, verdict: Verdict) -> Pictures:
+    """The pictures of a verdict, before its arrays are dropped."""
+    shot = verdict.shot
+    noise = np.sqrt(session.pixels.variance_dn2(shot.level.level))
+    seen = [(part - shot.level.level) / noise for part in (shot.photo.dn, verdict.predicted)]
+    top = math.asinh(WHITE)
+    greys = [255 * np.clip(np.arcsinh(np.clip(part - BLACK, 0, None)) / top, 0, 1) for part in seen]
+    greys.append(255 * np.clip(verdict.residual / (2 * RESIDUAL) + 0.5, 0, 1))
+    height, width = verdict.residual.shape
+    rows, columns = np.linspace(0, height, 13).astype(int), np.linspace(0, width, 17).astype(int)
+    clipped = np.minimum(verdict.residual**2, 25.0)
+    sums = np.add.reduceat(np.add.reduceat(clipped, rows[:-1], axis=0), columns[:-1], axis=1)
+    return Pictures(tuple(_jpeg(grey) for grey in greys), sums / np.outer(np.diff(rows), np.diff(columns)))
+
+
+def _jpeg(grey: FloatArray) -> bytes:
+    from PIL import Image
+
+    picture = Image.fromarray(np.rint(grey).astype(np.uint8))
+    if max(picture.size) > MAX_SIDE_PX:
+        picture.thumbnail((MAX_SIDE_PX, MAX_SIDE_PX), Image.Resampling.BOX)
+    data = io.BytesIO()
+    picture.save(data, "JPEG", quality=JPEG_QUALITY)
+    return data.getvalue()
+
+
+def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> None:
+    """Write the page, which needs no other file. Raises InputError where it cannot be written."""
+    verdict = (
+        "beyond the limits: " + "; ".join(found.failures) if found.failures else "the simulator explains these photographs"
+    )
+    body = [
+        f"<style>{STYLE.read_text()}</style>",
+        f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b> {escaped(verdict)}.</p>',
+        *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
+        "<h2>Verdicts</h2><ul>" + "".join(f"<li>{escaped(line)}</li>" for line in found.lines) + "</ul>",
+        _summary(found.verdicts),
+    ]
+    for one, views in zip(found.verdicts, pictures, strict=True):
+        body.append(_frame(one, views))
+    body += [f"<h2>{title}</h2>{chart}" for title, chart in _charts(found, pictures)]
+    if found.excess is not None:
+        body.append("<h2>What the scatter is made of</h2>")
+        for unit, whole, parts in (
+            ("mag", found.excess.rms_mag, found.excess.light),
+            ("px", found.excess.rms_px, found.excess.places),
+        ):
+            rows: list[tuple[object, ...]] = [("all", whole, "")]
+            rows += [(one.name, None if math.isnan(one.rms) else one.rms, one.how) for one in parts]
+            body.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
+    body.append(_lists(found.verdicts))
+    write_whole(path, page_of("Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]))
+
+
+def _summary(verdicts: Sequence[Verdict]) -> str:
+    header = ("photograph", "stars to V = 6.5", "px rms", "mag rms", "background chi²", "star chi²", "unexplained", "missing")
+    rows = [
+        (v.shot.photo.name, v.counted, v.rms_px, v.rms_mag, v.background_chi2, v.star_chi2, len(v.unexplained), len(v.missing))
+        for v in verdicts
+    ]
+    return table_of(rows, header, 3)
+
+
+def _frame(verdict: Verdict, pictures: Pictures) -> str:
+    height, width = verdict.shot.photo.dn.shape
+    marks = [
+        f'<rect x="{s.x_px - 9:.0f}" y="{s.y_px - 9:.0f}" width="18" height="18" stroke="#ff9e5e"/>'
+        for s in verdict.unexplained
+    ]
+    marks += [
+        f'<circle cx="{r.x_predicted_px:.0f}" cy="{r.y_predicted_px:.0f}" r="10" stroke="#6cb6ff"/>' for r in verdict.missing
+    ]
+    over = f'<svg viewBox="-0.5 -0.5 {width} {height}" fill="none" stroke-width="1.5">{"".join(marks)}</svg>'
+    images = "".join(
+        f'<img alt="{name}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
+        for name, data in zip(VIEWS, pictures.views, strict=True)
+    )
+    buttons = "".join(f"<button>{name}</button> " for name in (*VIEWS, "blink", "side by side"))
+    return (
+        f'<h2>{escaped(verdict.shot.photo.name)}</h2><div class="frame"><p>{buttons}</p>'
+        f'<div class="views">{images}{over}</div></div>'
+        f'<p class="small">Squares: sources over {LISTED_SNR:g} sigmas that nothing explains. Circles: stars that are missing.'
+        f" Residual: black is -{RESIDUAL:g}, white +{RESIDUAL:g} sigmas.</p>"
+    )
+
+
+def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
+    rows = [row for verdict in found.verdicts for row in verdict.stars if row.dn > 0 and row.dn_predicted > 0]
+    good = [row for row in rows if not NOT_COUNTED & set(row.flags)]
+    charts = [("Flux and colour", _flux(found, good))] if good else []
+    if good:
+        charts.append(("Places", _places(good)))
+    charts.append(("Point spread function", _psf_grid(found.session)))
+    if len(found.session.pixels.points):
+        charts.append(("Photon transfer", _transfer(found.session)))
+    charts.append(("Squared residuals over the field", _chi2_maps(found.verdicts, pictures)))
+    return charts
+
+
+def _flux(found: Confronted, rows: Sequence[Any]) -> str:
+    v, bv, dn, off = (np.array([getattr(row, name) for row in rows]) for name in ("v_mag", "b_v_mag", "dn", "off_mag"))
+    light = found.session.light
+    counted = np.array([row.counted for row in rows])
+    rms = math.sqrt(float((off[counted] ** 2).mean())) if counted.any() else math.nan
+    finding = f"Stars to V = 6.5 are {rms:.3f} mag rms off their prediction"
+    note = "Stars that stand alone and are not saturated. Filled: to V = 6.5. Off: seen less predicted, up where too faint."
+    with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.9) as panels:
+        for axes, x, y, names in (
+            (panels[0], v, -2.5 * np.log10(dn), ("V [mag]", "-2.5 log10 DN")),
+            (panels[1], v, off, ("V [mag]", "off [mag]")),
+            (panels[2], bv, off, ("B-V [mag]", "off [mag]")),
+        ):
+            axes.plot(x[~counted], y[~counted], "o", ms=2.5, mfc="none", color=MUTED, rasterized=True)
+            axes.plot(x[counted], y[counted], "o", ms=3.5, color=BLUE)
+            axes.set(xlabel=names[0], ylabel=names[1])
+        for axes in panels[1:]:
+            axes.axhline(0, color=INK, lw=1)
+            axes.set_ylim(-1, 1)
+        if math.isfinite(light.zero_point_mag):
+            line = np.array([v.min(), v.max()])
+            panels[0].plot(
+                line, line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)), color=ORANGE, lw=1.2
+            )
+    return drawing_of(panels[0].figure, "flux against V, and what is left of it against V and colour")
+
+
+def _places(rows: Sequence[Any]) -> str:
+    some = [row for row in rows if row.dn > 20 * row.sigma_dn]
+    x, y = (np.array([getattr(row, name) for row in some]) for name in ("x_predicted_px", "y_predicted_px"))
+    dx = np.array([row.x_px - row.x_predicted_px for row in some])
+    dy = np.array([row.y_px - row.y_predicted_px for row in some])
+    rms = math.sqrt(float((dx**2 + dy**2).mean() / 2)) if some else math.nan
+    with panels_of(f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places", height_inch=4.6) as panels:
+        axes = panels[0]
+        arrows = axes.quiver(x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width")
+        axes.quiverkey(arrows, 0.86, 0.04, 0.1, "0.1 px", labelpos="E")
+        axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
+        axes.invert_yaxis()
+    return drawing_of(panels[0].figure, "places seen less predicted over the field")
+
+
+def _psf_grid(session: Session) -> str:
+    psf = session.psf
+    width, height = psf.size_px
+    places = [(x, y) for y in np.linspace(0, height - 1, GRID) for x in np.linspace(0, width - 1, GRID)]
+    fwhm = psf.fwhm_px(*np.array(places).T)
+    finding = f"Full width at half maximum {fwhm.min():.2f} to {fwhm.max():.2f} px, pixel included"
+    tiles = np.array([np.sqrt(psf.samples(x, y, TILE_PER_PX, TILE_HALF_PX)) for x, y in places])
+    side = tiles.shape[-1]
+    mosaic = tiles.reshape(GRID, GRID, side, side).swapaxes(1, 2).reshape(GRID * side, GRID * side)
+    with panels_of(
+        finding, note="Width and height of each tile: 6 px. Numbers: place and width, px.", height_inch=6.6
+    ) as panels:
+        axes = panels[0]  # one picture: 25 panels of their own take a second
+        axes.imshow(mosaic, cmap="gray_r", extent=(0, GRID, GRID, 0))
+        for number, ((x, y), wide) in enumerate(zip(places, fwhm, strict=True)):
+            axes.text(number % GRID + 0.03, number // GRID + 0.97, f"{x:.0f}, {y:.0f}: {wide:.2f}", fontsize=7, color=MUTED)
+        axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
+        axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
+    return drawing_of(panels[0].figure, "point spread functions over the field")
+
+
+def _transfer(session: Session) -> str:
+    pixels = session.pixels
+    level, variance = pixels.points.T
+    finding = f"{pixels.gain_words}, {pixels.read_noise_e:.2f} e- of read noise at {pixels.pedestal_dn:.0f} DN"
+    with panels_of(finding, height_inch=3.8) as panels:
+        axes = panels[0]
+        axes.plot(level, variance, ".", ms=2.5, color=MUTED, rasterized=True)
+        line = np.array([min(pixels.pedestal_dn, level.min()), level.max()])
+        axes.plot(line, pixels.variance_dn2(line), color=ORANGE)
+        axes.set(xlabel="background level [DN]", ylabel="variance between neighbours [DN²]")
+        axes.set_ylim(0, 2 * float(np.median(variance)))
+    return drawing_of(panels[0].figure, "photon transfer")
+
+
+def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str:
+    chi2 = [one.background_chi2 for one in verdicts]
+    columns = min(len(verdicts), 4)
+    rows = math.ceil(len(verdicts) / columns)
+    finding = f"The background's chi² is {min(chi2):.3f} to {max(chi2):.3f}"
+    note = "Mean square of all residuals in a part of the image, stars among them, each up to 5 sigmas."
+    with panels_of(finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows) as panels:
+        for axes, one, views in zip(panels, verdicts, pictures, strict=False):
+            drawn = axes.imshow(views.chi2_map, vmin=0.5, vmax=2.0, cmap="RdBu_r", aspect="auto")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.grid(visible=False)
+            axes.set_xlabel(f"photograph {one.number + 1}")
+        for axes in panels[len(verdicts) :]:
+            axes.set_axis_off()
+        panels[0].figure.colorbar(drawn, ax=panels, label="chi²", shrink=0.7)
+    return drawing_of(panels[0].figure, "squared residuals over the field")
+
+
+def _lists(verdicts: Sequence[Verdict]) -> str:
+    sources: list[tuple[object, ...]] = [
+        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr) for v in verdicts for s in v.unexplained
+    ]
+    sources.sort(key=lambda row: -float(str(row[3])))
+    named: list[tuple[object, ...]] = [
+        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr, s.explained_by)
+        for v in verdicts
+        for s in v.sources
+        if s.explained_by and not s.explained_by.startswith("HIP ") and s.snr >= LISTED_SNR
+    ]
+    missing: list[tuple[object, ...]] = [
+        (v.shot.photo.name, r.name, r.v_mag, round(r.x_predicted_px, 1), round(r.y_predicted_px, 1))
+        for v in verdicts
+        for r in v.missing
+    ]
+    parts = []
+    for title, rows, header in (
+        ("Sources that nothing explains", sources, ("photograph", "x px", "y px", "sigmas")),
+        ("Sources that are no stars", named, ("photograph", "x px", "y px", "sigmas", "what")),
+        ("Stars that are missing", missing, ("photograph", "star", "V", "x px", "y px")),
+    ):
+        if rows:
+            more = f"<p>{len(rows) - MAX_ROWS} more in the tables.</p>" if len(rows) > MAX_ROWS else ""
+            parts.append(f"<h2>{title}</h2>{table_of(rows[:MAX_ROWS], header)}{more}")
+    return "".join(parts)

@@ -1,0 +1,288 @@
+"""The virtual tracker before a display that runs: light of its frames over an exposure, DN, found stars, an attitude."""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.attitude.wire.shown_frames import ShownFrame
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    propagate,
+    rate_between_rad_s,
+    to_matrix,
+    to_rotation_vector,
+)
+from hilstar.basics.units import NS_PER_S
+from hilstar.display.quantise import LitLight
+from hilstar.instruments.simulate.optics import DisplayColours, TwinOptics, seen_primaries
+from hilstar.instruments.simulate.simulator import TrackerBackground, detector_canvas
+from hilstar.instruments.simulate.twin import true_geometry, true_panel
+from hilstar.optics.layers.view import View
+from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.cameras import tracker_camera
+from hilstar.sky.stars import split_by_rate
+from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
+from hilstar.tracker.mosaic import software_image, software_psf_px
+
+TRACKING, LOST, TOO_FEW, BLINDED = "tracking", "lost in space", "too few stars", "blinded"
+KEPT_NS = 10 * NS_PER_S  # frames that an exposure may still be of
+SEEN_SIGMAS = 3.0  # in a pixel's noise: fainter stars are not expected in an image
+MAX_EXPECTED = 300  # brightest stars that are
+MAX_REPORTED = 30  # stars
+BLINDED_SHARE = 0.05  # detector pixels at the last code
+STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
+MAX_WINDOW_PX = 6.0
+STALE_S, TURN_S = 5.0, 1.0  # an attitude older than this predicts no other; two further apart than that tell no rate
+
+
+@dataclass(frozen=True, slots=True)
+class Exposed:
+    """What an exposure had of the display: lit pixels (n,), their mean light (n, primaries), e-/s, and the mean attitude.
+
+    `span_ns` are its begin and end; `frames` it had, and the share of it in which the field was not blank.
+    """
+
+    span_ns: tuple[int, int]
+    lit: IntArray
+    light_e_per_s: FloatArray
+    q_icrs_to_cam: FloatArray | None
+    frames: int
+    shown_share: float
+
+    @property
+    def middle_ns(self) -> int:
+        """The middle of the exposure."""
+        return sum(self.span_ns) // 2
+
+
+class WatchedFrames:
+    """The newest frames of a display, each lit until the next; `light_of` gives a frame's pixels' light (n, primaries)."""
+
+    def __init__(self, light_of: Callable[[ShownFrame], FloatArray]) -> None:
+        self.received = self.missing = 0
+        self._light_of = light_of
+        self._frames: deque[ShownFrame] = deque()
+
+    def add(self, frame: ShownFrame) -> None:
+        """Take a frame. One that is older than the last begins a new run."""
+        last = self._frames[-1].head if self._frames else None
+        if last is not None and (frame.head.lit_ns <= last.lit_ns or frame.head.frame <= last.frame):
+            self._frames.clear()
+        elif last is not None:
+            self.missing += frame.head.frame - last.frame - 1
+        self.received += 1
+        self._frames.append(frame)
+        while len(self._frames) > 1 and self._frames[1].head.lit_ns < frame.head.lit_ns - KEPT_NS:
+            self._frames.popleft()
+
+    @property
+    def newest_ns(self) -> int:
+        """When the newest frame was lit; 0 before any."""
+        return self._frames[-1].head.lit_ns if self._frames else 0
+
+    def exposed(self, begin_ns: int, end_ns: int) -> Exposed | None:
+        """The mean of what was lit in a span; None where its beginning is not known."""
+        frames = list(self._frames)
+        if not frames or frames[0].head.lit_ns > begin_ns:
+            return None
+        ends_ns = [frame.head.lit_ns for frame in frames[1:]] + [end_ns]
+        places: list[npt.NDArray[np.uint32]] = []
+        lights: list[FloatArray] = []
+        turns: list[tuple[FloatArray, float]] = []
+        for frame, until_ns in zip(frames, ends_ns, strict=True):
+            share = (min(until_ns, end_ns) - max(frame.head.lit_ns, begin_ns)) / (end_ns - begin_ns)
+            if share <= 0:
+                continue
+            places.append(frame.lit)
+            lights.append(self._light_of(frame) * share)
+            if (q := frame.q_icrs_to_cam) is not None:
+                turns.append((q, share))
+        lit, first = np.unique(np.concatenate(places), return_inverse=True)
+        columns = np.concatenate(lights).T
+        light = np.array([np.bincount(first, one, minlength=len(lit)) for one in columns], dtype=np.float64).T
+        shown = sum((share for _, share in turns), 0.0)
+        return Exposed((begin_ns, end_ns), lit.astype(np.intp), light, _mean(turns), len(places), shown)
+
+
+def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
+    """The mean rotation of attitudes with weights: of small turns from the first."""
+    if not turns:
+        return None
+    first, total = turns[0][0], sum(share for _, share in turns)
+    about = np.sum([share / total * to_rotation_vector(multiply(q, conjugate(first))) for q, share in turns], axis=0)
+    return normalise(multiply(from_rotation_vector(about), first))
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """An exposure's answer before anything is planted: its attitude (None: none was found), the stars that it rests on.
+
+    `mode` is one of the four words above; LOST is "lost in space", solved or not.
+    """
+
+    exposed: Exposed
+    mode: str
+    found: FoundStars
+    identified: Identified | None = None
+
+
+Solve = Callable[[FoundStars, npt.NDArray[np.uint16]], FloatArray | None]
+
+
+class LiveTracker(Closing):
+    """A bench's virtual tracker, as a watcher of its display's frames. Free it with `close`.
+
+    `lost_in_space` gives an attitude of stars or of an image when none is expected; None: each exposure's true one is taken.
+    Raises InputError as the bench does.
+    """
+
+    lost_in_space: Solve | None = None
+
+    def __init__(self, file: BenchFile, rng: np.random.Generator) -> None:
+        self.file, self.config, self._rng = file, file.config, rng
+        tracker = self.config.tracker
+        self.exposure_s = tracker.exposure_s
+        self.camera = tracker_camera(tracker, file.folder)
+        self.canvas = detector_canvas(file, self.camera)
+        self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
+        with open_bench(file) as bench:
+            self._bench = bench  # its light; its renderer is closed
+            self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
+            self._panel = true_panel(bench)
+            self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
+            self._colours = DisplayColours.of(bench)
+            self._optics = TwinOptics(true_geometry(bench, self.camera), bench.tracker_psf)
+            glow_e_per_s = self._optics.glow_e_per_s(self._panel)
+            noise_e2 = tracker.detector.noise(np.median(glow_e_per_s) * self.exposure_s, self.exposure_s).total_e2
+            faintest = SEEN_SIGMAS * float(np.sqrt(noise_e2)) / self.canvas.psf.peak_share / self.exposure_s
+            self.stars, _ = split_by_rate(bench.stars, max(faintest, bench.faintest_shown_e_per_s))
+        background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
+        glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
+        self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
+        self._radius_rad = self.camera.field_radius_rad(0.0)
+        self._before: tuple[int, FloatArray] | None = None
+        self._last: tuple[int, FloatArray] | None = None
+        self.refused = 0
+        self.frames = WatchedFrames(self._light)
+
+    def _light(self, frame: ShownFrame) -> FloatArray:
+        levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
+        panels, columns = self._panel.primaries or (self._panel,), levels.reshape(len(levels), math.prod(levels.shape[1:])).T
+        lights = [one.response.light[k] * one.flux_at_white_e_per_s for one, k in zip(panels, columns, strict=True)]
+        light = np.stack(lights, axis=1)
+        if self._panel.uniformity is not None:
+            light = light * self._panel.uniformity.ravel()[frame.lit, None]
+        return np.asarray(light)
+
+    def take(self, frame: ShownFrame) -> None:
+        """Take a frame. Raises InputError for one of another display."""
+        head = frame.head
+        kind = head.width, head.height, head.bits, head.channels
+        mine = *self._size_px, self._bits, 1 if self._rgb is None and not self._panel.primaries else 3
+        if kind != mine:
+            shown, wanted = ("{} x {} pixels of {} bits in {} channels".format(*each) for each in (kind, mine))
+            raise InputError(f"frames of {shown}, the bench file has {wanted}; give the bench file of serve")
+        self.frames.add(frame)
+
+    def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
+        """The DN of an exposure."""
+        lights = (LitLight(exposed.lit, light) for light in exposed.light_e_per_s.T)
+        images = self._optics.images_e_per_s(lights, self._primaries)
+        light = self._colours.shown(images) * self.exposure_s
+        light += self._under_e
+        return self._detector.expose(light, self.exposure_s, self._rng)
+
+    def solve(self, exposed: Exposed) -> Solved:
+        """The attitude of an exposure."""
+        dn = self.expose(exposed)
+        expected = self._expected(exposed)
+        found = self._found(dn, exposed, expected)
+        settings = self.config.tracker.detector
+        if np.count_nonzero(dn == 2**settings.bits - 1) > BLINDED_SHARE * dn.size:
+            return self._answered(Solved(exposed, BLINDED, found))
+        identified = None if expected is None else identify(found, expected, self._near, self._place)
+        mode = TRACKING
+        if identified is None and self.lost_in_space is not None and len(found):
+            mode = LOST
+            guess = self.lost_in_space(found, dn)
+            identified = None if guess is None else identify(found, guess, self._near, self._place)
+        if identified is None:
+            mode = TOO_FEW if len(found) < MIN_STARS else LOST
+        return self._answered(Solved(exposed, mode, found, identified))
+
+    def _answered(self, solved: Solved) -> Solved:
+        if solved.identified is not None:
+            at_ns = solved.exposed.middle_ns
+            self._before, self._last = self._last, (at_ns, solved.identified.q_icrs_to_cam)
+        return solved
+
+    def _expected(self, exposed: Exposed) -> FloatArray | None:
+        """The attitude that the last two lead to, or the true one; None where none is known."""
+        if self.lost_in_space is None:
+            return exposed.q_icrs_to_cam
+        if self._last is None or exposed.middle_ns - self._last[0] > STALE_S * NS_PER_S:
+            return None
+        return propagate(self._last[1], self.rate_cam_rad_s(), (exposed.middle_ns - self._last[0]) / NS_PER_S)
+
+    def rate_cam_rad_s(self) -> FloatArray:
+        """The turn between the last two attitudes (3,), cam; 0 where there are none of the last second."""
+        before, last = self._before, self._last
+        if before is None or last is None or last[0] - before[0] > TURN_S * NS_PER_S:
+            return np.zeros(3)
+        return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
+
+    def _found(self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None) -> FoundStars:
+        psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
+        streak_px = float(np.linalg.norm(self.rate_cam_rad_s()[:2])) * self.exposure_s * self.camera.focal_length_px
+        window_px = max(1.0, *psf_px, min(streak_px / np.sqrt(12), MAX_WINDOW_PX) if streak_px > STREAK_PX else 0.0)
+        still = streak_px <= STREAK_PX
+        image = software_image(dn, self.config.tracker.detector)
+        seen = find_stars(image, CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None))
+        good = ~seen.at_edge
+        x_px, y_px = seen.x_px[good], seen.y_px[good]
+        flux_e = seen.flux[good] * self.config.tracker.detector.gain_e_per_dn
+        return FoundStars(x_px, y_px, flux_e, normalise(self.camera.rays(x_px, y_px)))
+
+    def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
+        """The brightest stars of an exposure, as a tracker reports them."""
+        found, pairs, gain = solved.found, solved.identified, self.config.tracker.detector.gain_e_per_dn
+        hip = {} if pairs is None else dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
+        return tuple(
+            ReportedStar(float(found.x_px[k]), float(found.y_px[k]), float(found.flux_e[k]) / gain, hip.get(k) or None)
+            for k in range(min(len(found), MAX_REPORTED))
+        )
+
+    def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:
+        near = self.stars.near(to_matrix(q_icrs_to_cam)[2], self._radius_rad)
+        near = near[np.argsort(-self.stars.electrons_per_s[near], kind="stable")[:MAX_EXPECTED]]
+        return near, self.stars.directions(near)
+
+    def _place(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.camera.project(rays @ self.camera.cam_to_image.T)
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._optics.close()
+
+
+def _levels_of(codes: npt.NDArray[np.unsignedinteger], rgb: npt.NDArray[np.uint16]) -> IntArray:
+    """The levels (n,) of triples of codes (n, 3); the darkest where a triple is none of the response's."""
+    numbers = rgb.astype(np.int64) @ [1 << 32, 1 << 16, 1]
+    order = np.argsort(numbers)
+    asked = codes.astype(np.int64) @ [1 << 32, 1 << 16, 1]
+    place = order[np.minimum(np.searchsorted(numbers[order], asked), len(order) - 1)]
+    return np.where(numbers[place] == asked, place, 0)

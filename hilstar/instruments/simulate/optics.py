@@ -1,0 +1,215 @@
+"""The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
+
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four, nine or more Gaussians
+that have the square's variance together (`square_points`), spread by the tracker's PSF. The black level is a glow over the
+whole monitor, by its own density on the image.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.process.closing import Closing
+from hilstar.display.primaries import channel_matrix
+from hilstar.display.quantise import LitLight, Panel
+from hilstar.display.render.backend import Target
+from hilstar.display.render.numpy_backend import headless_context, open_backend
+from hilstar.optics.camera import Camera
+from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
+from hilstar.optics.psf import Psf, square_points
+from hilstar.optics.sprites import mean_share, pack_sprites
+from hilstar.server.bench.build import bench_primaries, named_channels
+from hilstar.server.bench.frame import Bench
+from hilstar.tracker.mosaic import in_pixels
+
+Mirror = Literal["none", "x", "y", "swap"]
+POINTS_AT_ONCE = 400_000
+PIXELS_AT_ONCE = 500_000  # of a glow, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
+
+
+@dataclass(frozen=True, slots=True)
+class BenchGeometry:
+    """Where the monitor stands before the tracker: `monitor` maps cam to its pixels, `tracker` maps cam to the detector's.
+
+    `mirror` is what the screen does to its image, about the middle: columns reversed, rows reversed, or axes swapped.
+    """
+
+    monitor: Camera
+    tracker: Camera
+    mirror: Mirror = "none"
+
+    def to_tracker(
+        self, x_px: FloatArray, y_px: FloatArray, place_px: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[FloatArray, FloatArray]:
+        """Tracker pixels of light at `place_px` from the middles of monitor pixels, (n,) each; NaN behind the tracker."""
+        x_px, y_px = self.shown_at(x_px, y_px)
+        rays = self.monitor.rays(x_px + place_px[0], y_px + place_px[1])
+        return self.tracker.project(rays @ self.tracker.cam_to_image.T)
+
+    def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
+        return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
+
+    def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the mirror shows pixels (n,) of the image, and which pixels it shows there."""
+        width, height = self.monitor.resolution_px
+        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
+        match self.mirror:
+            case "x":
+                return 2 * middle_x - x_px, y_px
+            case "y":
+                return x_px, 2 * middle_y - y_px
+            case "swap":
+                return middle_x + (y_px - middle_y), middle_y + (x_px - middle_x)
+            case _:
+                return x_px, y_px
+
+
+class Primary(NamedTuple):
+    """A monitor's primary before the tracker's optics: where its light lies within a pixel, and its glass's spectrum.
+
+    That is each of the file's wavelengths' share (L,) of its electrons; None: as of light without a spectrum.
+    """
+
+    place_px: tuple[float, float] = (0.0, 0.0)
+    shares: FloatArray | None = None
+
+
+ALL_ALIKE = (Primary(),)
+
+
+def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
+    """The primaries of a bench before its tracker's optics: one for all where they are not driven apart."""
+    colours, psf = bench.colours, bench.tracker_psf
+    if colours is None:
+        return ALL_ALIKE
+    spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if isinstance(psf, GlassPsf) else None
+    places = [(float(x), float(y)) for x, y in colours.places_px]
+    return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
+
+
+@dataclass(frozen=True, slots=True)
+class DisplayColours:
+    """A display's light in the pixels of a tracker with a mosaic; all of it in those of a tracker without.
+
+    `by_primary` (channels, primaries) are the channels' shares of a primary's electrons, `white` (channels,) of black's.
+    """
+
+    bayer: str | None
+    by_primary: FloatArray
+    white: FloatArray
+
+    @classmethod
+    def of(cls, bench: Bench) -> "DisplayColours":
+        """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean colour of the stars."""
+        config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
+        bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
+        if bayer is None or stars.colours is None:
+            return cls(None, np.empty((0, 0)), np.empty(0))
+        if colours is not None:
+            return cls(bayer, colours.by_primary, colours.by_primary @ colours.of_white)
+        white = mean_share(stars.colours, stars)
+        if primaries is not None:
+            white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
+        return cls(bayer, white[:, None], white)
+
+    def shown(self, images: FloatArray) -> FloatArray:
+        """Light of each primary (primaries, h, w) in the detector's pixels (h, w)."""
+        if self.bayer is None:
+            return np.asarray(images.sum(axis=0)) if len(images) > 1 else images[0]
+        return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
+
+    def grey(self, image: FloatArray) -> FloatArray:
+        """The black level's light (h, w) in the detector's pixels."""
+        return image if self.bayer is None else in_pixels(np.multiply.outer(self.white, image), self.bayer)
+
+
+class TwinOptics(Closing):
+    """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
+
+    def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
+        self.geometry = geometry
+        side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+        self._steps, self._psf = square_points(side_px, psf)
+        # A pixel farther than this from the detector lights none of it, though it be twice as large there as on the axis.
+        self._reach_px = 2 * side_px + self._psf.footprint_px / 2 + 1
+        self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
+
+    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:
+        """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w), float64."""
+        images = [self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)]
+        return np.array(images) if len(images) > 1 else images[0][None]
+
+    def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
+        """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit ones or all (H, W), float64."""
+        lit = light_e_per_s if isinstance(light_e_per_s, LitLight) else LitLight.of(light_e_per_s)
+        lit = self._near_the_detector(lit, primary)
+        at_once = POINTS_AT_ONCE // len(self._steps) ** 2
+        total = self._points(lit.part(0, at_once), primary)
+        for begin in range(at_once, len(lit.place), at_once):
+            total += self._points(lit.part(begin, begin + at_once), primary)
+        return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
+
+    def _near_the_detector(self, lit: LitLight, primary: Primary) -> LitLight:
+        """The lit pixels that may light the detector, of a screen that it may see a small part of."""
+        rows, columns = np.divmod(lit.place, self.geometry.monitor.resolution_px[0])
+        x_px, y_px = self.geometry.to_tracker(columns.astype(np.float64), rows.astype(np.float64), primary.place_px)
+        width, height = self.geometry.tracker.resolution_px
+        near = (x_px >= -self._reach_px) & (x_px < width + self._reach_px)
+        near &= (y_px >= -self._reach_px) & (y_px < height + self._reach_px)
+        return LitLight(lit.place[near], lit.e_per_s[near])
+
+    def _points(self, lit: LitLight, primary: Primary) -> FloatArray:
+        dx, dy = (step.ravel() for step in np.meshgrid(self._steps, self._steps))
+        rows, columns = np.divmod(lit.place[:, None], self.geometry.monitor.resolution_px[0])
+        x_px, y_px = self.geometry.to_tracker((columns + dx).ravel(), (rows + dy).ravel(), primary.place_px)
+        light = np.repeat(lit.e_per_s / len(dx), len(dx))
+        star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
+        sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
+        if isinstance(self._psf, GlassPsf):  # grey light has no spectrum here
+            shares = self._psf.mean_shares if primary.shares is None else primary.shares
+            return self._psf.image(sprites, shares, size_px).astype(np.float64)
+        self._renderer.draw(sprites)
+        return self._renderer.linear().astype(np.float64)
+
+    def glow_e_per_s(self, panel: Panel) -> FloatArray:
+        """Electrons per second of each tracker pixel (h, w) from the black level of the whole monitor.
+
+        The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the pixel, not within it.
+        """
+        width, height = self.geometry.tracker.resolution_px
+        glow = np.zeros((height, width))
+        if not panel.response.black:
+            return glow
+        rows = max(1, PIXELS_AT_ONCE // width)
+        for top in range(0, height, rows):
+            below = min(top + rows, height)
+            # A density is a slope: of a band's first and last row, too, it needs the rows beside them.
+            first, last = max(top - 1, 0), min(below + 1, height)
+            glow[top:below] = self._glow_of_rows(panel, first, last)[top - first : below - first]
+        return glow
+
+    def _glow_of_rows(self, panel: Panel, first: int, last: int) -> FloatArray:
+        """The glow of the detector's rows from `first` to before `last`."""
+        width, _ = self.geometry.tracker.resolution_px
+        y, x = np.mgrid[first:last, 0:width].astype(np.float64)
+        seen_x, seen_y = (part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
+        (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
+        # Beyond a lens there is no place: a pixel whose neighbour looks there has no density either.
+        density = np.nan_to_num(np.abs(x_right * y_down - x_down * y_right))
+        screen_w, screen_h = self.geometry.monitor.resolution_px
+        on_screen = np.abs(seen_x - (screen_w - 1) / 2) <= screen_w / 2
+        on_screen &= np.abs(seen_y - (screen_h - 1) / 2) <= screen_h / 2
+        light = np.full(on_screen.shape, panel.response.black * panel.flux_at_white_e_per_s)
+        if panel.uniformity is not None:
+            column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(np.intp)
+            row = np.clip(np.rint(np.where(on_screen, seen_y, 0)), 0, screen_h - 1).astype(np.intp)
+            light = light * panel.uniformity[row, column]
+        return np.asarray(np.where(on_screen, light * density, 0.0))
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()

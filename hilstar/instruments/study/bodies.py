@@ -1,0 +1,446 @@
+"""The study of bodies: the cost of each in a frame, the accuracy of its disc at each size, and its approach.
+
+Each body is alone on its bench; its cost is the difference from the same frame without bodies. A disc is compared with rays
+traced in float64 and with a point in its place. An approaching body is judged by frame time and by finite light.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.basics.units import NS_PER_S
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.instruments.study.settings import FULL_HD, Table, study_bench
+from hilstar.instruments.study.sweep import Judged, Load, OtherWork, Spent, in_turn
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import DiscView, Pose, disc_lights
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import join_sprites, pack_sprites
+from hilstar.server.bench.frame import Bench
+from hilstar.sky.bodies.disc import Disc, lunar_share
+
+REFRESH_HZ = 60.0
+EPOCH: Table = {"epoch_utc": "2026-11-21T00:00:00Z"}
+# 400 km over a circle, made for that date
+TLE = """\
+1 99999U          26325.00000000  .00000000  00000-0  00000+0 0    05
+2 99999  51.6000 150.0000 0001000   0.0000   0.0000 15.55820000    02
+"""
+DAY_SIDE_NS = 24 * 60 * NS_PER_S  # the Sun is 72 degrees from its zenith then
+LOW_ORBIT: Table = {"orbit": "low.tle"}
+GEOCENTRE: Table = {"orbit": "geocentre"}
+# By the name of a bench: its bodies and its observer
+BODIES: dict[str, tuple[Table, Table]] = {
+    "nothing": ({}, {}),
+    "observer": ({}, GEOCENTRE),
+    "low orbit": ({}, LOW_ORBIT),
+    "planets": ({"planets": True}, GEOCENTRE),
+    "Moon": ({"moon": True}, GEOCENTRE),
+    "Sun": ({"sun": True}, GEOCENTRE),
+    "Earth": ({"earth": True}, LOW_ORBIT),
+    "all": ({"planets": True, "moon": True, "sun": True, "earth": True}, LOW_ORBIT),
+}
+FRAME_NS = round(NS_PER_S / REFRESH_HZ)
+SIGMA_PX = (0.85, 0.85)
+MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
+FOCAL_PX = 6000.0
+RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
+QUICK_RADII_PX = (0.1, 2.0, 12.0)
+PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
+MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400  # along each side: at most 0.07 px apart, under a tenth of sigma
+LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
+PLACES = 60
+MARGIN_PX = 8
+# Degrees from the boresight to the body's middle, of the Earth beyond its limb (negative: on it)
+NEAR_DEG: dict[str, tuple[float, ...]] = {
+    "Moon": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
+    "Sun": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
+    "Earth": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.0, -1.0, -3.0, -8.0, -20.0, -40.0, -70.0),
+}
+QUICK_DEG = {"Moon": (40.0, 0.5), "Sun": (40.0, 0.5), "Earth": (40.0, 0.0, -70.0)}
+ROUNDS, QUICK_ROUNDS = 40, 3
+QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
+FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
+FLOOR = 1e-6  # lower end of the chart's axis
+
+
+@contextmanager
+def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
+    """The benches of these names, which end with the context. Raises InputError or MachineError."""
+    common: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ, "bits": 12},
+        "collimator": {"focal_length_mm": 350.0},
+        "sky": EPOCH,
+        "render": {"quantisation": "round", "motion": "off", "brightest_v_mag": 2.0},
+    }
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        (Path(folder) / "low.tle").write_text(TLE)
+        benches = {}
+        for name in names:
+            own = {key: table for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True) if table}
+            path = Path(folder) / f"{name.replace(' ', '_')}.toml"
+            benches[name] = stack.enter_context(study_bench(path, {**common, **own}))
+        yield benches
+
+
+def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
+    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb (negative: on it)."""
+    if bench.moving is None:
+        raise AssertionError("a bench with bodies moves")
+    disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body)
+    off_rad = np.radians(off_deg) + (disc.radius_rad if body == "Earth" else 0.0)
+    # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
+    beside = disc.sun if body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
+    beside = beside - (beside @ disc.direction) * disc.direction
+    beside /= np.linalg.norm(beside)
+    x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
+    return from_radec_roll_deg(float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arcsin(z))), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyScene:
+    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock from frame to frame."""
+
+    name: str
+    bench: str
+    body: str
+    off_deg: float
+    t_ns: int = 0
+    step_ns: int = FRAME_NS
+
+
+def at_a_step(scene: str) -> bool:
+    """Whether each frame of a scene, by its name, is the first of a step of the orbit."""
+    by_name = {known.name: known for known in SCENES}
+    return by_name[scene].step_ns != FRAME_NS
+
+
+@dataclass(frozen=True, slots=True)
+class BodyCost:
+    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the difference.
+
+    `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy machine changes it least,
+    and in software rendering it is the whole cost. `discs` are the bodies drawn as discs, `stars` counts the stars drawn.
+    """
+
+    scene: str
+    frame_ms: float
+    without_ms: float
+    cost_ms: float
+    cpu_ms: float
+    discs: str
+    stars: int
+
+
+SCENES = (
+    BodyScene("from the Earth's centre, no body", "observer", "Moon", 60.0),
+    BodyScene("planets, none in view", "planets", "Jupiter", 60.0),
+    BodyScene("Uranus in view, a point", "planets", "Uranus", 0.3),
+    BodyScene("Jupiter in view, 1.1 px", "planets", "Jupiter", 0.3),
+    BodyScene("Moon, not in view", "Moon", "Moon", 60.0),
+    BodyScene("Moon in view, 55 px", "Moon", "Moon", 0.3),
+    BodyScene("Sun, not in view", "Sun", "Sun", 60.0),
+    BodyScene("Sun in view, 57 px", "Sun", "Sun", 0.3),
+    BodyScene("from a low orbit, no body", "low orbit", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("Earth, not in view", "Earth", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("Earth's limb across the middle", "Earth", "Earth", 0.0, DAY_SIDE_NS),
+    BodyScene("Earth fills the field", "Earth", "Earth", -60.0, DAY_SIDE_NS),
+    BodyScene("all of them, none in view", "all", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("the same, at a step of the orbit", "all", "Earth", 80.0, DAY_SIDE_NS, 2 * NS_PER_S),
+)
+
+
+def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
+    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all" and the scene's."""
+    bench, nothing = benches[scene.bench], benches["nothing"]
+    knows = bench.moving is not None and scene.body in bench.moving.names
+    q = attitude(bench if knows else benches["all"], scene.body, scene.off_deg, scene.t_ns)
+    without, shown = fastest((nothing, bench), q, scene.t_ns, scene.step_ns, rounds)
+    stars = bench.draw(q, t_ns=scene.t_ns).star_count
+    discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.t_ns)))
+    cost = shown.wall_ms - without.wall_ms, shown.cpu_ms - without.cpu_ms
+    return BodyCost(scene.name, shown.wall_ms, without.wall_ms, *cost, discs, stars)
+
+
+def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int) -> tuple[Spent, Spent]:
+    """The fastest frame, from attitude to levels in memory, of a bench without bodies and of one with, timed in turn.
+
+    The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
+    """
+    nothing, bench = benches
+    works = {"nothing": lambda _: nothing.draw(q).levels, "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels}
+    without, shown = (Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values())
+    return without, shown
+
+
+@dataclass(frozen=True, slots=True)
+class Exactness:
+    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its middle, single pixels.
+
+    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel; `point_pixel_off` is that of a point.
+    """
+
+    body: str
+    phase_deg: float
+    radius_px: float
+    flux_off: float
+    middle_off_px: float
+    limb_off_px: float
+    pixel_off: float
+    point_pixel_off: float
+
+
+def moon(radius_px: float, phase_deg: float) -> Disc:
+    """A Moon of that radius off the middle of an image."""
+    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    side = np.cross(ahead, [0.3, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    phase = np.radians(phase_deg)
+    sun = -np.cos(phase) * ahead + np.sin(phase) * side
+    far = 1 / np.sin(radius_px / FOCAL_PX)
+    disc = Disc("Moon", ahead, far, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), sun, "lunar-lambert", 1.0, lunar_share(phase_deg))
+    return disc.of_rate(1e6)
+
+
+def exactness(radius_px: float, phase_deg: float) -> Exactness:
+    """A Moon as it is drawn, against rays."""
+    from scipy.ndimage import center_of_mass
+
+    disc = moon(radius_px, phase_deg)
+    half = int(np.ceil(radius_px)) + MARGIN_PX
+    size, psf = (2 * half + 1, 2 * half + 1), GaussianPsf(SIGMA_PX)
+    camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
+    with Renderer(Target(size, psf)) as renderer:
+        place = camera.project(disc.direction[None])
+        point = pack_sprites(*place, np.array([1e6]), np.zeros(1, dtype=np.intp), size, renderer.footprint_px)
+        lights = disc_lights(disc, DiscView(camera, psf, (Pose(np.eye(3)),)), covers=True)
+        renderer.draw(replace(join_sprites([], renderer.footprint_px), extended=tuple(lights)))
+        drawn = renderer.linear().astype(np.float64)
+        renderer.draw(point)
+        as_point = renderer.linear().astype(np.float64)
+    truth = traced(disc, camera)
+    limb = np.nan
+    if radius_px >= LIMB_PX and phase_deg <= 90:
+        limb = float(np.nanmax(np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))))
+    return Exactness(
+        body=disc.name,
+        phase_deg=phase_deg,
+        radius_px=radius_px,
+        flux_off=float(drawn.sum() / truth.sum() - 1),
+        middle_off_px=float(np.abs(np.subtract(center_of_mass(drawn), center_of_mass(truth))).max()),
+        limb_off_px=limb,
+        pixel_off=float(np.abs(drawn - truth).max() / truth.max()),
+        point_pixel_off=float(np.abs(as_point - truth).max() / truth.max()),
+    )
+
+
+def traced(disc: Disc, camera: Camera) -> FloatArray:
+    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the Gaussian over the pixels."""
+    from scipy.special import ndtr
+
+    radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
+    count = int(np.clip(RAYS_A_PX * 2 * radius_px, MIN_RAYS, MAX_RAYS))
+    step_px = 2 * radius_px / count
+    (x_mid,), (y_mid,) = camera.project(disc.direction[None])
+    along = (np.arange(count) + 0.5) * step_px - radius_px
+    x_px, y_px = np.meshgrid(x_mid + along, y_mid + along)
+    rays = camera.rays(x_px.ravel(), y_px.ravel())
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    # The solid angle of a square of the image plane: the cube of the ray's cosine to the axis
+    light = disc.radiance(rays) * (step_px / camera.focal_length_px) ** 2 * rays[:, 2] ** 3
+    width, height = camera.resolution_px
+    across = np.diff(ndtr((np.arange(width + 1) - 0.5 - (x_mid + along)[:, None]) / SIGMA_PX[0]), axis=1)
+    down = np.diff(ndtr((np.arange(height + 1) - 0.5 - (y_mid + along)[:, None]) / SIGMA_PX[1]), axis=1)
+    return np.asarray(down.T @ light.reshape(count, count) @ across)
+
+
+def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
+    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward of the limb."""
+    from scipy.ndimage import map_coordinates
+
+    half = image.shape[0] // 2
+    lit = 1.0 if phase_deg else np.pi  # radians to either side of the Sun's
+    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    sun = np.cross(ahead, [0.3, 1.0, 0.0])
+    angle = np.arctan2(sun[1], sun[0]) + np.linspace(-lit, lit, PLACES)
+    steps = np.linspace(-3.0, 3.0, 241)
+    way = radius_px + steps[None, :]
+    x_px = half + MIDDLE_PX[0] + way * np.cos(angle)[:, None]
+    y_px = half + MIDDLE_PX[1] + way * np.sin(angle)[:, None]
+    profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
+    level = profile[:, :1] / 2
+    below = profile < level
+    first = np.maximum(np.argmax(below, axis=1), 1)
+    rows = np.arange(PLACES)
+    high, low = profile[rows, first - 1], profile[rows, first]
+    place = steps[first - 1] + (steps[1] - steps[0]) * (high - level[:, 0]) / (high - low)
+    return np.asarray(np.where(below.any(axis=1), place, np.nan))
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and without any body.
+
+    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0: fainter), `finite` says that
+    every pixel's light is a number, `white_is_white` that each with more than white has white's code; `stars` those drawn.
+    """
+
+    body: str
+    off_deg: float
+    frame_ms: float
+    cpu_ms: float
+    without_ms: float
+    over_white_mag: float
+    finite: bool
+    white_is_white: bool
+    stars: int
+
+
+def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: int) -> Near:
+    """A body at one place. `benches` has "nothing" and the body's own."""
+    bench, nothing = benches[body], benches["nothing"]
+    start_ns = DAY_SIDE_NS if body == "Earth" else 0
+    q = attitude(bench, body, off_deg, start_ns)
+    without, shown = fastest((nothing, bench), q, start_ns, FRAME_NS, rounds)
+    drawn = bench.draw(q, t_ns=start_ns)
+    levels = drawn.levels.copy()
+    light = bench.renderer.linear()
+    brightest, white = float(light.max()), bench.flux_at_white_e_per_s
+    return Near(
+        body=body,
+        off_deg=off_deg,
+        frame_ms=shown.wall_ms,
+        cpu_ms=shown.cpu_ms,
+        without_ms=without.wall_ms,
+        over_white_mag=2.5 * math.log10(max(brightest, 1e-9) / white),
+        finite=bool(np.isfinite(light).all()),
+        white_is_white=bool((levels[light > white] == bench.calibration.response.white).all()),
+        stars=drawn.star_count,
+    )
+
+
+def run(directory: Path, quick: bool = False) -> Judged:
+    """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each finding. Raises InputError."""
+    others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
+    scenes = [scene for scene in SCENES if scene.bench in QUICK_BENCHES] if quick else SCENES
+    with opened(QUICK_BENCHES if quick else tuple(BODIES)) as benches:
+        costs = [measure_cost(benches, scene, rounds) for scene in scenes]
+        nears = [
+            approach(benches, body, off_deg, max(QUICK_ROUNDS, rounds // 4))
+            for body, angles in (QUICK_DEG if quick else NEAR_DEG).items()
+            for off_deg in angles
+        ]
+    load = others.load()
+    sizes = [exactness(radius, phase) for phase in PHASES_DEG for radius in (QUICK_RADII_PX if quick else RADII_PX)]
+    for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
+        write_records(directory / f"{name}.csv", records)
+    cost_line = draw_costs(directory / "bodies_cost", costs, load)
+    draw_sizes(directory / "bodies_size", sizes)
+    draw_limits(directory / "bodies_limits", nears, load)
+    return load.judged([cost_line, _size_line(sizes), _limits_line(nears)])
+
+
+def _size_line(sizes: Sequence[Exactness]) -> str:
+    limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
+    worst = max(sizes, key=lambda size: abs(size.flux_off))
+    return (
+        f"discs of {sizes[0].radius_px:g} to {max(s.radius_px for s in sizes):g} px in radius have their light within"
+        f" {100 * abs(worst.flux_off):.2g} % and their limb within {limb_px:.3f} px of rays in float64"
+    )
+
+
+def _limits_line(nears: Sequence[Near]) -> str:
+    slowest = max(nears, key=lambda near: near.cpu_ms)
+    return (
+        f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame ({slowest.body} at {slowest.off_deg:g}"
+        f" degrees); every pixel's light is {light_words(nears)}"
+    )
+
+
+def light_words(nears: Sequence[Near]) -> str:
+    """Whether every pixel's light is finite and clips at white, in words."""
+    if all(near.finite and near.white_is_white for near in nears):
+        return "finite, and white where it is over white"
+    return "NOT finite, or over white and not white"
+
+
+def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
+    """What each scene costs; the finding."""
+    dearest = max(costs, key=lambda cost: cost.cpu_ms)
+    unseen = [cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)]
+    unseen_ms = max(0.0, *unseen)
+    note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
+    finding = (
+        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest body,"
+        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    )
+    title = load.title(finding, "Bodies of each kind on top of a frame")
+    with chart(path, title, note=load.note(note), height_inch=4.4) as (axes,):
+        value_bars(axes, [capital(cost.scene) for cost in costs], [round(max(cost.cpu_ms, 0.0), 2) for cost in costs], BLUE)
+        axes.set_xlabel("processor time on top [ms]")
+    return (
+        f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time a frame, and all of them"
+        f" {max(costs[-1].cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    )
+
+
+def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
+    """The errors of discs against their radius."""
+    note = f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it is drawn as a point."
+    with chart(path, _size_line(sizes), panels=3, note=note, height_inch=8.4) as panels:
+        light, place, pixel = panels
+        for phase_deg, colour in zip(PHASES_DEG, SERIES, strict=False):
+            rows = [size for size in sizes if size.phase_deg == phase_deg]
+            radius, label = [size.radius_px for size in rows], f"{phase_deg:g} deg"
+            for axes, name, style, shown in (
+                (light, "flux_off", "o-", label),
+                (place, "limb_off_px", "s-", "_"),
+                (place, "middle_off_px", "o:", label),
+                (pixel, "pixel_off", "o-", label),
+                (pixel, "point_pixel_off", "x:", "_"),
+            ):
+                values = [max(abs(getattr(size, name)), FLOOR) for size in rows]
+                axes.loglog(radius, values, style, color=colour, ms=4, label=shown)
+        light.set(title="Light of the whole disc", ylabel="error [share]")
+        place.set(title="Place of its limb (squares, solid) and of its middle (dotted)", ylabel="error [px]")
+        pixel.set(
+            title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)", ylabel="error [of the brightest]"
+        )
+        pixel.axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label="_")
+        for axes, limit in ((light, FLUX_LIMIT), (place, LIMB_LIMIT_PX)):
+            axes.axhline(limit, color=INK, linestyle="--", lw=1.2, label="limit")
+        plain_ticks(pixel.xaxis, sorted({size.radius_px for size in sizes}))
+        pixel.set_xlabel("radius of the Moon's disc [px]")
+        label_ends(*panels)
+
+
+def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
+    """Processor time and light as bodies come near."""
+    note = "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in software."
+    title = load.title(_limits_line(nears), f"Every pixel's light is {light_words(nears)}")
+    with chart(path, title, panels=2, note=load.note(note)) as (times, light):
+        for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):
+            rows = [near for near in nears if near.body == body]
+            off_deg = [near.off_deg for near in rows]
+            times.plot(off_deg, [near.cpu_ms for near in rows], "o-", ms=4, color=colour, label=body)
+            light.plot(off_deg, [near.over_white_mag for near in rows], "o-", ms=4, color=colour, label=body)
+        times.axhline(1e3 / REFRESH_HZ, color=INK, linestyle="--", lw=1.2, label=f"{REFRESH_HZ:g} Hz")
+        light.axhline(0, color=INK, linestyle="--", lw=1.2, label="white")
+        times.set_ylim(bottom=0)
+        times.set_ylabel("processor time of a frame [ms]")
+        light.set_ylabel("brightest pixel over white [mag]")
+        light.set_xlabel("angle from the boresight [deg]")
+        light.set_xscale("symlog", linthresh=1.0)
+        plain_ticks(light.xaxis, (-70, -20, -8, -3, -1, 0, 1, 3, 8, 20, 40))
+        label_ends(times, light)

@@ -1,0 +1,389 @@
+"""Measurements of the study of the chain: error over some exposures, time in turn with all other combinations, error budget.
+
+A frame goes from the sender's samples to codes; an exposure sums the light of its frames. The budget starts from a display
+that does everything exactly and adds one step at a time, in the order of the chain. Each step is charged with the change of the
+measured stars; the steps add up to the whole error, star by star. Cut sprites come last, because codes leave the cut light
+dark: earlier it would be charged twice.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Attitude, Timeline
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import propagate
+from hilstar.basics.units import ERROR_OF_MEDIAN, NS_PER_S
+from hilstar.instruments.study.chain import choices
+from hilstar.instruments.study.chain.tracker import Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off, points
+from hilstar.instruments.study.predictors import Movement, attitude_at
+from hilstar.instruments.study.sweep import Spent, spent
+from hilstar.optics.frame_motion import CameraTurn, swept_sprites
+from hilstar.server.bench.frame import Bench
+from hilstar.sky.stars import Stars
+
+STAGES = ("prediction", "sprites", "drawing and codes", "read-back")
+# Each frame that is timed has an attitude of its own, as a sender's have: nothing can be kept from the frame before.
+NUDGE_RAD = np.array([1e-7, 1e-7, 0.0])
+FIRST_FRAMES = (20, 151, 325)  # first frames of the exposures: no whole number of cycles of `temporal` or of the jitter apart
+PHASE_STEP_PX = (3.37, 4.71)  # tracker pixels, from exposure to exposure
+SIGMAS_IN_IQR = 1.349  # normal distribution
+FRAMES_A_VISIT = 2
+MIN_ROUNDS, MAX_ROUNDS = 4, 60
+SEED = 1
+STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
+RSS, WHOLE = "rss", "whole"
+DEFAULT, AUTO = "default", "auto"
+DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a time
+
+
+@dataclass(slots=True)
+class DrawingChain:
+    """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed, from samples to codes."""
+
+    combination: choices.Combination
+    bench: Bench
+    movement: Movement
+    timed_frames: int = 0
+
+    def timeline(self, movement: Movement, light_ns: int) -> Timeline:
+        """The samples received when the frame is started whose light is at `light_ns`."""
+        samples = movement.samples(light_ns - choices.lead_ns(self.bench.config))
+        return choices.filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
+
+    def attitude(self, light_ns: int) -> Attitude:
+        """The attitude at a frame's light, predicted from the samples received when the frame is started."""
+        return attitude_at(self.timeline(self.movement, light_ns), light_ns)
+
+    def rate(self, attitude: Attitude) -> FloatArray | None:
+        """The rate along which stars are drawn as paths, rad/s; None where they are drawn as points."""
+        return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
+
+    def lit(self, number: int, light_ns: int) -> choices.Lit:
+        """The pixels that a frame's codes light, and the light of each, electrons per second."""
+        attitude, panel = self.attitude(light_ns), self.bench.panel
+        levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
+        place = np.flatnonzero(levels)
+        light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
+        return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
+
+    def exposed(self, seen: choices.PanelExposure) -> FloatArray:
+        """The mean light (H, W) over an exposure; at rest one frame stands for all, except with `temporal`."""
+        alike = not self.movement.turns and self.combination.quantisation != "temporal"
+        return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
+
+    def sprite_px(self) -> str:
+        """The sides of its sprites, px."""
+        sides = [side.side_px for side in self.bench.renderer.target.sides] or [self.bench.psf.footprint_px]
+        low, high = min(sides), max(sides)
+        return f"{low}" if low == high else f"{low} to {high}"
+
+    def frame_ms(self) -> Spent:
+        """Wall and processor time of the next frame, ms."""
+        timeline, light_ns = self._next()
+
+        def draw() -> object:
+            attitude = attitude_at(timeline, light_ns)
+            return self.bench.draw(attitude.q_icrs_to_cam, self.timed_frames, self.rate(attitude)).levels
+
+        return spent(draw)
+
+    def stages_ms(self) -> tuple[float, ...]:
+        """The next frame's time by STAGES, with a wait for the GPU before its codes are read."""
+        (timeline, light_ns), bench = self._next(), self.bench
+        marks = [time.perf_counter()]
+        attitude = attitude_at(timeline, light_ns)
+        marks.append(time.perf_counter())
+        sprites = bench.light(bench.view(attitude.q_icrs_to_cam, self.rate(attitude)))
+        marks.append(time.perf_counter())
+        drawn = bench.draw_sprites(sprites, self.timed_frames)
+        bench.renderer.finish()
+        marks.append(time.perf_counter())
+        _ = drawn.levels
+        marks.append(time.perf_counter())
+        return tuple((np.diff(marks) * 1e3).tolist())
+
+    def _next(self) -> tuple[Timeline, int]:
+        """The timeline of the next frame and its moment of light."""
+        self.timed_frames += 1
+        light_ns = NS_PER_S + self.timed_frames * round(NS_PER_S / self.bench.config.monitor.refresh_hz)
+        own = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
+        return self.timeline(replace(self.movement, q_icrs_to_cam=own), light_ns), light_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Rounds:
+    """How many exposures each combination is judged by, and for how long a scene's combinations are timed, s."""
+
+    exposures: int = len(FIRST_FRAMES)
+    time_s: float = 12.0
+
+
+QUICK = Rounds(exposures=1, time_s=0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Error:
+    """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of them as one attitude."""
+
+    stars: int
+    lost: int
+    error_arcsec: float
+    error_mag: float
+    attitude_arcsec: float
+    roll_arcsec: float
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """A frame's median time, quartile range and one sigma of the median, ms; its processor time; how many were timed."""
+
+    time_ms: float
+    iqr_ms: float
+    noise_ms: float
+    cpu_ms: float
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class StageTime:
+    """The median time of a stage of a frame at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
+
+    scene: str
+    chosen: str
+    stage: str
+    time_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorPart:
+    """What a step adds to the error (rms) at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`.
+
+    The steps RSS and WHOLE are the root sum of squares of the others, and the whole error.
+    """
+
+    scene: str
+    chosen: str
+    step: str
+    error_arcsec: float
+    error_mag: float
+
+
+@dataclass(frozen=True, slots=True)
+class CombinationRow:
+    """A combination in a scene; its fields are the columns of `chain.csv`.
+
+    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are rms over the `stars` of all
+    exposures, `lost` of them not found. `on_front` and `on_front_mag` are the fronts of `time_ms` against these two.
+    `on_front_as_filed` is the first of them among the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and
+    `prediction` of the bench file.
+    """
+
+    scene: str
+    rate_deg_s: float
+    exposure_s: float
+    bits: int
+    bit_stealing: str
+    faintest_v_mag: float
+    sprite: str
+    sprite_px: str
+    smear: str
+    prediction: str
+    quantisation: str
+    stars: int
+    lost: int
+    error_arcsec: float
+    error_mag: float
+    attitude_arcsec: float
+    roll_arcsec: float
+    time_ms: float
+    iqr_ms: float
+    noise_ms: float
+    cpu_ms: float
+    frames: int
+    on_front: str = ""
+    on_front_mag: str = ""
+    on_front_as_filed: str = ""
+    chosen: str = ""
+    as_filed: str = ""
+
+
+def said(flag: bool) -> str:
+    """A flag as it is written in the table."""
+    return "true" if flag else "false"
+
+
+class SceneMeasurement:
+    """A scene on a study's benches: its judges, one an exposure, and its combinations."""
+
+    def __init__(self, parts: choices.Parts, tracker: StudyTracker, scene: choices.ChainScene, plan: Rounds) -> None:
+        self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
+        self.movement = Movement(scene.q_icrs_to_cam, scene.rate_deg_s)
+        self.marks: choices.Marks = parts.marks(self.movement)
+        found = choices.combinations(self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag)
+        marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
+        self.combinations = list(dict.fromkeys([*found, *marked]))
+        # At rest each exposure has its stars at other sub-pixel phases.
+        step_rad = np.zeros(3) if self.movement.turns else np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
+        self.judges = []
+        for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
+            moved = replace(self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k))
+            self.judges.append(StarJudge(tracker, moved, choices.exposure(parts.own, number)))
+
+    @property
+    def star_count(self) -> int:
+        """The stars that are judged, over all exposures."""
+        return sum(len(judge) for judge in self.judges)
+
+    def chain(self, combination: choices.Combination, exposure_number: int = 0) -> DrawingChain:
+        """A combination with the movement of one exposure."""
+        return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
+
+    def outcomes(self) -> tuple[list[CombinationRow], list[StageTime]]:
+        """Every combination's error and time, and the times of the stages of `auto`."""
+        chains = [self.chain(combination) for combination in self.combinations]
+        times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
+        rows = [self.row(chain, taken) for chain, taken in zip(chains, times, strict=True)]
+        return rows, [
+            StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
+        ]
+
+    def untimed(self) -> list[CombinationRow]:
+        """Every combination's error, which no machine changes, without times."""
+        untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
+        return [self.row(self.chain(combination), untimed) for combination in self.combinations]
+
+    def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
+        """A combination's row of the table."""
+        own = chain.combination
+        chosen = {DEFAULT: self.marks.default, AUTO: self.marks.auto}
+        marked = [name for name, combination in chosen.items() if combination == own]
+        return CombinationRow(
+            scene=self.scene.name,
+            rate_deg_s=self.scene.rate_deg_s,
+            exposure_s=rounded(self.judges[0].seen.length_s),
+            bits=self.parts.own.config.monitor.bits,
+            sprite_px=chain.sprite_px(),
+            chosen=" ".join(marked),
+            as_filed=said(own == self.marks.as_filed),
+            **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
+            **asdict(self.error(own)),
+            **asdict(taken),
+        )
+
+    def error(self, combination: choices.Combination) -> Error:
+        """A combination's error over all exposures."""
+        found, turns = [], []
+        for number, judge in enumerate(self.judges):
+            light = self.chain(combination, number).exposed(judge.seen)
+            shown = judge.measure(self.tracker.image_e(light, judge.seen))
+            found.append(off(judge, shown, judge.sky))
+            turns.append(attitude_off_arcsec(shown, judge.sky))
+        arcsec, mag = pooled(found)
+        cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
+        lost = sum(int(one.lost.sum()) for one in found)
+        return Error(self.star_count, lost, *map(rounded, (arcsec, mag, cross, roll)))
+
+
+def rms_of_known(values: Sequence[float]) -> float:
+    """The rms of the finite values; NaN where there is none."""
+    known = [value for value in values if math.isfinite(value)]
+    return math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
+
+
+def pooled(found: Sequence[Off]) -> tuple[float, float]:
+    """The rms over the stars of several exposures, arcsec and mag."""
+    arcsec, mag = (np.concatenate([getattr(one, name) for one in found]) for name in ("arcsec", "mag"))
+    return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
+
+
+def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[float]]:
+    """The times of all chains, and the median times of STAGES, ms, of one of them.
+
+    In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
+    counted: it fills caches that the chain before has emptied.
+    """
+    for chain in chains:
+        chain.frame_ms()
+    taken: list[list[Spent]] = [[] for _ in chains]
+    stages: list[tuple[float, ...]] = []
+    rng, begin = np.random.default_rng(SEED), time.perf_counter()
+    for number in range(MAX_ROUNDS):
+        if number >= MIN_ROUNDS and time.perf_counter() - begin > time_s:
+            break
+        for k in rng.permutation(len(chains) + 1):
+            chain = chains[staged if k == len(chains) else k]
+            chain.frame_ms()
+            if k == len(chains):
+                stages += [chain.stages_ms() for _ in range(FRAMES_A_VISIT)]
+            else:
+                taken[k] += [chain.frame_ms() for _ in range(FRAMES_A_VISIT)]
+    return [times_of(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
+
+
+def times_of(taken: FloatArray) -> Times:
+    """The times of a work by what its frames took (n, 2), `Spent`."""
+    low, middle, high = np.percentile(taken[:, 0], (25, 50, 75))
+    noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(taken))
+    time_ms, iqr_ms, noise_ms, cpu_ms = (
+        round(float(ms), MS_PLACES) for ms in (middle, high - low, noise, np.median(taken[:, 1]))
+    )
+    return Times(time_ms, iqr_ms, noise_ms, cpu_ms, len(taken))
+
+
+def rounded(value: float) -> float:
+    """A figure with the tables' four digits."""
+    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
+
+
+def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
+    """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
+    found = [
+        [judge.sky, *(judge.measure(scene.tracker.image_e(light, judge.seen)) for light in _lights(scene, combination, number))]
+        for number, judge in enumerate(scene.judges)
+    ]
+
+    def between(before: int, after: int) -> tuple[float, float]:
+        return pooled([off(judge, one[after], one[before]) for judge, one in zip(scene.judges, found, strict=True)])
+
+    parts = [between(k, k + 1) for k in range(len(STEPS))]
+    arcsec, mag = (float(np.sqrt(sum(value**2 for value in column))) for column in zip(*parts, strict=True))
+    named = zip((*STEPS, RSS, WHOLE), (*parts, (arcsec, mag), between(0, -1)), strict=True)
+    return [ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named]
+
+
+def _lights(scene: SceneMeasurement, combination: choices.Combination, number: int) -> Iterator[FloatArray]:
+    """The mean light (H, W) of an exposure after each of STEPS."""
+    chain, seen = scene.chain(combination, number), scene.judges[number].seen
+    movement, bench, every = chain.movement, chain.bench, scene.parts.own.stars
+
+    def exposed(light_of: Callable[[int, int], choices.Lit]) -> FloatArray:
+        return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
+
+    def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> choices.Lit:
+        if along_paths:
+            return linear_light(bench, swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf))
+        return linear_light(bench, points(bench, turn.q_icrs_to_cam, stars))
+
+    def true(_: int, light_ns: int) -> choices.Lit:
+        return whole(every, CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns)), movement.turns)
+
+    def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
+        def light_of(_: int, light_ns: int) -> choices.Lit:
+            attitude = chain.attitude(light_ns)
+            rate = attitude.rate_cam_rad_s
+            turn = CameraTurn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)
+            return whole(stars, turn, along_paths and rate is not None)
+
+        return exposed(light_of)
+
+    along_paths = movement.turns and combination.smear == "path"
+    yield exposed(true)
+    yield shown_as(every, movement.turns)
+    yield shown_as(every, along_paths)
+    yield shown_as(bench.shown_stars, along_paths)
+    yield scene.chain(replace(combination, sprite="full"), number).exposed(seen)
+    yield chain.exposed(seen)

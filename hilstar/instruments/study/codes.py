@@ -1,0 +1,199 @@
+"""Ways from light to code values, and the error of each by every centroider: of one frame, and over an exposure."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, TEAL, chart, label_ends, plain_ticks, write_records
+from hilstar.basics.units import flux_ratio
+from hilstar.display.balance import AS_USUAL, Balance
+from hilstar.display.phases import USUAL_PSF, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.display.quantise import EXPOSURE_FRAMES, Panel, dither_levels, mask_turn, shown_light
+from hilstar.display.quantisers import Quantisation
+from hilstar.display.response import Response, Weights, bit_stealing_response, gamma_response, srgb_response, table_response
+from hilstar.display.temporal import TemporalQuantiser
+from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.tracker.centroiders import FAMILY, Centroider
+from hilstar.tracker.star_errors import Judge, StarErrors
+
+BITS = (8, 10, 12)
+# By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is allowed.
+AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
+AIM_PX = 0.01
+# Rec. 709's shares of white stand in for the primaries as a tracker sees them.
+STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
+FRAME_PX = (1920, 1080)
+STARS = 1000
+SEED = 1
+STEALING = ", bit stealing"
+JUDGE: Centroider = "fit"  # as most trackers do
+ERROR_COLUMNS = (
+    "flux_rms_mag",
+    "flux_max_mag",
+    "centroid_rms_px",
+    "centroid_max_px",
+    *(f"axis_rms_px_{kind}" for kind in FAMILY),
+    *(f"max_px_{kind}" for kind in FAMILY),
+)
+FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
+BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
+AIM_FRAMES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way from light to levels: its name, the renderer's method, its colour, and in how many frames it is seen."""
+
+    name: str
+    method: Quantisation
+    colour: str
+    stealing: bool = False
+    frames: int = 1
+
+
+WAYS = (
+    Way("round", "round", PURPLE),
+    Way("dither", "dither", ORANGE),
+    Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", GREEN, frames=EXPOSURE_FRAMES),
+    Way("exact", "exact", BLUE),
+    Way("round" + STEALING, "round", PURPLE, stealing=True),
+    Way("exact" + STEALING, "exact", BLUE, stealing=True),
+)
+
+
+def response_of(bits: int, way: Way) -> Response:
+    """The sRGB response of a way; with bit stealing, of three equal channels."""
+    grey = srgb_response(bits)
+    return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
+
+
+def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
+    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as in the one before."""
+    rng = np.random.default_rng(SEED)
+    mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
+    flux = WHITE / USUAL_PSF.peak_share * flux_ratio(mag)
+    x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(frame_px)[:, None]
+    return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, footprint_px)
+
+
+def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
+    """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its judge by the usual tracker."""
+    sprites, tile = phase_grid(phases, USUAL_PSF)
+    bright = phase_image(sprites, USUAL_PSF)
+    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    return sprites, tile, bright, judge
+
+
+def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
+    """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
+    panel, balance = Panel(response_of(bits, way), WHITE), Balance(USUAL_PSF, AS_USUAL)
+    sprites, _, bright, judge = judged_phases(phases)
+    errors = []
+    for mag in mags:
+        wanted, share = fainter(sprites, mag), flux_ratio(mag)
+        shown = shown_by(way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance)
+        errors.append(judge.errors(shown, share))
+    return errors
+
+
+def error_cells(errors: StarErrors) -> tuple[float, ...]:
+    """The values of ERROR_COLUMNS; `centroid_...` are distances by the plain moment, `axis_rms_...` along one axis."""
+    distance_px = np.sqrt(2) * errors.axis_rms_px("moment")
+    return (
+        errors.flux_rms_mag,
+        errors.flux_max_mag,
+        float(distance_px),
+        errors.max_px("moment"),
+        *(errors.axis_rms_px(kind) for kind in FAMILY),
+        *(errors.max_px(kind) for kind in FAMILY),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OverFrames:
+    """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many frames, places along an axis.
+
+    `steps` is the star's light in steps from black; errors are infinite where a star may show nothing.
+    """
+
+    panel: str
+    mag_under_white: float
+    steps: float
+    method: str
+    frames: int
+    flux_rms_mag: float
+    axis_rms_px_moment: float
+    axis_rms_px_window: float
+    axis_rms_px_fit: float
+
+
+def study_frames(directory: Path, quick: bool) -> str:
+    """Write over_frames.csv and its chart into `directory`; the finding."""
+    phases, counts = (6, FRAMES[:4]) if quick else (16, FRAMES)
+    equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
+    # Monitors of 8 bits, and microdisplays whose levels are equal; a star so many magnitudes under white on each.
+    shown = (
+        ("sRGB, 8 bits", srgb_response(8), 6.0),
+        ("gamma 2.2, 8 bits", gamma_response(8), 6.0),
+        ("linear, 8 bits", equal[8], 6.0),
+        ("linear, 2 bits", equal[2], 2.0),
+        ("1 bit", equal[1], 2.0),
+    )
+    left = [row for panel in shown for row in _left_by(*panel, phases, counts)]
+    write_records(directory / "over_frames.csv", left)
+    draw(directory / "over_frames", left)
+    at = (row for row in left if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
+    each = "; ".join(f"{row.panel} {row.flux_rms_mag:.2g} mag, {row.axis_rms_px_fit:.2g} px" for row in at)
+    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {each}"
+
+
+def _left_by(name: str, response: Response, mag: float, phases: int, counts: tuple[int, ...]) -> Iterator[OverFrames]:
+    panel, share = Panel(response, WHITE), flux_ratio(mag)
+    sprites, tile, bright, judge = judged_phases(phases)
+    stars, linear = fainter(sprites, mag), (share * bright).astype(np.float32)
+    quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), USUAL_PSF)
+    steps = float(stars.data["electrons_per_s"][0]) / (float(response.light[1]) * WHITE)
+    kinds: tuple[Centroider, ...] = ("moment", "window", "fit")
+    for method in ("temporal", "dither"):
+        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))  # light up to the end of each frame
+        for frame in range(len(whole) - 1):
+            levels = quantiser.levels(stars) if method == "temporal" else dither_levels(linear, panel, mask_turn(frame))
+            whole[frame + 1] = whole[frame] + shown_light(levels, panel)
+
+        def until(refreshes: float, whole: FloatArray = whole) -> FloatArray:
+            frame, part = int(refreshes), refreshes % 1
+            return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
+
+        for count in counts:
+            errors = [judge.errors((until(begin + count) - until(begin)) / count, share, kinds) for begin in BEGINS]
+            each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors]
+            rms = np.sqrt(np.mean(np.square(each), axis=0)).tolist()
+            yield OverFrames(name, mag, steps, method, count, *rms)
+
+
+def draw(path: Path, left: list[OverFrames]) -> None:
+    """What is left over the frames of an exposure, each panel in its colour."""
+    names = list(dict.fromkeys(row.panel for row in left))
+    at = {row.panel: row.axis_rms_px_fit for row in left if row.frames == AIM_FRAMES and row.method == "temporal"}
+    finding = (
+        f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on {names[0]},"
+        f" and within {at[names[-1]]:.2g} px on {names[-1]}"
+    )
+    note = "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of the panel from black."
+    with chart(path, finding, panels=2, note=note) as (flux, place):
+        for name, colour in zip(names, (BLUE, ORANGE, GREEN, PURPLE, TEAL), strict=True):
+            for method, style in (("temporal", "-o"), ("dither", ":")):
+                rows = [row for row in left if (row.panel, row.method) == (name, method)]
+                frames = [row.frames for row in rows]
+                steps = f"{rows[0].steps:.{1 if rows[0].steps < 100 else 0}f}"
+                for axes, error, label in ((flux, "flux_rms_mag", f"{name}: {steps} steps"), (place, "axis_rms_px_fit", name)):
+                    errors = np.array([getattr(row, error) for row in rows])
+                    values = np.where(np.isfinite(errors), errors, np.nan)
+                    axes.loglog(frames, values, style, color=colour, ms=4, label=label if method == "temporal" else "_")
+        flux.set_ylabel("flux error, rms [mag]")
+        place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
+        plain_ticks(place.xaxis, sorted({row.frames for row in left}))
+        label_ends(flux, place)

@@ -1,0 +1,445 @@
+"""Where hilstar itself fails: each of its methods against what stresses it, and its tolerance.
+
+Every error is measured here, by hilstar's own functions against a truth of another kind: an
+integral, a movement in closed form, held-out spectra, rays onto a tilted plane. The tolerances are
+those that a bench file has by default, `[render] tolerance_px` and `tolerance_mag`; a direction's
+is `tolerance_px` on the demo's monitor.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits, write_csv
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_radec_roll_deg,
+    normalise,
+    propagate,
+    to_radec_roll_deg,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S, flux_ratio, magnitude
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.assess.bench_effects import turn_between
+from hilstar.instruments.study import codes
+from hilstar.instruments.study.predictors import ORION, predictors, rate_of, slew_attitude
+from hilstar.instruments.study.settings import held_out_errors, study_optics
+from hilstar.optics.psf import GaussianPsf, pixel_shares
+from hilstar.optics.sprites import brightest, max_stars
+from hilstar.server.bench.config import RenderSettings
+from hilstar.server.sync import Exposures, beat
+from hilstar.sky.electrons import Photometry, library_electrons_per_s, load_library
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# The demo's monitor and collimator (configs/demo.toml).
+FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX, ALIGNED = (
+    350.0,
+    57.65,
+    (1920, 1080),
+    np.array([1.0, 0.0, 0.0, 0.0]),
+)
+SIGMA_PX, REFRESH_HZ, PARTED_REFRESHES = 0.85, 60.0, 6.3
+FAINT_MAG, COARSE_BITS = 6.0, 8
+TOLERANCE_PX, TOLERANCE_MAG = RenderSettings().tolerance_px, RenderSettings().tolerance_mag
+ARCSEC_PER_PX = PITCH_UM * 1e-3 / FOCAL_LENGTH_MM * ARCSEC_PER_RAD
+TOLERANCE_ARCSEC = TOLERANCE_PX * ARCSEC_PER_PX
+COLUMNS, PANEL_INCH, EDGE_INCH = 3, 1.75, 1.4
+SPAN_S, SEED = 4.0, 1
+EXACT = codes.Way("exact", "exact", BLUE)
+NEAR_SAMPLES = 4
+WINDOW_VI_MAG = 0.4  # half the width of a running median
+# Decades of stars a magnitude: 0.6 where stars fill space evenly, less what dust hides.
+STAR_SLOPE = 0.51
+VIBRATION_ARCSEC, Z = 2.0, np.array([0.0, 0.0, 1.0])
+SMALLEST = 1e-9  # as drawn
+LOG_FROM = 20.0  # ratio of the ends of an axis from which on it is logarithmic
+# The stresses of the title: what a bench meets first.
+SIGMA, BITS, FAINT = (
+    "sigma of a star [px]",
+    f"bits, {FAINT_MAG:g} mag under white",
+    f"mag under white, {COARSE_BITS} bits",
+)
+RED_STARS, CROWD, TILT = "V-I [mag]", "stars in view", "tilt of the screen [deg]"
+TURN = f"turn [deg/s], {PARTED_REFRESHES:g} refreshes"
+AGE, PACKETS, VIBRATION = (
+    "age of a packet [ms]",
+    "packets a second",
+    f"vibration of {VIBRATION_ARCSEC:g} arcsec [Hz]",
+)
+MET_FIRST = (SIGMA, FAINT, TURN, AGE)
+# What to do where a method leaves its tolerance, by its stress, in the words of
+# docs/where-it-fails.md.
+ADVICE = {
+    SIGMA: "write a `sprite_sigma_px` of 0.5 or more",
+    BITS: "[bit stealing, or a panel of more bits](accuracy-speed.md)",
+    FAINT: "[bit stealing, `temporal`, or a panel of more bits](accuracy-speed.md)",
+    RED_STARS: '`spectrum = "mk"`, or your own V-I for a star that matters',
+    CROWD: "the brightest are drawn; write a smaller `faintest_v_mag`",
+    TILT: "`hilstar calibrate geometric`",
+    TURN: "an exposure of whole refreshes ([on time](on-time.md))",
+    AGE: "a faster link; the swing here is shaken as the wheels of a small satellite shake it",
+    PACKETS: "more packets, in the same swing",
+    VIBRATION: '`prediction = "auto"` ([on time](on-time.md#prediction-and-jitter))',
+}
+
+Unit = Literal["px", "mag", "arcsec"]
+TOLERANCES: dict[Unit, float] = {
+    "px": TOLERANCE_PX,
+    "mag": TOLERANCE_MAG,
+    "arcsec": TOLERANCE_ARCSEC,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A method's error (n,) against a stress (n,), from easy to hard; `unit` is the error's.
+
+    `says` names the place where the method leaves its tolerance, whose figure stands in its braces.
+    """
+
+    method: str
+    stress: str
+    says: str
+    unit: Unit
+    at: FloatArray
+    error: FloatArray
+
+    @property
+    def at_unit(self) -> str:
+        """The stress's unit, in brackets at its end, or what it counts."""
+        bracketed = self.stress.partition("[")[2].partition("]")[0]
+        return bracketed or self.stress.split()[0].rstrip(",")
+
+    @property
+    def tolerance(self) -> float:
+        """The largest error that is allowed."""
+        return TOLERANCES[self.unit]
+
+    @property
+    def fails(self) -> bool:
+        """Whether its error is over the tolerance somewhere."""
+        return bool((self.error > self.tolerance).any())
+
+    @property
+    def meets(self) -> float:
+        """The first stress at which the error crosses the tolerance; NaN for none.
+
+        Between two points the error's logarithm is a straight line.
+        """
+        over = self.error > self.tolerance
+        crossing = np.flatnonzero(over[1:] != over[:-1])
+        if not len(crossing):
+            return math.nan
+        k = int(crossing[0])
+        low, high = np.log(np.maximum(self.error[k : k + 2], SMALLEST))
+        share = (math.log(self.tolerance) - low) / (high - low)
+        return float(self.at[k] + share * (self.at[k + 1] - self.at[k]))
+
+    @property
+    def words(self) -> str:
+        """Where it fails, in words."""
+        if math.isfinite(self.meets):
+            return self.says.format(two_digits(self.meets))
+        if (self.error > self.tolerance).all():
+            return "everywhere"
+        return f"nowhere to {two_digits(float(self.at[-1]))} {self.at_unit}"
+
+
+def narrow_sprites() -> Limit:
+    """The place of a star that is integrated over pixels, against its sigma."""
+    sigmas_px = np.geomspace(0.9, 0.1, 33)
+    phases, pixels = np.linspace(-0.5, 0.5, 21), np.arange(-8.0, 9.0)
+    errors = []
+    for sigma_px in sigmas_px.tolist():
+        shares = np.stack([pixel_shares(pixels - phase, sigma_px) for phase in phases])
+        places = shares @ pixels / shares.sum(axis=1)
+        errors.append(float(np.abs(places - phases).max()))
+    says = "stars under {} px wide"
+    return Limit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
+
+
+def coarse_codes(quick: bool) -> Limit:
+    """The light of a star of exact codes, against the monitor's bits."""
+    bits = (10, 8, 6, 4) if quick else (12, 10, 9, 8, 7, 6, 5, 4)
+    errors: list[float] = []
+    for count in bits:
+        (star,) = codes.code_errors(count, EXACT, 8, [FAINT_MAG])
+        errors.append(star.flux_max_mag)
+    return Limit(
+        "Exact codes, light",
+        BITS,
+        "codes under {} bits",
+        "mag",
+        np.array(bits, dtype=float),
+        np.array(errors),
+    )
+
+
+def faint_stars(quick: bool) -> Limit:
+    """The place of a star of exact codes by the plain moment, against how faint it is."""
+    mags = np.linspace(0, 9, 5 if quick else 13)
+    stars = codes.code_errors(COARSE_BITS, EXACT, 8, mags)
+    errors = [star.max_px("moment") for star in stars]
+    stress = FAINT
+    return Limit("Exact codes, place", stress, "{} mag under white", "px", mags, np.array(errors))
+
+
+def red_stars() -> Limit:
+    """The light of spectra that are found by V-I, the median of those held out, against V-I."""
+    library = load_library()
+    rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
+    errors = held_out_errors(rates)
+    at = np.arange(-0.2, 3.9, 0.2)
+    medians = []
+    for centre in at:
+        near = np.abs(library.vi_mag - centre) <= WINDOW_VI_MAG
+        medians.append(float(np.median(np.abs(magnitude(1 + errors[near])))))
+    says = "spectra over V-I {}"
+    return Limit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
+
+
+def crowds() -> Limit:
+    """The light of stars that have no room in a frame, against the stars in view."""
+    counts = np.geomspace(3e3, 3e6, 19)
+    room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
+    rng, errors = np.random.default_rng(SEED), []
+    for count in counts.astype(int).tolist():
+        light = flux_ratio(np.log10(rng.uniform(size=count)) / STAR_SLOPE)
+        drawn = brightest(light, room)
+        shown = light if drawn is None else light[drawn]
+        errors.append(abs(magnitude(float(shown.sum() / light.sum()))))
+    return Limit("A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors))
+
+
+def tilted_screen() -> Limit:
+    """The places of a pinhole on a tilted screen, rms after alignment, against the tilt."""
+    camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
+    x_px, y_px = camera.grid_px((13, 9))
+    shown = normalise(camera.rays(x_px, y_px))
+    tilts_deg = np.geomspace(0.0003, 3.0, 17)
+    errors = []
+    for tilt in np.radians(tilts_deg).tolist():
+        across, down = (x_px - camera.principal_point_px[0], y_px - camera.principal_point_px[1])
+        depth = camera.focal_length_px + across * math.sin(tilt)
+        true = normalise(np.stack([across * math.cos(tilt), down, depth], axis=1))
+        turn = turn_between(true, shown, np.ones(len(true)))
+        residual = shown - true - np.cross(turn, true)
+        rms_rad = float(np.sqrt((residual**2).sum(axis=1).mean()))
+        errors.append(rms_rad * camera.focal_length_px)
+    says = "a tilt over {} deg"
+    return Limit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
+
+
+def wide_fields() -> Limit:
+    """A direction onto the monitor's plane and back, against the angle from the axis."""
+    camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
+    from_90_deg = np.geomspace(60.0, 1e-7, 15)
+    angle = np.radians(90.0 - from_90_deg)
+    true = np.stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)], axis=1)
+    rays = normalise(camera.rays(*camera.project(true)))
+    errors = np.linalg.norm(np.cross(rays, true), axis=1) * ARCSEC_PER_RAD
+    return Limit(
+        "Perspective",
+        "angle short of 90 deg [deg]",
+        "{} deg short of 90",
+        "arcsec",
+        from_90_deg,
+        errors,
+    )
+
+
+def poles() -> Limit:
+    """An attitude to RA, Dec and roll and back, against its distance from the pole."""
+    from_pole_deg = np.geomspace(10.0, 1e-7, 15)
+    errors = []
+    for distance in from_pole_deg.tolist():
+        q = from_radec_roll_deg(123.4, 90.0 - distance, 56.7)
+        back = from_radec_roll_deg(*to_radec_roll_deg(q))
+        errors.append(angle_between_rad(q, back) * ARCSEC_PER_RAD)
+    return Limit(
+        "RA, Dec and roll",
+        "distance from the pole [deg]",
+        "{} deg from the pole",
+        "arcsec",
+        from_pole_deg,
+        np.array(errors),
+    )
+
+
+def parted_refreshes() -> Limit:
+    """A star's place over an exposure that is no whole number of refreshes, against the turn.
+
+    `study timing` holds this law to the virtual tracker.
+    """
+    rates_deg_s = np.geomspace(0.03, 30.0, 13)
+    worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
+    stress = TURN
+    return Limit(
+        "Refreshes in an exposure",
+        stress,
+        "turns over {} deg/s",
+        "arcsec",
+        rates_deg_s,
+        worst * rates_deg_s,
+    )
+
+
+def predicted_rms_arcsec(
+    attitude: Callable[[int], FloatArray],
+    packet_hz: float,
+    age_ms: float,
+) -> float:
+    """The error of prediction of a movement, rms over its frames; packets arrive `age_ms` old."""
+    way = next(predictor for predictor in predictors() if predictor.is_default)
+    errors = []
+    for frame in range(int(SPAN_S * REFRESH_HZ)):
+        t_ns = round((1 + frame / REFRESH_HZ) * NS_PER_S)
+        newest = math.floor((t_ns - age_ms * NS_PER_MS) * packet_hz / NS_PER_S)
+        numbers = range(newest + 1 - NEAR_SAMPLES, newest + 1)
+        samples = []
+        for number in numbers:
+            at_ns = round(number * NS_PER_S / packet_hz)
+            samples.append(AttitudeSample(at_ns, attitude(at_ns), rate_of(attitude, at_ns)))
+        errors.append(angle_between_rad(way.load(samples)(t_ns), attitude(t_ns)) * ARCSEC_PER_RAD)
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def old_packets(quick: bool) -> Limit:
+    """Prediction in a shaken swing, against the age of the newest packet."""
+    ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
+    errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
+    says = "packets over {} ms old"
+    return Limit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
+
+
+def few_packets(quick: bool) -> Limit:
+    """The same without any delay, against the packets a second."""
+    rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
+    errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
+    return Limit(
+        "Prediction by rates",
+        PACKETS,
+        "under {} packets a second",
+        "arcsec",
+        rates_hz,
+        np.array(errors),
+    )
+
+
+def vibrations(quick: bool) -> Limit:
+    """Prediction over 20 ms of a vibration, against its frequency."""
+    frequencies_hz = np.geomspace(0.5, 45.0, 6 if quick else 12)
+    errors = []
+    for hz in frequencies_hz.tolist():
+
+        def attitude(t_ns: int, hz: float = hz) -> FloatArray:
+            angle = VIBRATION_ARCSEC / ARCSEC_PER_RAD * math.sin(math.tau * hz * t_ns / NS_PER_S)
+            return propagate(ORION, Z, angle)
+
+        errors.append(predicted_rms_arcsec(attitude, 100.0, 20.0))
+    return Limit(
+        "Prediction over 20 ms",
+        VIBRATION,
+        "vibrations over {} Hz",
+        "arcsec",
+        frequencies_hz,
+        np.array(errors),
+    )
+
+
+def every_limit(quick: bool) -> list[Limit]:
+    """Every limit, in the order of the chain: light, places, time."""
+    return [
+        *(narrow_sprites(), coarse_codes(quick), faint_stars(quick)),
+        *(red_stars(), crowds(), tilted_screen()),
+        *(wide_fields(), poles(), parted_refreshes()),
+        *(old_packets(quick), few_packets(quick), vibrations(quick)),
+    ]
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `limits.csv` and its chart; a line for each limit. Raises InputError."""
+    limits = every_limit(quick)
+    rows = [
+        (
+            limit.method,
+            limit.stress,
+            float(at),
+            float(error),
+            limit.unit,
+            limit.tolerance,
+            limit.meets,
+        )
+        for limit in limits
+        for at, error in zip(limit.at, limit.error, strict=True)
+    ]
+    write_csv(
+        directory / "limits.csv",
+        ("method", "stress", "at", "error", "unit", "tolerance", "meets"),
+        rows,
+    )
+    draw(directory / "limits", limits)
+    finding = limits_finding(limits)
+    return [finding, *(f"{limit.method} ({limit.stress}): {limit.words}" for limit in limits)]
+
+
+def limits_finding(limits: Sequence[Limit]) -> str:
+    """How many methods leave their tolerance, and where those do that a bench meets first."""
+    failing = [limit for limit in limits if limit.fails]
+    met = [limit.words for limit in failing if limit.stress in MET_FIRST]
+    count = f"{len(failing)} of {len(limits)} methods of hilstar leave their tolerance"
+    return f"{count}: {', '.join(met)}"
+
+
+def draw(path: Path, limits: Sequence[Limit]) -> None:
+    """A panel for each method: its error, the tolerance, and where they meet."""
+    rows = math.ceil(len(limits) / COLUMNS)
+    note = (
+        f"Blue: the error as measured, largest or rms. Red: the tolerance, {TOLERANCE_MAG:g} mag,"
+        f" {TOLERANCE_PX:g} px, or {two_digits(TOLERANCE_ARCSEC)} arcsec, which is {TOLERANCE_PX:g} px"
+        " of the demo's monitor; the dot is where they meet."
+        " Each axis runs from easy to hard. Places by the plain moment."
+    )
+    height_inch = EDGE_INCH + PANEL_INCH * rows
+    with chart(
+        path,
+        limits_finding(limits),
+        rows,
+        COLUMNS,
+        note=note,
+        share_x=False,
+        height_inch=height_inch,
+    ) as grid:
+        for axes, limit in zip(grid, limits, strict=False):
+            draw_limit(axes, limit)
+        for axes in grid[len(limits) :]:
+            axes.set_axis_off()
+
+
+def draw_limit(axes: "Axes", limit: Limit) -> None:
+    """One method: error against stress, from easy to hard, and where it meets its tolerance."""
+    axes.plot(limit.at, np.maximum(limit.error, SMALLEST), color=BLUE, label="_error")
+    axes.axhline(limit.tolerance, color=RED, ls="--", lw=1.2, label="_tolerance")
+    axes.set(yscale="log", xlabel=limit.stress, ylabel=f"error [{limit.unit}]")
+    axes.set_title(capital(limit.method), color=BLUE)  # the name of the line
+    low, high = sorted((float(limit.at[0]), float(limit.at[-1])))
+    if high > LOG_FROM * abs(low) > 0:
+        axes.set_xscale("log")
+    if limit.at[0] > limit.at[-1]:
+        axes.invert_xaxis()
+    style: dict[str, Any] = {"color": RED, "fontsize": SMALL_PT}
+    if not math.isfinite(limit.meets):
+        axes.text(0.05, 0.5, limit.words, transform=axes.transAxes, **style)
+        return
+    place = limit.meets, limit.tolerance
+    axes.plot(*place, "o", color=RED, ms=6, label="_meets", zorder=4)
+    label = f"{two_digits(limit.meets)} {limit.at_unit}".strip()
+    axes.annotate(label, place, (-7, 5), textcoords="offset points", ha="right", **style)

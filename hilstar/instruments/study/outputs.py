@@ -1,0 +1,254 @@
+"""The seven outputs of chapter 5: three plots of the stars, two images and a part of each.
+
+Of the three simulations that the thesis has, as they were published and with their errors mended;
+or of a bench, for the same three fields and any other.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.charts import INK, MUTED, SMALL_PT, chart, write_csv
+from hilstar.basics.resources import resource_path
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.simulate.pictures import write_exposure_fits
+from hilstar.instruments.simulate.simulator import Exposure, FrameNoise, Simulator
+from hilstar.instruments.study.fields import FIELDS, Field, fields_of
+from hilstar.optics.camera import Camera
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.tracker.settings import DetectorSettings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SEED = 1
+ZOOM_PX = 160
+STRETCH_PERCENT = (1, 99.8)
+# From black to white, in sigmas of the sky's noise: at least, and at most where a body fills pixels.
+MIN_SIGMAS, MAX_SIGMAS = 10.0, 300.0
+HEIGHT_INCH = 8.4
+PUBLISHED = "_as_published"
+WITHOUT_NOISE = "_without_noise"
+DECIMALS = {"mag": 2, "K": 0}  # of a mean
+# The thesis's figures of each field.
+FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.18"}
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A field before a camera: stem of its files, title, and star of its zoom (None: the brightest)."""
+
+    stem: str
+    title: str
+    field: Field
+    zoom_hip: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """A scene's exposures without and with noise, and what its sky has."""
+
+    clean: Exposure
+    noisy: Exposure
+    inside: BoolArray  # (n,) whether the centre of a star of the truth table is on the image
+    sky_e: float
+    noise_e: float
+    gain_e_per_dn: float
+    camera_words: str
+
+    @property
+    def truth(self) -> npt.NDArray[np.void]:
+        """The stars whose light falls on the image, brightest first."""
+        return self.noisy.truth
+
+
+def run(
+    directory: Path,
+    file: BenchFile | None = None,
+    radec_roll_deg: tuple[float, float, float] | None = None,
+) -> list[str]:
+    """Write each scene's figure, images (FITS) and truth (CSV); a line for each. Raises InputError."""
+    if file is not None:
+        chosen = fields_of(radec_roll_deg)
+        return [_output(directory, file, Scene(field.stem, f"{field.name}, {file.path.name}", field)) for field in chosen]
+    lines = []
+    for field in FIELDS:
+        published = Scene(
+            field.stem + PUBLISHED,
+            f"{field.name} as published (thesis figures {FIGURES[field.stem]})",
+            field,
+            field.zoom_hip,
+        )
+        mended = Scene(field.stem, f"{field.name} with the thesis's errors mended", field, field.zoom_hip)
+        for scene, suffix in ((published, "-as-published"), (mended, "")):
+            bench = read_bench_file(resource_path("configs", f"thesis-{field.stem}{suffix}.toml"))
+            lines.append(_output(directory, bench, scene))
+    return lines
+
+
+def output_files(fields: tuple[Field, ...]) -> list[str]:
+    """The names of all files that `run` writes of a bench."""
+    endings = (".png", ".svg", ".csv", ".fits", f"{WITHOUT_NOISE}.fits")
+    return [field.stem + ending for field in fields for ending in endings]
+
+
+def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float) -> float:
+    """The n_TOT of table 4.1 and eq. 4.14 as printed, whose PRNU and DSNU have no dimension."""
+    fixed_e2 = light_e * detector.prnu + detector.dsnu_e_per_s * exposure_s
+    return math.sqrt(
+        light_e + detector.dark_e_per_s * exposure_s + fixed_e2 + detector.adc_noise_e**2 + detector.read_noise_e**2
+    )
+
+
+def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
+    """Expose a scene and write its files; what it has, in a line."""
+    noise = FrameNoise(seed=SEED)
+    with Simulator(file) as simulator:
+        view = simulator.view(from_radec_roll_deg(*scene.field.radec_roll_deg), np.zeros(3))
+        clean = simulator.expose(view, None)
+        noisy = simulator.expose(view, noise.rng())
+        exposure_s = simulator.config.tracker.exposure_s
+        sky_e = float(np.median(clean.mean_e))
+        noise_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
+        inside = simulator.camera.contains_px(noisy.truth["x_px"], noisy.truth["y_px"])
+        camera_text = _camera_words(file, simulator.camera, sky_e, noise_e)
+        gain = simulator.detector.settings.gain_e_per_dn
+        outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, camera_text)
+        write_exposure_fits(directory / f"{scene.stem}.fits", simulator, noisy, noise)
+        without = FrameNoise("none", SEED)
+        write_exposure_fits(directory / f"{scene.stem}{WITHOUT_NOISE}.fits", simulator, clean, without)
+    truth = outputs.truth
+    write_csv(directory / f"{scene.stem}.csv", truth.dtype.names or (), truth.tolist())
+    _figure(directory / scene.stem, scene, outputs)
+    return f"{scene.stem}: {_found(outputs)}"
+
+
+def _found(outputs: Outputs) -> str:
+    """Stars, temperatures and sky of a scene in words."""
+    level_dn = np.median(outputs.noisy.dn)
+    sky = f"sky {level_dn:.0f} DN; n_TOT of a pixel of sky {outputs.noise_e:.0f} e-"
+    truth = outputs.truth
+    if not len(truth):
+        return f"no star; {sky}"
+    v_mag = truth["v_mag"]
+    kelvin = truth["temperature_k"]
+    beyond = int((~outputs.inside).sum())
+    edge = f", {beyond} more whose light reaches the image" if beyond else ""
+    heat = ""
+    if np.isfinite(kelvin).any():
+        heat = f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
+        heat += f" ({np.nanmean(kelvin[outputs.inside]):.0f} K on the image)" if beyond else ""
+    return (
+        f"{int(outputs.inside.sum())} stars{edge}, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean"
+        f" {v_mag.mean():.2f}{heat};"
+        f" {int(truth['clipped'].sum())} stars saturated; {sky}"
+    )
+
+
+def _camera_words(file: BenchFile, camera: Camera, sky_e: float, noise_e: float) -> str:
+    tracker = file.config.tracker
+    width, height = (math.degrees(angle) for angle in _field_rad(camera))
+    return "\n".join(
+        (
+            f"Aperture {tracker.aperture_mm:g} mm",
+            f"Focal length {tracker.focal_length_mm:g} mm",
+            f"Field {width:.3g} x {height:.3g}°",
+            f"Exposure {tracker.exposure_s:g} s",
+            f"Gain {tracker.detector.gain_e_per_dn:g} e-/DN",
+            f"Sky {sky_e:.0f} e-/px",
+            f"Its noise {noise_e:.0f} e-",
+        )
+    )
+
+
+def _field_rad(camera: Camera) -> tuple[float, float]:
+    """The angles across the middle of the image, and down it."""
+    width, height = camera.resolution_px
+    across = camera.rays(np.array([-0.5, width - 0.5]), np.full(2, height / 2 - 0.5))
+    down = camera.rays(np.full(2, width / 2 - 0.5), np.array([-0.5, height - 0.5]))
+    return _angle_rad(across), _angle_rad(down)
+
+
+def _angle_rad(rays: FloatArray) -> float:
+    first, last = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return math.acos(float(np.clip(first @ last, -1, 1)))
+
+
+def _figure(path: Path, scene: Scene, outputs: Outputs) -> None:
+    """The seven outputs of a scene."""
+    saturated = int(outputs.truth["clipped"].sum())
+    kelvin = outputs.truth["temperature_k"]
+    finding = f"{scene.title}: {int(outputs.inside.sum())} stars, {saturated or 'none'} saturated"
+    if np.isfinite(kelvin).any():
+        finding += f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
+    note = "Stars count from the brightest; lines: means of all whose light reaches the image. One stretch for all images."
+    with chart(path, finding, 3, 3, note=note, share_x=False, height_inch=HEIGHT_INCH) as panels:
+        centroids, magnitudes, temperatures = panels[:3]
+        _draw_centroids(centroids, outputs)
+        _draw_property(magnitudes, outputs.truth["v_mag"], "V", "mag")
+        _draw_property(temperatures, outputs.truth["temperature_k"], "T", "K")
+        temperatures.set_yscale("log")
+        _draw_images(panels[3:], scene, outputs)
+
+
+def _draw_centroids(axes: "Axes", outputs: Outputs) -> None:
+    height, width = outputs.noisy.dn.shape
+    stars = outputs.truth[outputs.inside]
+    axes.plot(stars["x_px"], stars["y_px"], ".", color=INK, ms=3)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xlabel="x [px]", ylabel="y [px]", title="Centroids")
+
+
+def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> None:
+    known = np.isfinite(values)
+    title = f"{name}, no star"
+    if known.any():
+        mean = float(values[known].mean())
+        decimals = DECIMALS[unit]
+        title = f"{name}, mean {mean:.{decimals}f} {unit}"
+        axes.plot(np.arange(1, len(values) + 1), values, ".", color=INK, ms=3)
+        axes.axhline(mean, color=MUTED, lw=1)
+    axes.set(xlabel="star", title=title, ylabel=f"{name} [{unit}]")
+
+
+def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
+    """The images without and with noise, each with its zoom, and beside them scale and camera."""
+    star, (x_px, y_px) = _zoom(scene, outputs)
+    low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
+    noise_dn = max(outputs.noise_e / outputs.gain_e_per_dn, 0.1)
+    high = float(np.clip(high, low + MIN_SIGMAS * noise_dn, low + MAX_SIGMAS * noise_dn))
+    images = (outputs.clean, outputs.clean, outputs.noisy, outputs.noisy)
+    titles = ("Without noise", f"The same, {star}", "With noise", f"The same, {star}")
+    drawn = [panels[0], panels[1], panels[3], panels[4]]
+    for axes, exposure, title in zip(drawn, images, titles, strict=True):
+        image = axes.imshow(exposure.dn, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+        axes.grid(False)
+        axes.set(xlabel="x [px]", ylabel="y [px]", title=title)
+    for zoomed in (drawn[1], drawn[3]):
+        zoomed.set(
+            xlim=(x_px - ZOOM_PX / 2, x_px + ZOOM_PX / 2),
+            ylim=(y_px + ZOOM_PX / 2, y_px - ZOOM_PX / 2),
+        )
+    facts, scale = panels[2], panels[5]
+    facts.text(0, 1, outputs.camera_words, va="top", transform=facts.transAxes, fontsize=SMALL_PT)
+    for axes in (facts, scale):
+        axes.axis("off")
+    scale.figure.colorbar(image, ax=scale, label="Signal [DN]", orientation="horizontal", location="top", fraction=0.5)
+
+
+def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
+    """The name and place of the star in a zoom's middle; without one the image's middle."""
+    stars = outputs.truth[outputs.inside]
+    if scene.zoom_hip is not None:
+        stars = stars[stars["hip"] == scene.zoom_hip]
+    if not len(stars):
+        height, width = outputs.noisy.dn.shape
+        return "the middle", (width / 2, height / 2)
+    star = stars[0]
+    name = f"HIP {star['hip']}" if star["hip"] > 0 else str(star["name"])
+    return name, (float(star["x_px"]), float(star["y_px"]))

@@ -1,0 +1,162 @@
+"""A slew shaken on each axis, and the predictors that carry its samples on to the moment of light."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import from_radec_roll_deg, multiply, propagate, rate_between_rad_s
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.server.bench.config import AttitudeSettings
+
+ORION = from_radec_roll_deg(84.057, -1.2, 10.0)
+SLEW_DEG, SLEW_S = 3.0, 20.0
+# Jitter per axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
+JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
+RATE_STEP_NS = 100_000
+NEAR = 4  # samples that a predictor has
+AXIS = np.array([0.6, 0.8, 0.0])  # axis of a steady turn: across rows and columns
+
+# From the last samples to the attitude at a time, ns.
+AttitudeAt = Callable[[int], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Predictor:
+    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits` end after that time."""
+
+    name: str
+    load: Callable[[Sequence[AttitudeSample]], AttitudeAt]
+    is_default: bool = False
+    waits: bool = False
+
+
+def predictors() -> tuple[Predictor, ...]:
+    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it, fed with rates."""
+    settings = AttitudeSettings()
+    own = Policy(round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS))
+    hold = Policy(0, own.stale_after_ns)
+    return (
+        Predictor("hold", partial(_timeline, hold)),
+        Predictor("linear, by the sample's rate", partial(_timeline, own), is_default=own.max_extrapolation_ns > 0),
+        Predictor("linear, by the last two samples", partial(_timeline, own, without_rates=True)),
+        Predictor("rate and acceleration", _accelerated),
+        Predictor(f"cubic spline through {NEAR} samples", _spline),
+        Predictor("C2 blend, a sample later", partial(_timeline, own), waits=True),
+    )
+
+
+def slew_attitude(t_ns: int) -> FloatArray:
+    """The true q_icrs_to_cam: three turns about the camera's axes on ORION, each a slow swing and a fast jitter."""
+    t_s = t_ns / NS_PER_S
+    return shaken(ORION, t_s, [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)])
+
+
+def shaken(q_icrs_to_cam: FloatArray, t_s: float, angles_rad: Sequence[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+    """An attitude turned about the camera's x, y and z by these angles and JITTER."""
+    q = q_icrs_to_cam
+    for axis, angle in enumerate(angles_rad):
+        for size_arcsec, hz in JITTER:
+            angle += math.radians(size_arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz)
+        turn = np.zeros(4)
+        turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        q = multiply(turn, q)
+    return q
+
+
+def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
+    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec predicted."""
+    before, after = attitude(t_ns - RATE_STEP_NS), attitude(t_ns + RATE_STEP_NS)
+    return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it is `shaken`, JITTER on it.
+
+    A camera at rest is not shaken.
+    """
+
+    q_icrs_to_cam: FloatArray
+    rate_deg_s: float
+    packet_hz: int = 100
+    shaken: bool = True
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is not at rest."""
+        return self.rate_deg_s != 0
+
+    @property
+    def turn_rad_s(self) -> FloatArray:
+        """The constant turn (3,) of cam in icrs, cam components."""
+        return np.asarray(math.radians(self.rate_deg_s) * AXIS)
+
+    def at(self, t_ns: int) -> FloatArray:
+        """The true q_icrs_to_cam."""
+        if not self.turns:
+            return self.q_icrs_to_cam
+        t_s = t_ns / NS_PER_S
+        q = propagate(self.q_icrs_to_cam, self.turn_rad_s, t_s)
+        return shaken(q, t_s) if self.shaken else q
+
+    def rate_rad_s(self, t_ns: int) -> FloatArray:
+        """The true rate (3,) of cam in icrs, cam components, jitter included."""
+        return rate_of(self.at, t_ns) if self.turns and self.shaken else self.turn_rad_s
+
+    def samples(self, until_ns: int) -> list[AttitudeSample]:
+        """The newest NEAR samples at time `until_ns`."""
+        last = until_ns * self.packet_hz // NS_PER_S
+        times_ns = [round(k * NS_PER_S / self.packet_hz) for k in range(last + 1 - NEAR, last + 1)]
+        return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
+
+
+def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:
+    """The attitude at a moment, of a timeline that has samples."""
+    attitude = timeline.at(t_ns)
+    if attitude is None:
+        raise AssertionError("a timeline with samples has an attitude")
+    return attitude
+
+
+def slew_sample(t_ns: int) -> AttitudeSample:
+    """The attitude with its rate."""
+    return AttitudeSample(t_ns, slew_attitude(t_ns), rate_of(slew_attitude, t_ns))
+
+
+def _timeline(policy: Policy, near: Sequence[AttitudeSample], without_rates: bool = False) -> AttitudeAt:
+    timeline = Timeline(policy)
+    for sample in near:
+        timeline.add(replace(sample, rate_cam_rad_s=None) if without_rates else sample)
+    return lambda t_ns: attitude_at(timeline, t_ns).q_icrs_to_cam
+
+
+def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
+    """The newest sample's rate, and the change since the one before it carried on."""
+    (before_ns, before), (newest_ns, newest) = ((s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:])
+
+    def predicted(t_ns: int) -> FloatArray:
+        ahead_s, gap_s = (t_ns - newest_ns) / NS_PER_S, (newest_ns - before_ns) / NS_PER_S
+        bend = (newest - before) / gap_s
+        return propagate(near[-1].q_icrs_to_cam, newest + 0.5 * ahead_s * bend, ahead_s)
+
+    return predicted
+
+
+def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
+    """The samples' turns from the newest one, as a cubic carried on past it."""
+    newest = near[-1]
+
+    def predicted(t_ns: int) -> FloatArray:
+        seconds = [(s.t_ns - newest.t_ns) / NS_PER_S for s in near]
+        turns = [rate_between_rad_s(newest.q_icrs_to_cam, s.q_icrs_to_cam, 1.0) for s in near]
+        turn = CubicSpline(seconds, turns)((t_ns - newest.t_ns) / NS_PER_S)
+        return propagate(newest.q_icrs_to_cam, np.asarray(turn), 1.0)
+
+    return predicted

@@ -1,0 +1,139 @@
+"""Shared by studies: their benches, the optics of the brightness studies, and stars that stand alone in an image."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import magnitude
+from hilstar.optics.sprites import Sprites
+from hilstar.server.bench.build import load
+from hilstar.server.bench.frame import Bench
+from hilstar.sky.electrons import Optics, fit_table, load_library
+from hilstar.sky.spectral_types import bare_and_dusty, fit_spectra, read_types
+from hilstar.sky.spectrum import load_curve
+
+Value = str | float | tuple[int, int]
+Table = Mapping[str, Value]
+
+TRACKER: Table = {"aperture_mm": 30, "focal_length_mm": 70, "pixel_pitch_um": 13, "quantum_efficiency": "ccd47-20"}
+FULL_HD: Table = {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65}
+APERTURE_MM = 30.0
+GLASS = "n-bk7-10mm"
+MAX_RELIABLE_VI_MAG = 2.5
+Window = tuple[slice, slice]
+
+
+def bench_text(tables: Mapping[str, Table]) -> str:
+    """The text of a bench file with `tables` by name; [tracker] extends TRACKER."""
+    lines = []
+    for name, table in tables.items():
+        whole = {**TRACKER, **table} if name == "tracker" else table
+        # Text, numbers and pairs are written alike in JSON and TOML.
+        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in whole.items())]
+    return "\n".join(lines) + "\n"
+
+
+def study_bench(path: Path, tables: Mapping[str, Table]) -> Bench:
+    """The bench of `bench_text`, whose file is written to `path`. Raises InputError or MachineError."""
+    path.write_text(bench_text(tables), encoding="utf-8")
+    return load(path)
+
+
+def study_optics(sensor: str) -> Optics:
+    """A sensor behind an aperture of 30 mm and 10 mm of N-BK7."""
+    return Optics(APERTURE_MM, load_curve(sensor, sensor), load_curve(GLASS, GLASS))
+
+
+def held_out_errors(rates: FloatArray) -> FloatArray:
+    """Relative error (m,) of each library star's rate by a table fitted to the others, each star held out in turn."""
+    library = load_library()
+    errors = np.empty(len(rates))
+    for k in range(len(rates)):
+        rest = np.arange(len(rates)) != k
+        table = fit_table(library.bv_mag[rest], library.vi_mag[rest], rates[rest])
+        one = table.electrons_per_s(np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1])
+        errors[k] = one[0] / rates[k] - 1
+    return errors
+
+
+def held_out_by_type(rates: FloatArray) -> FloatArray:
+    """Relative error (2m,) of each spectrum's rate by type, over `bare_and_dusty`; each star is held out with its dusty one."""
+    library = bare_and_dusty()
+    kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
+    count, errors = len(rates) // 2, np.empty(len(rates))
+    for k in range(count):
+        own = np.array([k, k + count])
+        rest = np.delete(np.arange(len(rates)), own)
+        part = replace(library, bv_mag=library.bv_mag[rest], vi_mag=library.vi_mag[rest])
+        table = fit_spectra(kind[rest], part, rates[rest])
+        found = table.electrons_per_s(np.zeros(2), library.bv_mag[own], library.vi_mag[own], kind[own])
+        errors[own] = found / rates[own] - 1
+    return errors
+
+
+@dataclass(frozen=True, slots=True)
+class Isolation:
+    """Margin of a window around a star's sprites, px, and the share of its light that other stars may add there."""
+
+    margin_px: float
+    max_share: float
+
+
+def lone_windows(
+    sprites: Sprites, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], isolation: Isolation
+) -> Iterator[tuple[int, Window]]:
+    """Each isolated star whose window lies on an image of `size_px` (width, height), with that window.
+
+    `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and columns.
+    """
+    light, (width, height), margin = sprites.data["electrons_per_s"], size_px, isolation.margin_px
+    for star in np.unique(sprites.star):
+        own = sprites.star == star
+        left, right = x_px[own].min() - margin, x_px[own].max() + margin
+        top, bottom = y_px[own].min() - margin, y_px[own].max() + margin
+        if left < 0 or top < 0 or right > width - 1 or bottom > height - 1:
+            continue
+        near = (x_px > left - margin) & (x_px < right + margin) & (y_px > top - margin) & (y_px < bottom + margin) & ~own
+        if light[near].sum() <= isolation.max_share * light[own].sum():
+            yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
+
+
+def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
+    """The windows of an image, each alone in the middle of a square as wide as the widest: (n, side, side), side odd."""
+    side = max(part.stop - part.start for window in windows for part in window) | 1
+    found = np.zeros((len(windows), side, side))
+    for square, window in zip(found, windows, strict=True):
+        height, width = image[window].shape
+        top, left = (side - height) // 2, (side - width) // 2
+        square[top : top + height, left : left + width] = image[window]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class StarError:
+    """The error of a shown star: light, mag (positive: too faint), and centroid, px; NaN where it is dark."""
+
+    flux_mag: float
+    centroid_px: float
+
+
+def star_error(shown: FloatArray, true: FloatArray, window: Window) -> StarError:
+    """The error of the star in a window of `shown`, against the same window of `true`."""
+    light, true_light = float(shown[window].sum()), float(true[window].sum())
+    (x_px, y_px), (true_x_px, true_y_px) = centroid_px(shown, window), centroid_px(true, window)
+    return StarError(magnitude(light / true_light), math.hypot(x_px - true_x_px, y_px - true_y_px))
+
+
+def centroid_px(image: FloatArray, window: Window) -> tuple[float, float]:
+    """The centre of gravity (x, y) of a window of an image (h, w), px; NaN where it is dark."""
+    part = image[window]
+    y_px, x_px = np.mgrid[window]
+    total = float(part.sum())
+    if total <= 0:
+        return math.nan, math.nan
+    return float((part * x_px).sum() / total), float((part * y_px).sum() / total)

@@ -1,0 +1,269 @@
+"""Figures of chapters 2 to 4 about the sky: star density, frames, Sun, Vega, background light."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.charts import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    SMALL_PT,
+    chart,
+    label_ends,
+    plain_ticks,
+    write_csv,
+)
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.basics.units import LIGHT_M_S, flux_ratio
+from hilstar.instruments.study.fields import FIELDS
+from hilstar.instruments.study.rapp import ChartFinding
+from hilstar.sky.air import NIGHT_SKY
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, SUN_TEMPERATURE_K, load_library
+from hilstar.sky.spectrum import (
+    DATA_DIR,
+    PLANCK_J_S,
+    Curve,
+    blackbody_exitance_w_m2_m,
+    load_curve,
+    read_curve_csv,
+)
+from hilstar.sky.stars import unit_vectors_icrs
+from hilstar.sky.synthetic import ZERO_W_M2_M, curve_mean, vega
+
+SKY_DEG2 = 4 * np.pi * np.degrees(1) ** 2
+CELLS = (36, 18)  # of the map, across and down: 10 degrees of right ascension, equal areas
+FRAME_DEG = 25.0  # side of Orion's field, whose stars are shown in both frames
+FRAME_V_MAG, FRAME_EPOCH = 7.5, 2000.0
+SUN_TYPE = "G2V"
+SHOWN_NM = np.arange(300.0, 1101.0)
+QUOTED_NM = (350.0, 400.0, 900.0)
+VEGA_NM = (200.0, 10_000.0)
+VEGA_TICKS_NM = (200, 500, 1000, 2000, 5000, 10_000)
+GLOW_V_MAG = 21.7  # of a dark sky's zenith, from the ground
+EARTHSHINE, HST_ZODIACAL = DATA_DIR / "earthshine.csv", DATA_DIR / "hst-zodiacal.csv"
+EARTHSHINES = {
+    "earthshine, 24°": 2.0,
+    "earthshine, 38°": 1.0,
+    "earthshine, 50°": 0.5,
+}  # by degrees from the Earth's limb
+W_M2_M_OF_ERG = 1e7  # erg/s/cm2/A in W/m2/m
+
+
+def star_density(directory: Path) -> ChartFinding:
+    """Figure 2.2: how many stars of Hipparcos a square degree of the sky has."""
+    catalog = load_catalog()
+    across = np.linspace(0, 360, CELLS[0] + 1)
+    down = np.linspace(-1, 1, CELLS[1] + 1)
+    height = np.sin(np.radians(catalog.dec_deg))
+    stars, _, _ = np.histogram2d(catalog.ra_deg % 360, height, (across, down))
+    density = stars.T / (SKY_DEG2 / stars.size)
+    low, high = np.percentile(density, (5, 95))
+    text = (
+        f"Hipparcos has {len(catalog) / SKY_DEG2:.2f} stars a square degree, {low:.1f} to"
+        f" {high:.1f} in 90 % of the sky:"
+        " most along the Milky Way"
+    )
+    note = f"{len(catalog)} stars with V and B-V. Cells of equal area, {SKY_DEG2 / stars.size:.0f} square degrees each."
+    with chart(directory / "star_density", text, note=note, height_inch=4.2) as (axes,):
+        image = axes.imshow(
+            density,
+            extent=(0, 360, -1, 1),
+            origin="lower",
+            aspect="auto",
+            cmap="viridis",
+            interpolation="nearest",
+        )
+        declinations = np.array([-90, -60, -30, 0, 30, 60, 90])
+        axes.set_yticks(np.sin(np.radians(declinations)), [str(degree) for degree in declinations])
+        axes.set_xticks(np.arange(0, 361, 60))
+        axes.set(xlim=(360, 0), xlabel="right ascension [deg]", ylabel="declination [deg]")
+        axes.grid(False)
+        axes.figure.colorbar(image, ax=axes, label="Stars a square degree")
+    middles = (across[:-1] + across[1:]) / 2, np.degrees(np.arcsin((down[:-1] + down[1:]) / 2))
+    ra_deg, dec_deg = np.meshgrid(*middles)
+    table = np.column_stack((ra_deg.ravel(), dec_deg.ravel(), density.ravel()))
+    write_csv(directory / "star_density.csv", ("ra_deg", "dec_deg", "stars_deg2"), table.tolist())
+    return ChartFinding("star_density", text)
+
+
+def frames(directory: Path) -> ChartFinding:
+    """Figure 2.11: the directions of Orion's stars in the celestial frame and in the camera's."""
+    catalog = load_catalog().brighter_than(FRAME_V_MAG)
+    vectors = unit_vectors_icrs(catalog, FRAME_EPOCH)
+    angles = FIELDS[0].radec_roll_deg
+    matrix = to_matrix(from_radec_roll_deg(*angles))
+    cam = vectors @ matrix.T
+    half = np.tan(np.radians(FRAME_DEG / 2))
+    inside = (cam[:, 2] > 0) & (np.abs(cam[:, :2]) < half * cam[:, 2:]).all(axis=1)
+    error = float(np.abs(vectors[inside] @ equation_2_3(*angles) - cam[inside]).max())
+    text = (
+        f"{int(inside.sum())} stars of Orion, in the celestial frame about +y, stand about +z in"
+        f" the camera's;"
+        f" equation 2.3 and hilstar's quaternion agree to {error:.0e}"
+    ).replace("e-", " x 10^-")
+    count = int(inside.sum())
+    finding = f"{count} stars of Orion stand about +y in the celestial frame, and about +z in the camera's"
+    note = "Unit vectors. North is up in both, as roll is 0; the camera's y points down."
+    with chart(directory / "frames", finding, 1, 2, note=note, share_x=False, height_inch=4.4) as (
+        sky,
+        image,
+    ):
+        boresight = matrix[2]
+        sky.plot(vectors[inside, 0], vectors[inside, 2], ".", ms=3, color=BLUE)
+        sky.plot(boresight[0], boresight[2], "+", ms=14, mew=2, color=ORANGE)
+        sky.set(xlabel="x [1]", ylabel="z [1]", title="Celestial frame (ICRS)", aspect="equal")
+        image.plot(cam[inside, 0], cam[inside, 1], ".", ms=3, color=BLUE)
+        image.plot(0, 0, "+", ms=14, mew=2, color=ORANGE)
+        for axes, name, colour in ((sky, "stars", BLUE), (image, "boresight", ORANGE)):
+            axes.text(1, 1.03, name, color=colour, ha="right", transform=axes.transAxes, fontsize=SMALL_PT)
+        image.invert_yaxis()
+        image.set(xlabel="x [1]", ylabel="y [1]", title="Camera frame (cam)", aspect="equal")
+    _write_frames(directory / "frames.csv", catalog.hip[inside], vectors[inside], cam[inside])
+    return ChartFinding("frames", text)
+
+
+def _write_frames(path: Path, hip: IntArray, icrs: FloatArray, cam: FloatArray) -> None:
+    axes = [f"{axis}_{frame}" for frame in ("icrs", "cam") for axis in "xyz"]
+    table = np.column_stack((icrs, cam)).tolist()
+    rows = [(number, *row) for number, row in zip(hip.tolist(), table, strict=True)]
+    write_csv(path, ("hip", *axes), rows)
+
+
+def equation_2_3(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
+    """The matrix (3, 3) of camera components to celestial ones: A3(a3) A1(a2) A3(a1), table 2.4."""
+    roll, down, across = np.radians([roll_deg, dec_deg - 90, ra_deg - 90])
+    return np.asarray(_about_z(across) @ _about_x(down) @ _about_z(roll))
+
+
+def _about_z(angle: float) -> FloatArray:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
+def _about_x(angle: float) -> FloatArray:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+
+
+def sun(directory: Path) -> ChartFinding:
+    """Figure 3.1: a star of the Sun's type and the black body of the Sun's temperature."""
+    library = load_library()
+    star = library.flux[library.spectral_type.index(SUN_TYPE)]
+    johnson_v = load_curve("johnson-v", "johnson-v")
+    mean = curve_mean(Curve(library.wavelength_nm, star), johnson_v)
+    spectrum = Curve(library.wavelength_nm, star / mean)
+    everywhere = blackbody_exitance_w_m2_m(library.wavelength_nm, SUN_TEMPERATURE_K)
+    body = Curve(
+        library.wavelength_nm,
+        everywhere / curve_mean(Curve(library.wavelength_nm, everywhere), johnson_v),
+    )
+    at_nm = np.array(QUOTED_NM)
+    share = spectrum(at_nm) / body(at_nm)
+    quoted = ", ".join(f"{ratio:.2f} at {nm:.0f} nm" for ratio, nm in zip(share.tolist(), QUOTED_NM, strict=True))
+    text = f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K, scaled in V: {quoted}"
+    note = "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
+    with chart(directory / "sun", text, note=note) as (axes,):
+        axes.plot(SHOWN_NM, spectrum(SHOWN_NM), color=INK, label=f"{SUN_TYPE}, observed")
+        axes.plot(SHOWN_NM, body(SHOWN_NM), color=ORANGE, label=f"black body, {SUN_TEMPERATURE_K:.0f} K")
+        axes.set(xlabel="wavelength [nm]", ylabel="F_lambda over its mean in V [1]")
+        axes.legend()
+    table = np.column_stack((SHOWN_NM, spectrum(SHOWN_NM), body(SHOWN_NM)))
+    write_csv(directory / "sun.csv", ("wavelength_nm", "g2v", "blackbody"), table.tolist())
+    return ChartFinding("sun", text)
+
+
+def vega_logarithmic(directory: Path) -> ChartFinding:
+    """Figure 2.13, right: Vega on logarithmic scales, beside the thesis's black body."""
+    light = vega()
+    shown = (light.wavelength_nm >= VEGA_NM[0]) & (light.wavelength_nm <= VEGA_NM[1])
+    nm, value = light.wavelength_nm[shown], light.value[shown]
+    johnson_v = load_curve("johnson-v", "johnson-v")
+    flux = value / curve_mean(light, johnson_v) * ZERO_W_M2_M["v"]
+    body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
+    body *= ZERO_W_M2_M["v"] / curve_mean(Curve(nm, body), johnson_v)
+    falls = float(np.interp(1000, nm, flux) / np.interp(5000, nm, flux))
+    blue, red = np.interp([350.0, 5000.0], nm, flux / body)
+    text = (
+        f"From 1 to 5 micrometres Vega's light falls by {falls:.0f} times; it has {blue:.2f} of"
+        f" the black body's at 350 nm,"
+        f" {red:.2f} at 5 micrometres"
+    )
+    note = f"CALSPEC, scaled to V = 0. Black body: {REFERENCE_TEMPERATURE_K:.0f} K, scaled in V."
+    with chart(directory / "vega_logarithmic", text, note=note) as (axes,):
+        axes.loglog(nm, flux, color=INK, label="Vega")
+        axes.loglog(nm, body, color=ORANGE, label="black body")
+        axes.set(xlabel="wavelength [nm]", ylabel="F_lambda [W/m2/m]", xlim=VEGA_NM)
+        plain_ticks(axes.xaxis, VEGA_TICKS_NM)
+        axes.legend()
+    table = np.column_stack((nm, flux, body))
+    write_csv(directory / "vega_logarithmic.csv", ("wavelength_nm", "vega", "blackbody"), table.tolist())
+    return ChartFinding("vega_logarithmic", text)
+
+
+def backgrounds(directory: Path) -> ChartFinding:
+    """Figure 4.11: zodiacal light and the other lights between the stars near the Earth."""
+    zodiacal, earthshine = read_curve_csv(HST_ZODIACAL), read_curve_csv(EARTHSHINE)
+    lights: dict[str, FloatArray] = {"zodiacal, V = 22.1": _photons(zodiacal)}
+    lights |= {name: times * _photons(earthshine) for name, times in EARTHSHINES.items()}
+    lights["from the ground"] = _glow_photons()
+    total = {name: float(np.nansum(values)) for name, values in lights.items()}
+    high, twice, low = (total[name] for name in ("earthshine, 38°", "earthshine, 24°", "earthshine, 50°"))
+    sky = total["zodiacal, V = 22.1"]
+    text = (
+        f"Zodiacal light of V = 22.1 has {sky:.0f} photons/s/m2/arcsec2 (300 to 1100 nm);"
+        f" earthshine adds {high:.0f} at 38"
+        f" degrees from the Earth's limb, {twice:.0f} at 24, {low:.0f} at 50"
+    )
+    note = (
+        "STIS Instrument Handbook, table 6.4. Ground: Paranal's glow (Hanuschik 2003) at V ="
+        f" {GLOW_V_MAG:g}, zodiacal"
+        " light within it. The geocoronal lines lie under 250 nm."
+    )
+    colours = (BLUE, MUTED, GREEN, PURPLE, ORANGE)
+    with chart(directory / "backgrounds", text, note=note) as (axes,):
+        for (name, values), colour in zip(lights.items(), colours, strict=True):
+            axes.semilogy(SHOWN_NM, values, color=colour, lw=1.5, label=name)
+        axes.set(xlabel="wavelength [nm]", ylabel="photons/s/m2/arcsec2/nm")
+        label_ends(axes)
+    names = ("zodiacal", "earthshine_24_deg", "earthshine_38_deg", "earthshine_50_deg", "ground")
+    write_csv(
+        directory / "backgrounds.csv",
+        ("wavelength_nm", *names),
+        np.column_stack((SHOWN_NM, *lights.values())).tolist(),
+    )
+    return ChartFinding("backgrounds", text)
+
+
+def _photons(erg_s_cm2_a_arcsec2: Curve) -> FloatArray:
+    """Photons/s/m2/arcsec2/nm at SHOWN_NM of a spectrum in erg/s/cm2/A/arcsec2."""
+    return _photons_of(erg_s_cm2_a_arcsec2(SHOWN_NM) * W_M2_M_OF_ERG)
+
+
+def _photons_of(w_m2_m: FloatArray) -> FloatArray:
+    joules = PLANCK_J_S * LIGHT_M_S / (SHOWN_NM * 1e-9)
+    return np.asarray(w_m2_m * 1e-9 / joules)
+
+
+def _glow_photons() -> FloatArray:
+    """The night sky's, NaN where its spectrum ends."""
+    spectrum = read_curve_csv(NIGHT_SKY, highest=np.inf)
+    mean = curve_mean(spectrum, load_curve("johnson-v", "johnson-v"))
+    level = flux_ratio(GLOW_V_MAG) * ZERO_W_M2_M["v"]
+    known = (spectrum.wavelength_nm[0] <= SHOWN_NM) & (spectrum.wavelength_nm[-1] >= SHOWN_NM)
+    return np.where(known, _photons_of(spectrum(SHOWN_NM) / mean * level), np.nan)
+
+
+FIGURES: tuple[Callable[[Path], ChartFinding], ...] = (
+    star_density,
+    frames,
+    sun,
+    vega_logarithmic,
+    backgrounds,
+)

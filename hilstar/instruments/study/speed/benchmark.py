@@ -1,0 +1,465 @@
+"""The benchmark: a frame's time by stage, beside other methods for the same image of the same stars, timed in turn.
+
+Other methods are NumPy and, where installed, numba, GalSim and photutils. Each is given the places and the light that hilstar
+found: its time has no culling and no projecting, and it makes no codes. A cell is one image size and one number of stars. They
+are the catalogue's and, where it has too few, random ones. Import and first frame are timed in fresh processes.
+"""
+
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from scipy.special import erf
+
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.interrupts import held
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.variants import StagedRenderer
+from hilstar.instruments.study.settings import FULL_HD, Table, Value, bench_text
+from hilstar.instruments.study.speed import report, tracker
+from hilstar.instruments.study.sweep import OtherWork
+from hilstar.optics.psf import SQRT2, GaussianPsf
+from hilstar.optics.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.frame import Bench
+from hilstar.sky.stars import Stars, cell_grid
+
+# A cap this much wider than the monitor's own: culling must have something to throw away.
+SKY_BEYOND = 1.5
+STAR_COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
+INSTALL = "pip install 'hilstar[benchmark]'"
+FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
+Sigma = tuple[float, float]
+_ONE = np.ones(1)
+FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4)
+# The linear image, (height, width), of sprites with their sigma, px.
+Draw = Callable[[Sprites, Sigma, tuple[int, int]], Float32Array]
+FRESH = """
+import re, sys, time
+from pathlib import Path
+begin = time.perf_counter()
+from hilstar import load
+imported = time.perf_counter()
+import numpy as np
+with load(sys.argv[1]) as bench:
+    bench.draw(np.array([float(part) for part in sys.argv[2:]])).levels
+    drawn = time.perf_counter()
+# Not getrusage: its maximum is inherited from the process that started this one.
+most_kb = re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]
+print((imported - begin) * 1e3, (drawn - imported) * 1e3, int(most_kb) / 1024)
+"""
+STAGES = ("cull", "project", "erase", "upload", "splat", "encode", "read_back")
+GPU_STAGES = ("gpu_splat", "gpu_encode")
+# 10 deg/s about an axis across and along the boresight: each star is drawn along its path while its row is lit.
+TURN_RAD_S = np.radians(10.0) * np.array([0.64, -0.74, 0.21])
+SIZES: tuple[report.Size, ...] = ((1024, 1024), report.REFERENCE_PX, (2560, 2048), (3840, 2160))
+COUNTS = (100, 1000, 10_000, 50_000)
+MAX_STARS = 200_000  # NumPy's method takes 2.9 kB of memory for each
+RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
+# What the project set itself on two cores, ms: whole frames by image and stars, Python at REFERENCE_PX by stars; how many times
+# a still frame one may take that turns by 10 deg/s.
+AIMS_MS = {(report.REFERENCE_PX, 1000): 3.5, (report.REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
+PYTHON_AIMS_MS = {1000: 0.2, 10_000: 1.0}
+TURNING_TIMES = 2.0
+START_AIM_MS = 1500.0
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkScene:
+    """Stars, and how many of those in view are the catalogue's."""
+
+    stars: Stars
+    catalogue_count: int
+
+
+def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> BenchmarkScene:
+    """A scene with exactly `count` stars in view: the brightest of `every`, then random ones in and around the view.
+
+    The random ones are as bright as random stars of the fainter half of `every`. Raises InputError where `every` is empty.
+    """
+    if not len(every):
+        raise InputError("bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag")
+    seen = bench.sprites(q_icrs_to_cam, every).star
+    ranked = seen[np.argsort(every.v_mag[seen], kind="stable")]
+    if len(ranked) >= count:
+        kept = every.v_mag <= every.v_mag[ranked[count - 1]]
+        kept[ranked[count:]] = False
+        return BenchmarkScene(_sorted(every, np.flatnonzero(kept), every.vectors[kept]), count)
+    vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
+    faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
+    sources = np.concatenate([np.arange(len(every)), rng.choice(faint, len(vectors))])
+    return BenchmarkScene(_sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked))
+
+
+def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
+    """Stars at `vectors` (n, 3) that are otherwise those of `every` at `sources` (n,), by cell."""
+    grid = cell_grid(vectors)
+    columns = {name: getattr(every, name)[sources[grid.order]] for name in STAR_COLUMNS}
+    return replace(every, vectors=np.asfortranarray(vectors[grid.order]), grid=grid, **columns)
+
+
+def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generator) -> FloatArray:
+    """ICRS unit vectors, even over a cap around the view, of which `wanted` are in view."""
+    camera, footprint_px = bench.camera, bench.psf.footprint_px
+    cos_cap = np.cos(min(SKY_BEYOND * camera.field_radius_rad(footprint_px), np.pi))
+    tries = 4 * wanted
+    while True:
+        z, turn = 1 - rng.uniform(size=tries) * (1 - cos_cap), rng.uniform(0, 2 * np.pi, tries)
+        across = np.sqrt(1 - z**2)
+        vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+        x_px, y_px = camera.project(vectors)
+        seen = pack_sprites(x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px).star
+        if len(seen) >= wanted:
+            return np.asarray(vectors[: seen[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q)))
+        tries *= 2
+
+
+def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
+    """The methods that are installed here, imported and compiled; and by name the remedy for each of the others."""
+    found: dict[str, Draw] = {}
+    missing: dict[str, str] = {}
+    for name, _, make in METHODS:
+        try:
+            draw = make()
+        except ImportError as error:
+            missing[name] = f"not installed ({error}): {INSTALL}"
+            continue
+        with held():  # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and lost
+            draw(FIRST, (0.85, 0.85), (8, 8))
+        found[name] = draw
+    return found, missing
+
+
+def numpy_linear(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+    """The baseline: separable erf differences and np.add.at. float32 (height, width), electrons per second."""
+    image = np.zeros(shape, np.float32)
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    columns = sprites.data["pixel"][:, :1] + steps
+    rows = sprites.data["pixel"][:, 1:] + steps
+    share_y = _shares(rows, sprites.y_px, sigma_px[1]) * sprites.data["electrons_per_s"][:, None]
+    light = (share_y[:, :, None] * _shares(columns, sprites.x_px, sigma_px[0])[:, None, :]).astype(np.float32)
+    inside = ((rows >= 0) & (rows < shape[0]))[:, :, None] & ((columns >= 0) & (columns < shape[1]))[:, None, :]
+    place = rows[:, :, None] * shape[1] + columns[:, None, :]
+    np.add.at(image.ravel(), place[inside], light[inside])
+    return image
+
+
+def _shares(pixels: IntArray, centre_px: FloatArray, sigma_px: float) -> FloatArray:
+    edges = np.concatenate([pixels - 0.5, pixels[:, -1:] + 0.5], axis=1)
+    return np.asarray(0.5 * np.diff(erf((edges - centre_px[:, None]) / (sigma_px * SQRT2)), axis=1))
+
+
+def _add_stars(image: Any, first: Any, centre_px: Any, electrons_per_s: Any, scale: Any, size: int) -> None:
+    """The plain loop that numba compiles: `first` (n, 2) is each footprint's first pixel, `scale` is 1 / (sigma sqrt 2)."""
+    height, width = image.shape
+    share = np.empty((2, size))
+    for k in range(len(first)):
+        for axis in range(2):
+            before = math.erf((first[k, axis] - 0.5 - centre_px[axis, k]) * scale[axis])
+            for i in range(size):
+                after = math.erf((first[k, axis] + i + 0.5 - centre_px[axis, k]) * scale[axis])
+                share[axis, i] = 0.5 * (after - before)
+                before = after
+        for j in range(max(0, -first[k, 1]), min(size, height - first[k, 1])):
+            row = share[1, j] * electrons_per_s[k]
+            for i in range(max(0, -first[k, 0]), min(size, width - first[k, 0])):
+                image[first[k, 1] + j, first[k, 0] + i] += row * share[0, i]
+
+
+def _make_numba() -> Draw:
+    add_stars = import_module("numba").njit(_add_stars)
+
+    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+        image = np.zeros(shape, np.float32)
+        first = sprites.data["pixel"] - (sprites.footprint_px - 1) // 2
+        centre_px = np.stack([sprites.x_px, sprites.y_px])
+        light = np.ascontiguousarray(sprites.data["electrons_per_s"])
+        add_stars(image, first, centre_px, light, 1 / (np.array(sigma_px) * SQRT2), sprites.footprint_px)
+        return image
+
+    return draw
+
+
+def _make_galsim() -> Draw:
+    galsim = import_module("galsim")
+
+    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+        image = galsim.ImageF(np.zeros(shape, np.float32), xmin=0, ymin=0)
+        profile = galsim.Gaussian(sigma=1.0).transform(sigma_px[0], 0, 0, sigma_px[1])
+        last = sprites.footprint_px - 1
+        first = (sprites.data["pixel"] - last // 2).tolist()
+        light = sprites.data["electrons_per_s"].tolist()
+        for (column, row), x, y, electrons in zip(first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True):
+            bounds = galsim.BoundsI(column, column + last, row, row + last) & image.bounds
+            star = profile.withFlux(electrons)
+            star.drawImage(image=image[bounds], scale=1.0, center=galsim.PositionD(x, y), add_to_image=True)
+        return np.asarray(image.array)
+
+    return draw
+
+
+def _make_photutils() -> Draw:
+    make_model_image = import_module("photutils.datasets").make_model_image
+    model = import_module("photutils.psf").GaussianPRF
+    table = import_module("astropy.table").QTable
+
+    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+        stars = table({"x_0": sprites.x_px, "y_0": sprites.y_px, "flux": sprites.data["electrons_per_s"].astype(float)})
+        fwhm = {"x_fwhm": sigma_px[0] * FWHM_PER_SIGMA, "y_fwhm": sigma_px[1] * FWHM_PER_SIGMA}
+        side = sprites.footprint_px | 1
+        return np.asarray(make_model_image(shape, model(**fwhm), stars, model_shape=(side, side)), dtype=np.float32)
+
+    return draw
+
+
+METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
+    ("numpy", "separable erf differences and np.add.at; our stamps", lambda: numpy_linear),
+    ("numba", "the same as a compiled loop on one core, compiled before; our stamps", _make_numba),
+    ("galsim", "drawImage of a Gaussian convolved with the pixel, by FFT; our stamps", _make_galsim),
+    ("photutils", "make_model_image of GaussianPRF, exact in the pixel; stamps of the next odd side", _make_photutils),
+)
+
+
+def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> report.ProcessStart:
+    """Start a process that imports hilstar and draws one frame of the bench file."""
+    command = [sys.executable, "-c", FRESH, str(path), *map(repr, q_icrs_to_cam.tolist())]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    import_ms, first_frame_ms, memory_mb = map(float, done.stdout.split())
+    return report.ProcessStart(*size, import_ms, first_frame_ms, memory_mb)
+
+
+def this_machine() -> report.Machine:
+    """The processor, and the versions that the times depend on."""
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text(encoding="utf-8").splitlines() if cpus.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return report.Machine(
+        cpu=next(iter(names), platform.machine()),
+        cores=len(os.sched_getaffinity(0)),
+        load=round(os.getloadavg()[0], 2),
+        python=platform.python_version(),
+        numpy=np.__version__,
+    )
+
+
+class CellMeasurement(Closing):
+    """One image size and star count, measured into `result`; close it to free its two GL contexts."""
+
+    def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result) -> None:
+        self.bench, self.q, self.result = bench, q_icrs_to_cam, result
+        self.cell_key = cell.width, cell.height, cell.stars
+        self.shape = cell.height, cell.width
+        self.sigma_px = bench.config.render.sprite_sigma_px
+        self.candidates = Candidates()
+        self.sprites = bench.sprites(self.q)
+        self.icrs_to_image = bench.camera.cam_to_image @ to_matrix(self.q)
+        self.staged = StagedRenderer(bench.renderer.target)
+        self.linear = Renderer(Target(bench.camera.resolution_px, GaussianPsf(self.sigma_px)))
+        self.stage_ms: dict[str, list[float]] = {}
+
+    def measure(self, methods: dict[str, Draw], rounds: int, budget_s: float) -> None:
+        """Time every method in turn, so that other load on the machine is in the times of all."""
+        works: dict[str, Callable[[], object]] = {
+            "whole_frame": lambda: self.bench.draw(self.q).levels,
+            "turning": lambda: self.bench.draw(self.q, 0, TURN_RAD_S).levels,
+            "linear_only": self._draw_linear,
+            "stages": self._draw_stages,
+            "python": self._python,
+        }
+        images: dict[str, Float32Array] = {}
+        for name, draw in methods.items():
+            if (why := self._too_long(draw, budget_s)) is not None:
+                self.result.skipped.append(report.Skipped(*self.cell_key, name, why))
+                continue
+            whole = partial(draw, self.sprites, self.sigma_px, self.shape)
+            works[name] = lambda name=name, whole=whole: images.update({name: whole()})  # type: ignore[misc]
+        self._keep(interleaved(works, rounds, budget_s))
+        ours = self._draw_linear()
+        for name, image in images.items():
+            worst = float(np.abs(image - ours).max() / ours.max())
+            self.result.agreement.append(report.Agreement(*self.cell_key, name, worst))
+
+    def _keep(self, times_ms: dict[str, list[float]]) -> None:
+        self.result.python_ms.append(report.PythonTime(*self.cell_key, _spread(times_ms.pop("python"))))
+        del times_ms["stages"]  # with its waits; its parts are kept
+        rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "turning", "linear_only")]
+        for kind in (*STAGES, *GPU_STAGES):
+            if stage_ms := self.stage_ms.get(kind):
+                rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))  # without the first turn, as in `interleaved`
+        rows += [(name, "linear_only", times) for name, times in times_ms.items()]
+        for method, kind, times in rows:
+            self.result.rows.append(report.MethodTiming(*self.cell_key, method, kind, _spread(times)))
+
+    def _too_long(self, draw: Draw, budget_s: float) -> str | None:
+        """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
+        if len(self.sprites) <= 101:
+            return None
+
+        def fastest_s(count: int) -> float:
+            few = {name: getattr(self.sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
+            part = replace(self.sprites, **few)
+            return min(_seconds(lambda: draw(part, self.sigma_px, self.shape)) for _ in range(2))
+
+        one_s = fastest_s(1)
+        frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
+        return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s" if frame_s > budget_s else None
+
+    def _draw_linear(self) -> Float32Array:
+        self.linear.draw(self.sprites)
+        return self.linear.linear()
+
+    def _draw_stages(self) -> None:
+        stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
+        begin = time.perf_counter()
+        near, directions, rates_e_per_s = self.candidates.near(stars, self.icrs_to_image, camera, footprint_px / 2 + 1)
+        culled = time.perf_counter()
+        # make_sprites in its two halves.
+        x_px, y_px = camera.project((self.icrs_to_image @ directions).T)
+        sprites = pack_sprites(x_px, y_px, rates_e_per_s, near, camera.resolution_px, footprint_px)
+        projected = time.perf_counter()
+        self.staged.draw(sprites)
+        self.staged.levels()
+        before = {"cull": (culled - begin) * 1e3, "project": (projected - culled) * 1e3}
+        for kind, ms in {**before, **self.staged.stage_ms}.items():
+            self.stage_ms.setdefault(kind, []).append(ms)
+
+    def _python(self) -> None:
+        """All of a frame that is not OpenGL."""
+        white, size_px = self.bench.flux_at_white_e_per_s, self.bench.camera.resolution_px
+        clipped_sprites(
+            self.bench.sprites(self.q), GaussianPsf(self.sigma_px), white, size_px, self.bench.uniformity, self.bench.darkest
+        )
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        self.staged.close()
+        self.linear.close()
+
+
+def interleaved(works: dict[str, Callable[[], object]], rounds: int, budget_s: float) -> dict[str, list[float]]:
+    """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within `budget_s` each.
+
+    The first turn counts only where no other fits.
+    """
+    first_s = {name: _seconds(work) for name, work in works.items()}
+    turns = {name: min(rounds, int(budget_s / seconds) - 1) for name, seconds in first_s.items()}
+    times = {name: [first_s[name] * 1e3] if turns[name] < 1 else [] for name in works}
+    for k in range(rounds):
+        for name, work in works.items():
+            if turns[name] > 0 and (k + 1) * turns[name] // rounds > k * turns[name] // rounds:
+                times[name].append(_seconds(work) * 1e3)
+    return times
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def _spread(times_ms: list[float]) -> report.Spread:
+    return report.Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkPlan:
+    """What to measure: image sizes (px), star counts, and the maximum rounds and seconds of a method in one cell.
+
+    `file` replaces the benchmark's own bench file; `sizes` is then that file's image size.
+    """
+
+    sizes: tuple[report.Size, ...] = SIZES
+    counts: tuple[int, ...] = COUNTS
+    rounds: int = 100
+    budget_s: float = 10.0
+    starts: int = 3
+    exposures: int = 20
+    file: BenchFile | None = None
+
+
+QUICK = BenchmarkPlan(sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1)
+
+
+def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> report.Result:
+    """Measure every cell of a plan; `advance` hears how many are done. Raises InputError, MachineError."""
+    methods, missing = other_methods()
+    others = OtherWork()
+    result = report.Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
+    result.skipped += [report.Skipped(method=name, why=why) for name, why in missing.items()]
+    q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
+    with TemporaryDirectory() as folder:
+        for place, size in enumerate(plan.sizes):
+            file = plan.file or own_bench_file(Path(folder) / "bench.toml", size, motion="on")
+            with open_bench(file) as bench:
+                result.gl_renderer = bench.renderer.gl_renderer
+                every = bench.shown_stars
+                for k, count in enumerate(plan.counts):
+                    shown = scene(bench, every, q_icrs_to_cam, count, rng)
+                    result.scenes.append(report.SceneOrigin(*size, count, shown.catalogue_count, count - shown.catalogue_count))
+                    with CellMeasurement(
+                        bench.with_stars(shown.stars), q_icrs_to_cam, report.Cell(*size, count), result
+                    ) as cell:
+                        cell.measure(methods, plan.rounds, plan.budget_s)
+                    advance(place * len(plan.counts) + k + 1)
+            result.startup += [fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)]
+    if plan.exposures:
+        result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
+        result.skipped += without
+    size = report.REFERENCE_PX if report.REFERENCE_PX in plan.sizes else plan.sizes[0]
+    here = [start for start in result.startup if start.size == size]
+    for name in ("import_ms", "first_frame_ms", "memory_mb"):
+        setattr(result, name, float(np.median([getattr(start, name) for start in here])))
+    result.others_cores = round(others.cores(), 2)
+    result.aims += _aims(result)
+    return result
+
+
+def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFile:
+    """The benchmark's own bench file for an image size, written to `path`; `render` are further keys of [render]."""
+    tables: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "sky": {"faintest_v_mag": 14},
+        "monitor": {**FULL_HD, "resolution_px": size_px},
+        "collimator": {"focal_length_mm": 200},
+        "render": {"flux_at_white_e_per_s": 2e6, "quantisation": "round", **render},
+    }
+    path.write_text(bench_text(tables))
+    return read_bench_file(path)
+
+
+def _aims(result: report.Result) -> list[report.Aim]:
+    at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in result.rows}
+    aims = []
+    for (size, stars, method, kind), ms in at.items():
+        where = f"{stars} stars, {size[0]} x {size[1]}"
+        still, numba = (at.get((size, stars, *key)) for key in (("hilstar", "whole_frame"), ("numba", "linear_only")))
+        if kind == "whole_frame" and (size, stars) in AIMS_MS:
+            aims.append((f"whole frame to codes, {where}", AIMS_MS[size, stars], ms))
+        elif kind == "turning" and still is not None:
+            aims.append((f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames", TURNING_TIMES * still, ms))
+        elif kind == "linear_only" and method == "hilstar" and numba is not None:
+            aims.append((f"linear image, {where}, numba's time", numba, ms))
+    for python in result.python_ms:
+        if python.size == report.REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
+            aims.append((f"Python outside GL, {python.stars} stars", PYTHON_AIMS_MS[python.stars], python.ms.median))
+    starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == report.REFERENCE_PX]
+    if starts:
+        aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
+    judged = not result.load.busy
+    return [report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims]

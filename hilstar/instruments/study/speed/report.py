@@ -1,0 +1,275 @@
+"""The benchmark's result: the command's JSON object, lines for a person, a CSV and a chart."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from msgspec import UNSET, UnsetType
+
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
+from hilstar.instruments.study.sweep import Load
+
+Size = tuple[int, int]
+REFERENCE_PX: Size = (1920, 1080)
+COLOURS = {"hilstar": RED, "numpy": BLUE, "numba": ORANGE, "galsim": GREEN, "photutils": PURPLE}
+COLUMN = 12
+NAME = 26
+OF_AN_IMAGE = ("whole_frame", "turning", "linear_only")
+LABELS = {
+    "whole_frame": ("whole frame to codes", "o-"),
+    "turning": ("the same turning by 10 deg/s", "o:"),
+    "linear_only": ("linear image only", "o--"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Times of a work, ms."""
+
+    median: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSize:
+    """An image size, px."""
+
+    width: int
+    height: int
+
+    @property
+    def size(self) -> Size:
+        """Width and height, px."""
+        return self.width, self.height
+
+
+@dataclass(frozen=True, slots=True)
+class Cell(ImageSize):
+    """An image size and a number of stars in view."""
+
+    stars: int
+
+
+@dataclass(frozen=True, slots=True)
+class MethodTiming(Cell):
+    """How long a method takes in a cell; `kind` is the whole frame, the linear image alone or a stage of hilstar's."""
+
+    method: str
+    kind: str
+    ms: Spread
+
+
+@dataclass(frozen=True, slots=True)
+class PythonTime(Cell):
+    """How long all of a frame takes that is not OpenGL."""
+
+    ms: Spread
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOrigin(Cell):
+    """How many of a cell's stars are the catalogue's, and how many are random."""
+
+    catalogue: int
+    random: int
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement(Cell):
+    """The largest difference of a method's linear image from hilstar's, as a share of hilstar's brightest pixel."""
+
+    method: str
+    worst_of_peak: float
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """A method that was not measured, in one cell or in any, and why."""
+
+    width: int | UnsetType = UNSET
+    height: int | UnsetType = UNSET
+    stars: int | UnsetType = UNSET
+    method: str = ""
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStart(ImageSize):
+    """Times of import and first frame in a process of its own, and its peak memory."""
+
+    import_ms: float
+    first_frame_ms: float
+    memory_mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """A time that the project set itself, and whether this run reached it; None on a busy machine."""
+
+    what: str
+    aim_ms: float
+    measured_ms: float
+    reached: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where the times were taken; `load` is the average of the last minute before, which is in the times too."""
+
+    cpu: str
+    cores: int
+    load: float
+    python: str
+    numpy: str
+
+
+@dataclass(slots=True)
+class Result:
+    """The JSON object of `hilstar benchmark`; it grows while the benchmark runs."""
+
+    machine: Machine
+    gl_renderer: str = ""
+    rows: list[MethodTiming] = field(default_factory=list)
+    tracker: list[MethodTiming] = field(default_factory=list)
+    scenes: list[SceneOrigin] = field(default_factory=list)
+    agreement: list[Agreement] = field(default_factory=list)
+    startup: list[ProcessStart] = field(default_factory=list)
+    python_ms: list[PythonTime] = field(default_factory=list)
+    does: dict[str, str] = field(default_factory=dict)
+    skipped: list[Skipped] = field(default_factory=list)
+    import_ms: float = 0.0
+    first_frame_ms: float = 0.0
+    memory_mb: float = 0.0
+    aims: list[Aim] = field(default_factory=list)
+    others_cores: float = 0.0  # that other processes took while it ran
+
+    @property
+    def load(self) -> Load:
+        """The same, and what may be said of the times."""
+        return Load(self.others_cores)
+
+
+def lines(result: Result) -> Iterator[str]:
+    """A table for each image size: medians in ms, a column for each star count; then notes."""
+    machine = result.machine
+    software = f"Python {machine.python}, NumPy {machine.numpy}; {result.gl_renderer}"
+    yield f"{machine.cpu}, {machine.cores} cores, load {machine.load:.1f} before; {software}"
+    for size in _sizes(result.rows):
+        rows = [row for row in result.rows if row.size == size]
+        counts = _counts(rows)
+        yield ""
+        yield f"{_words(size) + ', ms (median)':{NAME}}" + "".join(f"{f'{count} stars':>{COLUMN}}" for count in counts)
+        for name, values in _named(rows).items():
+            yield f"{name:{NAME}}" + "".join(f"{_ms(values.get(count)):>{COLUMN}}" for count in counts)
+        python = {row.stars: row.ms.median for row in result.python_ms if row.size == size}
+        yield f"{'  Python outside GL':{NAME}}" + "".join(f"{_ms(python.get(count)):>{COLUMN}}" for count in counts)
+    yield ""
+    yield from _tracker_lines(result.tracker)
+    yield from _notes(result)
+    if result.load.busy:
+        yield result.load.caution
+
+
+def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
+    own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
+    for row in rows:
+        if row is rows[0]:
+            yield f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor (median)"
+        beside = "" if row.method == "hilstar" else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
+        yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"
+    yield from [""] * bool(rows)
+
+
+def _notes(result: Result) -> Iterator[str]:
+    yield "whole frame: from attitude to codes in memory. turning: the same at 10 deg/s, with stars drawn along their paths"
+    yield "linear only: the image alone, from given places and light"
+    yield "stages are waited for, one after the other; gpu: the same by the driver's own timers"
+    for name, does in result.does.items():
+        worst = [row.worst_of_peak for row in result.agreement if row.method == name]
+        yield f"{name:11}{does}" + (f"; differs by at most {max(worst):.1g} of our brightest pixel" if worst else "; not run")
+    for row in result.scenes:
+        if row.random:
+            yield f"{_words(row.size)}, {row.stars} stars: {row.catalogue} from the catalogue, {row.random} random"
+    for skipped in result.skipped:
+        where = "" if skipped.stars is UNSET else f" at {skipped.width} x {skipped.height}, {skipped.stars} stars"
+        yield f"{skipped.method}{where}: {skipped.why}"
+    yield (
+        f"import {result.import_ms:.0f} ms, first frame {result.first_frame_ms:.0f} ms, "
+        f"peak memory {result.memory_mb:.0f} MB, in a fresh process"
+    )
+    for aim in result.aims:
+        word = "not judged" if aim.reached is None else "reached" if aim.reached else "NOT reached"
+        yield f"aim {word}: {aim.what} {aim.measured_ms:.2f} ms (at most {aim.aim_ms:.4g})"
+
+
+def write(result: Result, folder: Path) -> None:
+    """Write bench.csv, tracker.csv and the chart into `folder`. Raises InputError where they cannot be written."""
+    columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
+    for name, rows in (("bench.csv", result.rows), ("tracker.csv", result.tracker)):
+        table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in rows]
+        write_csv(folder / name, columns, table)
+    _draw(folder / "bench", result)
+
+
+def _draw(path: Path, result: Result) -> None:
+    sizes = _sizes(result.rows)
+    across = min(2, len(sizes))
+    down = -(-len(sizes) // across)
+    height = 2.1 + 2.5 * down
+    layout: dict[str, Any] = {"share_x": True, "share_y": True, "height_inch": height}
+    with chart(path, _finding(result), down, across, note=result.load.note("Medians, in turn."), **layout) as grid:
+        for axes in grid[len(sizes) :]:
+            axes.set_axis_off()
+        for axes, size in zip(grid, sizes, strict=False):
+            rows = [row for row in result.rows if row.size == size and row.kind in OF_AN_IMAGE]
+            for method, kind in dict.fromkeys((row.method, row.kind) for row in rows):
+                points = [(row.stars, row.ms.median) for row in rows if (row.method, row.kind) == (method, kind)]
+                label, style = LABELS[kind]
+                axes.plot(*zip(*points, strict=True), style, color=COLOURS[method], ms=4, label=f"{method}, {label}")
+            axes.set(title=_words(size), xscale="log", yscale="log")
+            plain_ticks(axes.xaxis, _counts(rows))
+        for axes in grid[-across:]:
+            axes.set_xlabel("stars in view")
+        for axes in grid[::across]:
+            axes.set_ylabel("time of a frame [ms]")
+        handles = {label: line for axes in grid for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        grid[0].figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
+
+
+def _finding(result: Result) -> str:
+    whole = [row for row in result.rows if row.kind == "whole_frame"]
+    first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
+    parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
+    where = f"{result.gl_renderer}, {result.machine.cores} cores"
+    return result.load.title(f"A whole frame takes {parts[0]} and {parts[1]} ({where})", "A whole frame beside other renderers")
+
+
+def _named(rows: Sequence[MethodTiming]) -> dict[str, dict[int, float]]:
+    """Medians by star count of each line of the table, hilstar's stages indented under the whole frame."""
+    named: dict[str, dict[int, float]] = {}
+    for wanted in (True, False):
+        for row in rows:
+            stage = row.kind not in OF_AN_IMAGE
+            if wanted == (stage or row.kind == "whole_frame"):
+                kind = row.kind.replace("_", " ")
+                name = f"  {kind}" if stage else f"{row.method}, {kind}"
+                named.setdefault(name, {})[row.stars] = row.ms.median
+    return named
+
+
+def _sizes(rows: Sequence[Cell]) -> list[Size]:
+    return list(dict.fromkeys(row.size for row in rows))
+
+
+def _counts(rows: Sequence[Cell]) -> list[int]:
+    return sorted({row.stars for row in rows})
+
+
+def _words(size: Size) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def _ms(value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"

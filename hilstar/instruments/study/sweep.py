@@ -1,0 +1,230 @@
+"""Methods side by side: their times in turn, the front of error against time, and how busy the machine was meanwhile.
+
+Works are timed in rounds, so that other load on the machine is in the times of all of them. On a busy machine no time says
+which method is faster, so a study also notes the load by others.
+"""
+
+import math
+import os
+import resource
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import BoolArray
+from hilstar.basics.charts import capital
+
+MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
+MAX_ROUNDS = 500  # more do not move a median
+SEED = 1
+BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores
+STAT = Path("/proc/stat")
+NOT_JUDGED = "the times were taken on a busy machine: none is named the faster"
+
+
+# What a study found, a line each, and whether it was right: None where its times cannot be judged.
+Judged = tuple[list[str], bool | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """The cores that others took while times were taken, and what to say of such times."""
+
+    cores: float = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether other work makes times worthless."""
+        return self.cores > BUSY_SHARE * (os.cpu_count() or 1)
+
+    @property
+    def caution(self) -> str:
+        """The line about times that were taken beside other work."""
+        return (
+            f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores"
+            " meanwhile, so these times name no winner; run it again when the machine is idle"
+        )
+
+    def title(self, finding: str, errors: str = "The errors hold") -> str:
+        """The title of a chart of times: `finding`; on a busy machine `errors` and NOT_JUDGED."""
+        if self.busy:
+            return f"{errors}; {NOT_JUDGED}"
+        return finding
+
+    def note(self, note: str) -> str:
+        """The note of a chart that draws times; on a busy machine with the caution about them."""
+        if not self.busy:
+            return note
+        return f"{note} {capital(self.caution)}."
+
+    def judged(self, lines: Sequence[str]) -> Judged:
+        """What a study of times found: on a busy machine with the caution, and not judged."""
+        if self.busy:
+            return [*lines, self.caution], None
+        return list(lines), True
+
+
+class Spent(NamedTuple):
+    """The wall time and the processor time (all threads) of one call, ms."""
+
+    wall_ms: float
+    cpu_ms: float
+
+
+def spent(work: Callable[[], object]) -> Spent:
+    """Call a work once and time it."""
+    begin_cpu, begin = time.process_time(), time.perf_counter()
+    work()
+    wall_s = time.perf_counter() - begin
+    return Spent(1e3 * wall_s, 1e3 * (time.process_time() - begin_cpu))
+
+
+def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf) -> dict[str, list[Spent]]:
+    """The times of at most `rounds` calls of each work, which is given the number of its round.
+
+    Each round has an order of its own, so that no work always follows the same one. A work that has had `share_s` skips the
+    rounds after MIN_ROUNDS. Round 0 is not counted: it compiles shaders and fills caches.
+    """
+    times: dict[str, list[Spent]] = {name: [] for name in works}
+    names, rng = list(works), np.random.default_rng(SEED)
+    for number in range(rounds + 1):
+        for name in (names[k] for k in rng.permutation(len(names))):
+            if number <= MIN_ROUNDS or sum(one.wall_ms for one in times[name]) <= 1e3 * share_s:
+                took = spent(partial(works[name], number))
+                times[name] += [took] if number else []
+    return times
+
+
+def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
+    """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
+    return {name: float(np.median([one.wall_ms for one in took])) for name, took in in_turn(works, rounds).items()}
+
+
+def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
+    """Whether the method of a row is beaten by that of a column, (n, n).
+
+    A method beats another whose error and time are both no smaller, and one of them larger.
+    """
+    error, taken = np.asarray(errors, dtype=np.float64), np.asarray(times_ms, dtype=np.float64)
+    as_good = (error <= error[:, None]) & (taken <= taken[:, None])
+    return np.asarray(as_good & ((error < error[:, None]) | (taken < taken[:, None])))
+
+
+def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
+    """Which methods (n,) no other beats, by error and time; two that are equal in both are both on the front."""
+    return np.asarray(~beaten_by(errors, times_ms).any(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A measure of methods: its name and unit; figures under `floor` count as 0."""
+
+    name: str
+    unit: str
+    floor: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A method: its error and a second figure, in the units of its `Trials`, and the work that is timed.
+
+    `more` are further figures by the names of their columns. The others are measured against the exact one. `measured` adds
+    the median time and its quartiles, ms; `on_front` where no other is both as accurate and as fast; and in `beaten` the method
+    that beats the default, and why the default stays.
+    """
+
+    method: str
+    error: float
+    second: float
+    work: Callable[[], object]
+    is_default: bool = False
+    is_exact: bool = False
+    more: dict[str, float] = field(default_factory=dict)
+    time_ms: float = np.nan
+    quartiles_ms: tuple[float, float] = (np.nan, np.nan)
+    on_front: bool = False
+    beaten: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """All methods of a step. `work` names the timed work, `why_default` is the reason for the default where another beats it.
+
+    `remark` is a caution that the figures alone would hide. `load` is what others took while it was timed.
+    """
+
+    name: str
+    work: str
+    error: Figure
+    second: Figure
+    why_default: str
+    trials: Sequence[Trial]
+    remark: str = ""
+    load: Load = field(default_factory=Load)
+
+    @property
+    def default(self) -> Trial:
+        """The method that hilstar takes."""
+        return next(trial for trial in self.trials if trial.is_default)
+
+
+def measured(step: Trials, budget_s: float) -> Trials:
+    """Time the methods of a step in turn, mark the front, and put the fastest first.
+
+    On a busy machine no method is on the front, and none is said to beat the default.
+    """
+    others = OtherWork()
+    works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
+    times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
+    low, middle, high = np.array([np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]).T
+    load = others.load()
+    errors = [max(trial.error, step.error.floor) for trial in step.trials]
+    # On a busy machine every method counts as beaten: none is on the front.
+    beaten = beaten_by(errors, middle) | load.busy
+    found = [
+        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any())
+        for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
+    ]
+    own = next(k for k, trial in enumerate(found) if trial.is_default)
+    if not found[own].on_front and not load.busy:
+        best = min((trial for trial, beats in zip(found, beaten[own], strict=True) if beats), key=lambda trial: trial.time_ms)
+        saved = 100 * (1 - best.time_ms / found[own].time_ms)
+        noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= found[own].quartiles_ms[0] else ""
+        why = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {step.why_default}"
+        found[own] = replace(found[own], beaten=why)
+    return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms), load=load)
+
+
+class OtherWork:
+    """Counts the cores that other processes take from its creation on; children of this process are its own."""
+
+    def __init__(self) -> None:
+        self._before = self._times_s()
+
+    def cores(self) -> float:
+        """How many cores the others took on average since creation; 0 where the system does not say."""
+        all_s, others_s = (now - before for now, before in zip(self._times_s(), self._before, strict=True))
+        return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
+
+    def load(self) -> Load:
+        """What the others took since creation."""
+        return Load(self.cores())
+
+    @staticmethod
+    def _times_s() -> tuple[float, float]:
+        """Processor time since the machine started, s: of all cores, idle or busy, and that of other processes."""
+        try:
+            ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
+        except (OSError, ValueError):
+            return 0.0, 0.0
+        each_s = 1 / os.sysconf("SC_CLK_TCK")
+        user, nice, system, idle, waiting, *interrupts = ticks
+        busy = user + nice + system + sum(interrupts)
+        own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return (busy + idle + waiting) * each_s, busy * each_s - sum(used.ru_utime + used.ru_stime for used in own)

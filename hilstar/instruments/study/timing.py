@@ -1,0 +1,493 @@
+"""The study of timing: the effect of a screen's timing on a slewing tracker, and the gain and cost of each compensation.
+
+The virtual tracker integrates over several frames of a simulated panel, which lights row by row and holds each row until it is
+written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
+the stars of one exposure see the whole beat. The beat is compared with the prediction of `run.sync`.
+
+Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and without noise, the glow of the
+black level shows each row's light, and lines are `run.sync`'s at each row's own phase.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
+from hilstar.display.quantise import shown_light
+from hilstar.display.render.backend import Target
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.response import Levels
+from hilstar.instruments.campaign.display_tracker import DisplayTracker
+from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.shutter import S_PER_US
+from hilstar.instruments.study import settings
+from hilstar.instruments.study.predictors import Movement, attitude_at
+from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
+from hilstar.optics.exposure_motion import Motion, smeared_sprites
+from hilstar.optics.frame_motion import Scan
+from hilstar.optics.layers.view import STILL, View
+from hilstar.optics.sprites import Sprites
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import scan_of
+from hilstar.server.bench.cameras import bench_camera, tracker_camera
+from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
+
+STRIPES_RADEC_ROLL_DEG = (84.0, 0.0, 0.0)
+STRIPE_ROWS, ROW_TIME_US, REFRESH_HZ = 1024, 60.0, 60.0
+STRIPE_SIZE_PX = (128, STRIPE_ROWS)
+EVERY_ROWS = 16  # between dots
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class StripeCase:
+    """Refreshes in an exposure, and how long the display's rows stay lit, ms."""
+
+    refreshes: float
+    lit_ms: float
+
+    @property
+    def words(self) -> str:
+        """For a legend."""
+        return f"{self.refreshes:g} refreshes, rows lit {self.lit_ms:.3g} ms"
+
+
+STRIPE_CASES = (StripeCase(0.6, 4.0), StripeCase(2.4, 4.0), StripeCase(2.0, 4.0), StripeCase(2.4, 1e3 / REFRESH_HZ))
+
+
+@dataclass(frozen=True, slots=True)
+class StripePoint:
+    """A row of one case: its light relative to the mean, seen and foretold."""
+
+    refreshes: float
+    lit_ms: float
+    row: int
+    light: float
+    foretold: float
+
+
+def stripe_points(case: StripeCase) -> list[StripePoint]:
+    """The rows of one case, every so many."""
+    exposure_s = case.refreshes / REFRESH_HZ
+    tables: dict[str, settings.Table] = {
+        "tracker": {"resolution_px": STRIPE_SIZE_PX, "exposure_s": exposure_s, "transmission": settings.GLASS},
+        "sky": {"faintest_v_mag": 3.0},
+        "monitor": {**settings.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
+        "collimator": {"focal_length_mm": 350},
+    }
+    rolling: settings.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
+    view, light = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s), []
+    for extra in ({"tracker.detector": rolling}, {}):
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "bench.toml"
+            path.write_text(settings.bench_text({**tables, **extra}), encoding="utf-8")
+            file = read_bench_file(path)
+            tracker = DisplayTracker(file)
+            light.append(
+                tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
+            )  # the left edge: the boresight's stars are elsewhere
+            tracker.close()
+    config, x, y = file.config, np.zeros(STRIPE_ROWS)[::EVERY_ROWS], np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
+    geometry = BenchGeometry(bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent))
+    screen_late_s = scan_of(config.monitor).late_s(*geometry.to_monitor(x, y), config.monitor.resolution_px)
+    late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)  # middle rows begin together
+    foretold = seen_at(Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3), late).light
+    return [
+        StripePoint(case.refreshes, case.lit_ms, int(y[row]), float(light[0][row] / light[1][row]), float(foretold[row]))
+        for row in np.flatnonzero(light[1])  # the first and last see past the screen
+    ]
+
+
+def stripe_findings(directory: Path) -> list[str]:
+    """Write `stripes.csv` and its chart; its finding. Raises InputError."""
+    points = [point for case in STRIPE_CASES for point in stripe_points(case)]
+    write_records(directory / "stripes.csv", points)
+    return [draw_stripes(directory / "stripes", points)]
+
+
+def stripe_depth(points: list[StripePoint], whole: bool) -> float:
+    """The largest departure of a row from the mean light, of exposures of whole refreshes or others."""
+    depth = 0.0
+    for point in points:
+        if float(point.refreshes).is_integer() == whole:
+            depth = max(depth, abs(point.light - 1))
+    return depth
+
+
+def draw_stripes(path: Path, points: list[StripePoint]) -> str:
+    """The chart of the cases; its finding."""
+    off = max(abs(point.light - point.foretold) for point in points)
+    whole, parted = stripe_depth(points, True), stripe_depth(points, False)
+    finding = (
+        f"Behind a rolling shutter a display's stripes are up to {100 * parted:.0f} % of its light,"
+        f" {100 * whole:.0f} % where exposures are whole refreshes: as foretold within"
+        f" {max(off, ROUNDING):.0e}"
+    )
+    note = (
+        f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each, the top row first."
+        " Dots: glow on the virtual tracker's rows. Lines: foretold."
+    )
+    with chart(path, finding, note=note) as (axes,):
+        for case, colour in zip(STRIPE_CASES, SERIES, strict=False):
+            mine = [point for point in points if (point.refreshes, point.lit_ms) == (case.refreshes, case.lit_ms)]
+            rows = [point.row for point in mine]
+            axes.plot(rows, [point.foretold for point in mine], color=colour, label=case.words)
+            axes.plot(rows, [point.light for point in mine], "o", ms=3, color=colour, label="_seen")
+        axes.set_ylabel("light / mean light")
+        axes.set_xlabel("row of the tracker")
+        axes.set_ylim(bottom=0)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
+    return finding
+
+
+RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
+PACKET_HZ = 200
+RATE_DEG_S = 1.0
+PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
+STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
+STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
+ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
+RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
+QUICK_RATES_DEG_S = (2.0,)
+# A window reaches the largest error here and the PSF beyond a star's path.
+
+
+def slew(rate_deg_s: float) -> Movement:
+    """A turn at a constant rate from t = 0 on, with the packets that report it."""
+    return Movement(from_radec_roll_deg(*RADEC_ROLL_DEG), rate_deg_s, PACKET_HZ, shaken=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Compensation:
+    """A bench's compensation: further keys of [monitor], and `motion` of [render]."""
+
+    monitor_keys: settings.Table
+    motion: str
+
+
+WAYS = {
+    "no prediction": Compensation({}, "off"),
+    "prediction": Compensation({}, "off"),
+    "+ scan-out": Compensation({"hold_ms": 0}, "on"),
+    "+ smear": Compensation({}, "on"),
+}
+DRAW_TO_SWAP_S = 0.010
+EXPOSURE_S = 0.1
+START_S = 0.0037  # exposure start within a refresh period
+REFRESH_MS = 1e3 / 60  # the default of a bench file
+FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
+COST_ROUNDS = 9
+
+
+def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]) -> FloatArray:
+    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r); `rows` from 0 to 1.
+
+    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one reaches it.
+    """
+    begins = np.asarray(swaps_s)[:, None] + rows * scan.scanout_s
+    ends = begins + scan.hold_s
+    lit = np.minimum(ends, span_s[1]) - np.maximum(begins, span_s[0])
+    return np.asarray(np.maximum(lit, 0.0) / (span_s[1] - span_s[0]))
+
+
+class ScanningPanel(Closing):
+    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`.
+
+    Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
+    """
+
+    def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
+        held: settings.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
+        tables: dict[str, settings.Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": settings.GLASS},
+            "sky": {"faintest_v_mag": 6.0},
+            "monitor": {**settings.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
+            "collimator": {"focal_length_mm": 350},
+            "render": {"quantisation": "exact", "motion": WAYS[way].motion, "brightest_v_mag": 1.5},
+        }
+        self.way = way
+        self.start_s = START_S
+        self.bench = settings.study_bench(path, tables)
+        config = self.bench.config
+        self.period_s = 1 / config.monitor.refresh_hz
+        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
+        tracker = config.tracker
+        self.exposure_s = tracker.exposure_s
+        self.camera = tracker_camera(tracker, self.bench.file.folder)
+        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf)
+        self.panel = self.bench.panel
+
+    def attitude(self, movement: Movement, swap_s: float) -> Attitude:
+        """The attitude that the display derives from the packets received when it starts the frame of a swap."""
+        timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
+        for sample in movement.samples(round((swap_s - DRAW_TO_SWAP_S) * NS_PER_S)):
+            timeline.add(sample)
+        light_s = swap_s + self.period_s / 2
+        if self.way == "no prediction":
+            light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
+        return attitude_at(timeline, round(light_s * NS_PER_S))
+
+    def levels(self, attitude: Attitude, number: int) -> Levels:
+        """Draw one frame: its levels (H, W)."""
+        rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
+        return self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
+
+    def exposed_e_per_s(self, movement: Movement) -> FloatArray:
+        """The tracker's image (h, w) of the screen, mean over an exposure."""
+        height = self.bench.config.monitor.resolution_px[1]
+        span_s = (self.start_s, self.start_s + self.exposure_s)
+        first = math.floor((span_s[0] - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
+        numbers = range(first, math.ceil(span_s[1] / self.period_s) + 1)
+        swaps_s = [number * self.period_s for number in numbers]
+        weights = frame_weights((np.arange(height) + 0.5) / height, swaps_s, self.panel_scan, span_s)
+        light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
+        for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
+            if weight.any():
+                light += weight[:, None] * shown_light(self.levels(self.attitude(movement, swap_s), number), self.panel)
+        return self.optics.image_e_per_s(light)
+
+    def cost_ms(self, movement: Movement) -> float:
+        """Median time of drawing a frame, from its attitude to its codes, ms."""
+        attitude = self.attitude(movement, 0.0)
+        return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[self.way]
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        self.bench.close()
+        self.optics.close()
+
+
+class TimingSky(Closing):
+    """The same tracker's image of the sky itself, spread by the sprites' width. Free it with `close`."""
+
+    def __init__(self, shown: ScanningPanel) -> None:
+        self._shown = shown
+        self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, shown.bench.psf))
+
+    def paths(self, movement: Movement) -> Sprites:
+        """Each star's path over the exposure, in monitor pixels."""
+        middle_s = self._shown.start_s + self._shown.exposure_s / 2
+        motion = Motion(movement.at(round(middle_s * NS_PER_S)), movement.turn_rad_s, self._shown.exposure_s)
+        bench = self._shown.bench
+        return smeared_sprites(bench.stars, motion, bench.camera, bench.psf)
+
+    def exposed_e_per_s(self, movement: Movement) -> FloatArray:
+        """The tracker's image (h, w), mean over the exposure."""
+        self._renderer.draw(self.paths(movement))
+        return self._shown.optics.image_e_per_s(self._renderer.linear().astype(np.float64))
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()
+
+
+@dataclass(frozen=True, slots=True)
+class TimingCase:
+    """Refreshes in an exposure, and for how much of a refresh a row stays lit."""
+
+    refreshes: float
+    lit: float = 1.0
+
+    @property
+    def exposures(self) -> Exposures:
+        """The exposures, before a panel of 60 Hz."""
+        return Exposures(60.0, self.refreshes / 60.0, lit_s=self.lit / 60.0)
+
+    @property
+    def words(self) -> str:
+        """For a legend."""
+        return f"{self.refreshes:g} refreshes" + ("" if self.lit == 1 else f", lit {self.lit:g} of each")
+
+
+CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4), TimingCase(6.0, 0.25), TimingCase(2.4, 0.25))
+QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
+
+
+@dataclass(frozen=True, slots=True)
+class BeatPoint:
+    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after its row lights.
+
+    `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
+    """
+
+    refreshes: float
+    lit: float
+    phase: float
+    off_arcsec: float
+    foretold_arcsec: float
+    light_mag: float
+    foretold_mag: float
+
+
+def measure_beat(quick: bool = False) -> list[BeatPoint]:
+    """Every case at 1 deg/s, by the virtual tracker."""
+    movement = slew(RATE_DEG_S)
+    points: list[BeatPoint] = []
+    for case in QUICK_CASES if quick else CASES:
+        with TemporaryDirectory() as folder, ExitStack() as stack:
+            path = Path(folder) / "beat.toml"
+            panel = stack.enter_context(ScanningPanel("+ smear", path, case.refreshes / 60.0, case.lit))
+            sky = stack.enter_context(TimingSky(panel))
+            for number in range(STARTS):
+                panel.start_s = (number + 0.2) / STARTS * panel.period_s
+                points += _exposure_points(case, panel, sky, movement)
+    return points
+
+
+def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement) -> Iterator[BeatPoint]:
+    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
+    paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
+    windows = list(settings.lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
+    # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
+    middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
+    middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
+    vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
+    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
+    before, now, after = (camera.project(image) for image in images)
+    speed_px_s = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
+    phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
+    foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase)
+    for index, (_, window) in enumerate(windows):
+        off_px = np.subtract(settings.centroid_px(shown, window), settings.centroid_px(true, window))
+        speed = speed_px_s[:, index]
+        yield BeatPoint(
+            case.refreshes,
+            case.lit,
+            float(phase[index]),
+            float(off_px @ speed / (speed @ speed)) * RATE_DEG_S * ARCSEC_PER_DEG,
+            float(foretold.off_s[index]) * RATE_DEG_S * ARCSEC_PER_DEG,
+            magnitude(float(shown[window].sum() / true[window].sum()) / case.lit),
+            magnitude(float(foretold.light[index])),
+        )
+
+
+def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
+    """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
+    write_records(directory / "beat.csv", points)
+    cases: dict[TimingCase, list[BeatPoint]] = {}
+    for point in points:
+        cases.setdefault(TimingCase(point.refreshes, point.lit), []).append(point)
+    finding = (
+        f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
+        f" within {_off_arcsec(points):.2g} arcsec rms"
+    )
+    _draw(directory / "beat", finding, cases)
+    lines = []
+    for case, mine in cases.items():
+        found = beat(case.exposures)
+        lines.append(
+            f"{case.words}: up to {max(abs(p.off_arcsec) for p in mine):.3g} arcsec"
+            f" ({(found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S:.3g} foretold over all phases) and"
+            f" {max(abs(p.light_mag) for p in mine):.2g} mag ({found.worst_mag:.2g});"
+            f" {_off_arcsec(mine):.2g} arcsec rms off that ({len(mine)} stars)"
+        )
+    return [finding, *lines]
+
+
+def _off_arcsec(points: list[BeatPoint]) -> float:
+    """How far stars are from where they were foretold, rms."""
+    return float(np.sqrt(np.mean([(p.off_arcsec - p.foretold_arcsec) ** 2 for p in points])))
+
+
+def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
+    phases = np.linspace(0, 1, 801)
+    note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
+    with chart(path, finding, panels=2, note=note) as (place, light):
+        for (case, mine), colour in zip(cases.items(), SERIES, strict=False):
+            foretold = seen_at(case.exposures, phases)
+            place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
+            light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
+            for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
+                axes.plot([p.phase for p in mine], [getattr(p, seen) for p in mine], "o", ms=3.5, color=colour, label="_seen")
+        place.set_ylabel("shift of its place [arcsec]")
+        place.set_yscale("symlog", linthresh=1.0)
+        plain_ticks(place.yaxis, [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))])
+        light.set_ylabel("change of its light [mag]")
+        light.set_xlabel("start of the exposure after a row lights [refreshes]")
+        label_ends(place, light)
+
+
+@dataclass(frozen=True, slots=True)
+class TimingOutcome:
+    """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error, mag, and drawing time, ms."""
+
+    way: str
+    rate_deg_s: float
+    stars: int
+    rms_arcsec: float
+    worst_arcsec: float
+    flux_rms_mag: float
+    draw_ms: float
+
+
+def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingOutcome:
+    """One compensation on one slew, against the sky."""
+    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
+    paths = sky.paths(movement)
+    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
+    windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
+    errors = [settings.star_error(shown, true, window) for _, window in windows]
+    flux_mag = np.array([error.flux_mag for error in errors])
+    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
+    rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
+    return TimingOutcome(
+        panel.way, movement.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(movement)
+    )
+
+
+def measure(quick: bool = False) -> list[TimingOutcome]:
+    """Every compensation at every rate."""
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        panels = [stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml")) for k, way in enumerate(WAYS)]
+        sky = stack.enter_context(TimingSky(panels[0]))
+        return [compare(panel, sky, slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
+
+
+def run(directory: Path, quick: bool = False) -> Judged:
+    """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a line each. Raises InputError."""
+    others = OtherWork()
+    outcomes = measure(quick)
+    load = others.load()
+    write_records(directory / "timing.csv", outcomes)
+    finding = draw(directory / "timing", outcomes, load)
+    lines = [
+        f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.flux_rms_mag:.2g} mag rms,"
+        f" {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
+        for o in outcomes
+        if o.rate_deg_s == QUICK_RATES_DEG_S[0]
+    ]
+    return load.judged([finding, *lines, *beat_findings(measure_beat(quick), directory), *stripe_findings(directory)])
+
+
+def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
+    """The chart of the outcomes; its finding."""
+    at = {(o.way, o.rate_deg_s): o for o in outcomes}
+    plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
+    finding = (
+        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction alone,"
+        f" and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
+    )
+    note = "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to the one above it."
+    with chart(path, finding, panels=2, note=load.note(note), heights=(1.5, 1)) as (error, cost):
+        for way, marker in zip(WAYS, "osd^", strict=True):
+            mine = [o for o in outcomes if o.way == way]
+            rates = [o.rate_deg_s for o in mine]
+            error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
+            cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
+        error.set_ylabel("error of star positions, rms [arcsec]")
+        cost.set_ylabel("time of a frame [ms]")
+        cost.set_ylim(bottom=0)
+        cost.set_xlabel("slew rate [deg/s]")
+        plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))
+        label_ends(error, cost)
+    return finding

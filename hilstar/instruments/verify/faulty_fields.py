@@ -1,0 +1,199 @@
+"""Each fault of a scenario in the twin: shown alone in a field on which it falls, and taken as what it adds to that field.
+
+What a fault should bring is what it adds to the linear image, through the same glass. A fault is asked for, so none of these
+figures is a reason against a bench.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.units import magnitude
+from hilstar.display.quantise import MASK_TURNS
+from hilstar.instruments.simulate.star_finder import StarFinder, star_finder
+from hilstar.instruments.simulate.twin import Twin, exposure_lights
+from hilstar.optics.layers.fault_kinds import (
+    AttitudeStep,
+    Blank,
+    Drop,
+    Fault,
+    Flash,
+    Freeze,
+    Glow,
+    Now,
+    PlacedFault,
+    PointLight,
+    StarGone,
+)
+from hilstar.optics.layers.fault_light import FaultView, icrs_direction
+from hilstar.optics.layers.faults import FaultLayer
+from hilstar.server.bench.fault_views import display_view
+from hilstar.server.bench.frame import Frame
+from hilstar.server.bench.scenario import Scenario, lasts_ns
+
+OFF_AXIS = 0.4  # a fault is placed within this share of the field's radius
+OFF_FIELD = 1.2  # where a glow's is
+WINDOW_SIGMAS = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSeen:
+    """A fault as the twin's tracker sees it: electrons that it should add in an exposure, and those that it adds.
+
+    `flux_mag` is how many magnitudes too faint it is, `off_px` how far from its place, tracker px (of a wrong attitude: the
+    stars' median); None where there is no such figure. `note` says why.
+    """
+
+    name: str
+    kind: str
+    asked_e: float | None = None
+    seen_e: float | None = None
+    flux_mag: float | None = None
+    off_px: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """A field in tracker pixels: mean electrons (h, w) of its linear image, and of the monitor as it is; and its frame."""
+
+    asked_e: FloatArray
+    shown_e: FloatArray
+    frame: Frame
+
+
+class FaultyFields:
+    """Shows faults one by one on a twin's bench."""
+
+    def __init__(self, twin: Twin, scenario: Scenario, rng: np.random.Generator) -> None:
+        self._twin, self._rng = twin, rng
+        self._view: FaultView = display_view(twin.bench, scenario)
+        self._faults = scenario.prepared(self._view.prepare)
+        self._finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
+        self._view_rad = twin.camera.field_radius_rad(0.0)
+
+    def seen(self) -> list[FaultSeen]:
+        """Every fault of the scenario, in its order."""
+        return [self._one(fault) for fault in self._faults]
+
+    def _one(self, fault: Fault) -> FaultSeen:
+        if isinstance(fault, Freeze | Drop):
+            return FaultSeen(fault.name, fault.KIND, note="of the run's frames: a field that stands still has none")
+        q, first_frame = self._attitude(fault), int(self._rng.integers(0, MASK_TURNS))
+        since_ns = (lasts_ns(fault) or 0) // 2
+        effects = FaultLayer(self._view, (Now(1, fault, since_ns),))
+        plain, faulty = self._shot(q, first_frame, None), self._shot(q, first_frame, effects)
+        if isinstance(fault, AttitudeStep):
+            return FaultSeen(fault.name, fault.KIND, off_px=self._stars_off_px(faulty))
+        if isinstance(fault, Blank):
+            return FaultSeen(fault.name, fault.KIND, asked_e=0.0, seen_e=float(faulty.shown_e.sum()))
+        return self._compared(fault, plain, faulty)
+
+    def _compared(self, fault: Fault, plain: _Shot, faulty: _Shot) -> FaultSeen:
+        asked, shown = faulty.asked_e - plain.asked_e, faulty.shown_e - plain.shown_e
+        if isinstance(fault, PointLight | StarGone):
+            source = plain if isinstance(fault, StarGone) else faulty
+            place = self._place_px(fault, source.frame)
+            if place is None or not self._whole(place):
+                return FaultSeen(fault.name, fault.KIND, note="not on the tracker's image")
+            window = self._window(place)
+            asked, shown = asked[window], shown[window]
+        asked_e, seen_e = float(asked.sum()), float(shown.sum())
+        if not abs(asked_e) > 0:
+            return FaultSeen(fault.name, fault.KIND, asked_e=0.0, seen_e=seen_e, note="not on the tracker's image")
+        share = seen_e / asked_e
+        flux_mag = magnitude(share) if share > 0 else None
+        off_px = None
+        if isinstance(fault, PointLight | StarGone) and share > 0:
+            off_px = float(np.hypot(*(_middle(shown) - _middle(asked))))
+        return FaultSeen(fault.name, fault.KIND, asked_e, seen_e, flux_mag, off_px)
+
+    def _shot(self, q: FloatArray, first_frame: int, effects: FaultLayer | None) -> _Shot:
+        twin, exposure_s = self._twin, self._twin.config.tracker.exposure_s
+        frame = twin.bench.frame(q, first_frame, faults=effects)
+        lights = exposure_lights(twin.bench, frame, first_frame, [twin.true_panel], effects)
+        asked = twin.sky_optics.image_e_per_s(frame.linear) * exposure_s
+        shown = twin.true_optics.images_e_per_s(lights[0], twin.primaries).sum(axis=0) * exposure_s
+        return _Shot(asked, shown, frame)
+
+    def _attitude(self, fault: Fault) -> FloatArray:
+        """An attitude at which a fault falls on the image; any one where that does not matter."""
+        rng, toward = self._rng, self._direction(fault)
+        if toward is None:
+            q = rng.normal(size=4)
+            return np.asarray(q / np.linalg.norm(q))
+        ra_deg, dec_deg = np.degrees(np.arctan2(toward[1], toward[0])), np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
+        q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
+        angle, off = rng.uniform(0, 2 * np.pi), OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
+        return propagate(q, off * self._view_rad * np.array([math.cos(angle), math.sin(angle), 0.0]), 1.0)
+
+    def _direction(self, fault: Fault) -> FloatArray | None:
+        """A fault's place on the sky; None where it has none of its own."""
+        if isinstance(fault, PlacedFault) and (fault.radec_deg is not None or fault.icrs is not None):
+            return icrs_direction(fault)
+        if isinstance(fault, Flash | StarGone):
+            return self._view.star_direction(fault)
+        return None
+
+    def _place_px(self, fault: Fault, frame: Frame) -> FloatArray | None:
+        """The tracker pixel of a point, or of a star that is not there, from the truth of a frame."""
+        if isinstance(fault, StarGone):
+            toward = self._view.star_direction(fault)
+            rows = np.flatnonzero((self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14)
+        else:
+            rows = np.flatnonzero(frame.rows["name"] == fault.name)
+        if not len(rows):
+            return None
+        row = frame.rows[rows[0]]
+        x, y = self._twin.assumed_geometry.to_tracker(np.array([row["x_px"]]), np.array([row["y_px"]]))
+        return np.array([x[0], y[0]])
+
+    def _whole(self, place: FloatArray) -> bool:
+        width, height = self._twin.camera.resolution_px
+        reach = self._reach_px()
+        return bool(reach <= place[0] < width - reach and reach <= place[1] < height - reach)
+
+    def _reach_px(self) -> int:
+        return math.ceil(WINDOW_SIGMAS * max(self._finder.psf.width_px)) + 1
+
+    def _window(self, place: FloatArray) -> tuple[slice, slice]:
+        reach, (x, y) = self._reach_px(), np.rint(place).astype(int).tolist()
+        return slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
+
+    def _stars_off_px(self, shot: _Shot) -> float | None:
+        """How far the stars of a wrong attitude are from where that has them: the median."""
+        truth = shot.frame.rows
+        x_px, y_px = self._twin.assumed_geometry.to_tracker(truth["x_px"], truth["y_px"])
+        match = self._finder.match(shot.shown_e, x_px, y_px)
+        found = match.index >= 0
+        if not found.any():
+            return None
+        its = match.index[found]
+        return float(np.median(np.hypot(match.found.x_px[its] - x_px[found], match.found.y_px[its] - y_px[found])))
+
+
+def _middle(light: FloatArray) -> FloatArray:
+    """The centroid of light (h, w), x and y."""
+    y, x = np.indices(light.shape)
+    return np.asarray(np.array([(x * light).sum(), (y * light).sum()]) / light.sum())
+
+
+def fault_lines(seen: list[FaultSeen]) -> list[str]:
+    """The figures for a person, a line for each fault."""
+    return [f"{'fault':20}{one.name} ({one.kind}): {_words(one)}" for one in seen]
+
+
+def _words(one: FaultSeen) -> str:
+    if one.note:
+        return one.note
+    parts = []
+    if one.asked_e is not None and one.seen_e is not None:
+        parts.append(f"{one.asked_e:.6g} e- asked for, {one.seen_e:.6g} seen")
+    if one.flux_mag is not None:
+        parts.append(f"{one.flux_mag:+.4f} mag")
+    if one.off_px is not None:
+        parts.append(f"{one.off_px:.4f} px off")
+    return ", ".join(parts) or "nothing was found"

@@ -1,0 +1,481 @@
+"""The comparison: each star that the twin sees against itself in the image of the sky, and the geometry that explains the rest.
+
+The smallest model that explains where stars are shown is fitted by least squares. A star of direction d is drawn where the
+assumed lens has it, and seen at d', from where the true lens shows that place. So d is a polynomial of d', in focal lengths
+from the middle of the detector: d = z d' (1 + k1 r'^2 + ...) + shift for a true lens where an ideal one is assumed, whatever
+their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars too close for the tracker to separate
+(blends) count as one, at the centroid of their light.
+"""
+
+import itertools
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.units import magnitude
+from hilstar.display.calibration import Calibration
+from hilstar.instruments.simulate.optics import BenchGeometry, Mirror
+from hilstar.instruments.simulate.star_finder import (
+    WING_SIGMAS,
+    Matched,
+    StarFinder,
+    crowded,
+    faintest_e_per_s,
+    nearest,
+    neighbours,
+    shared,
+    star_finder,
+)
+from hilstar.instruments.simulate.twin import Twin, TwinField, true_calibration
+from hilstar.optics.camera import Camera
+from hilstar.optics.glass.glass_psf import GlassPsf
+from hilstar.optics.psf import Psf
+from hilstar.server.bench.config import BenchConfig
+from hilstar.server.bench.moving import wide_bodies
+from hilstar.server.bench.star_size import StarSize, star_size
+from hilstar.tracker.centroiders import FAMILY, Centroider
+from hilstar.tracker.centroids import Centroids, estimate_background, find_stars, noisiest_background
+
+MIN_RESIDUALS = 3  # to an unknown
+MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
+# A model explains a field where no larger one leaves much less: a quarter, and a tenth of the limit, beyond the best.
+ENOUGH, ENOUGH_OF_LIMIT = 1.25, 0.1
+TRIMS, WILD = 3, 6.0  # a star that is off by more than 6 medians and the limit is left out: 1e-11 of Gaussian errors are
+ALIGNED, LENS, TILT, HIGHER, DECENTRED = "aligned", "lens", "tilt", "higher", "decentred"
+MODELS = (
+    (ALIGNED,),
+    (ALIGNED, LENS),
+    (ALIGNED, TILT),
+    (ALIGNED, TILT, LENS),
+    (ALIGNED, TILT, LENS, HIGHER),
+    (ALIGNED, TILT, LENS, HIGHER, DECENTRED),
+)
+# Two equal Gaussians have one peak up to 2 sigmas, and a faint one disappears beside a bright one farther out. The windowed
+# centroid of a pair is off the centre of its light by 0.02 sigma at 1 sigma, 0.06 at 1.4
+# (tests/unit/instruments/simulate/test_blends.py).
+BLEND_SIGMAS = 1.5
+# The glow that a missing black level adds is noticed at this share of the faintest drawn star's light, per pixel of its disc.
+BLACK_SHARE = 0.1
+MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryFit:
+    """The smallest sufficient model of the displacements, as true minus assumed.
+
+    Scale, rotation about the detector's middle and shift, and where the displacements ask for them the screen's tilt about its
+    x and y axes and the lens, k1 of its tangents; `tilt_px` and `distortion_px` are the largest displacements by these.
+    `left` is the share of the mean square that is not explained, corrected for the number of unknowns, `left_px` what 95 % of
+    the stars are within of the model.
+    """
+
+    scale_error: float
+    rotation_rad: float
+    offset_px: tuple[float, float]
+    tilt_rad: tuple[float, float]
+    tilt_px: float
+    k1: float
+    distortion_px: float
+    left: float
+    left_px: float
+
+
+def fit_geometry(rows: FloatArray, tracker: Camera, limit_px: float) -> GeometryFit | None:
+    """The smallest model by least squares of stars (n, 4); None with too few. `limit_px` is what a centroid is allowed.
+
+    A row has a star's place on the detector, px, and how far from it, right and down, the display shows it.
+    """
+    if len(rows) < MIN_STARS:
+        return None
+    focal_px = tracker.focal_length_px
+    seen = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
+    back = -rows[:, 2:] / focal_px
+    for _ in range(TRIMS):
+        # Another star that was found near a star's place is none of these.
+        off = _lengths(_fits(seen, back)[-1].rest)
+        kept = off <= max(WILD * float(np.median(off)), limit_px / focal_px)
+        if kept.sum() < MIN_STARS:
+            break
+        seen, back = seen[kept], back[kept]
+    fits = _fits(seen, back)
+    good = ENOUGH * min(fit.noise for fit in fits) + ENOUGH_OF_LIMIT * limit_px / focal_px
+    return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
+
+
+def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
+    """Every model that so many stars (n, 2) can determine, the smallest first."""
+    parts, wanted = _parts(*seen.T), back.T.ravel()
+    fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
+    return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
+
+
+def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
+    """The displacements (2 n, unknowns), x then y, by a unit of each unknown of the parts."""
+    one, none, r2 = np.ones_like(x), np.zeros_like(x), x * x + y * y
+    pairs = {
+        ALIGNED: [(x, y), (-y, x), (one, none), (none, one)],
+        TILT: [(x * y, y * y), (-x * x, -x * y)],
+        LENS: [(x * r2, y * r2)],
+        HIGHER: [(x * r2**2, y * r2**2)],
+        DECENTRED: [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)],
+    }
+    return {name: np.column_stack([np.concatenate(pair) for pair in columns]) for name, columns in pairs.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _MotionFit:
+    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them leave."""
+
+    found: dict[str, FloatArray]
+    moved: dict[str, FloatArray]
+    rest: FloatArray
+    unknowns: int
+
+    @classmethod
+    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> "_MotionFit":
+        design = np.hstack(list(parts.values()))
+        values = np.linalg.lstsq(design, wanted, rcond=None)[0]
+        ends = np.cumsum([part.shape[1] for part in parts.values()])
+        found = dict(zip(parts, np.split(values, ends[:-1]), strict=True))
+        moved = {name: part @ found[name] for name, part in parts.items()}
+        return cls(found, moved, wanted - design @ values, design.shape[1])
+
+    @property
+    def noise(self) -> float:
+        """One sigma of what is left, of a residual."""
+        return math.sqrt(float(self.rest @ self.rest) / (len(self.rest) - self.unknowns))
+
+    def largest(self, *names: str) -> float:
+        """The largest displacement by some parts together."""
+        return float(_lengths(sum((self.moved[name] for name in names if name in self.moved), np.zeros_like(self.rest))).max())
+
+
+def _lengths(residuals: FloatArray) -> FloatArray:
+    return np.asarray(np.hypot(*np.split(residuals, 2)))
+
+
+def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> GeometryFit:
+    scale, rotation, right, down = fit.found[ALIGNED].tolist()
+    backwards = complex(1.0 + scale, rotation)
+    forwards, shift = 1.0 / backwards, -complex(right, down) / backwards
+    a, b = fit.found.get(TILT, np.zeros(2)).tolist()
+    total = float(wanted @ wanted)
+    return GeometryFit(
+        scale_error=forwards.real - 1.0,
+        rotation_rad=forwards.imag,
+        offset_px=(shift.real * focal_px, shift.imag * focal_px),
+        tilt_rad=(a, b),
+        tilt_px=focal_px * fit.largest(TILT),
+        k1=float(fit.found.get(LENS, np.zeros(1))[0]) / abs(backwards),
+        distortion_px=focal_px * fit.largest(LENS, HIGHER, DECENTRED),
+        left=fit.noise**2 * len(wanted) / total if total else 0.0,
+        left_px=focal_px * float(np.percentile(_lengths(fit.rest), 95)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Star:
+    """One star at its place on the tracker, px: errors of the display, + too faint, right and down, magnitudes and px.
+
+    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN where that star would
+    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky. A body has a
+    `name`, and 0 for `hip`.
+    """
+
+    hip: int
+    v_mag: float
+    x_px: float
+    y_px: float
+    flux_mag: float
+    dx_px: float
+    dy_px: float
+    codes_mag: float
+    codes_px: float
+    floor_mag: float
+    floor_px: float
+    name: str = ""
+
+
+@dataclass(slots=True)
+class MatchTally:
+    """Stars by what became of them, added up over the fields.
+
+    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` has the rows (`fit_geometry`)
+    of the stars that the display really shows, however far off. `vanished` counts how many fewer are found than the sky has,
+    `mirrored` those found where a screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
+    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`, `channels_mag` how much too faint
+    each channel is of those whose colour the primaries have; there are `out_of_gamut` others.
+    """
+
+    stars: list[Star] = field(default_factory=list)
+    lost: list[Star] = field(default_factory=list)
+    displaced: list[FloatArray] = field(default_factory=list)
+    blended: int = 0
+    summed: int = 0
+    clipped: int = 0
+    not_shown: int = 0
+    at_edge: int = 0
+    vanished: int = 0
+    mirrored: Counter[Mirror] = field(default_factory=Counter)
+    noisy_mag: list[float] = field(default_factory=list)
+    noisy_px: list[float] = field(default_factory=list)
+    channels_mag: list[list[float]] = field(default_factory=list)
+    out_of_gamut: int = 0
+    off_px: dict[Centroider, list[float]] = field(default_factory=lambda: {kind: [] for kind in FAMILY})
+
+
+@dataclass(frozen=True, slots=True)
+class GlowFit:
+    """The light of the screen's black level in a tracker pixel, electrons per second: as assumed, as seen, and their limit."""
+
+    assumed_e_per_s_px: float
+    seen_e_per_s_px: float
+    limit_e_per_s_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
+
+    `stars_a_field` is how many stars of the bench are in the tracker's field on average. `calibration` is the one that the
+    bench assumes; `true_calibration` is the monitor's own, where it is another.
+    """
+
+    field_count: int
+    tally: MatchTally
+    config: BenchConfig
+    camera: Camera
+    glow: GlowFit
+    calibration: Calibration
+    true_calibration: Calibration | None
+    gl_renderer: str
+    wide_bodies: list[str]
+    star: StarSize
+    stars_a_field: float
+    glass: "GlassEffect | None" = None
+
+
+class GlassEffect(NamedTuple):
+    """What the file of a tracker's PSF does to stars, at 95 %: px from chief ray to centroid, and mag of vignetting."""
+
+    px: float
+    mag: float
+
+
+def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
+    """The effect of a glass on stars where they are; None for a PSF that is the same everywhere, and without a star."""
+    if not isinstance(psf, GlassPsf) or not stars:
+        return None
+    x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
+    to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
+    fainter = [abs(magnitude(float(one))) for one in light if one > 0]
+    return GlassEffect(*(float(np.percentile(part, 95)) for part in (np.hypot(to_x - x, to_y - y), fainter or [0.0])))
+
+
+def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
+    """The field with each star that stands within BLEND_SIGMAS of a brighter one (of `psf`, the tracker's) added to that.
+
+    The brighter one keeps its name; its light, magnitude and places become those of the sum.
+    """
+    owner = _owners(np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"])
+    own = np.arange(len(owner))
+    if np.array_equal(owner, own):
+        return seen
+    light = seen.truth["electrons_per_s"]
+    total = np.bincount(owner, light, len(owner))
+    stars = np.flatnonzero(owner == own)
+
+    def centre(places_px: FloatArray) -> FloatArray:
+        moment = np.bincount(owner, light * (places_px - places_px[owner]), len(owner))[stars]
+        return np.asarray(places_px[stars] + moment / total[stars])
+
+    truth = seen.truth[stars].copy()
+    truth["x_px"], truth["y_px"] = centre(seen.truth["x_px"]), centre(seen.truth["y_px"])
+    truth["electrons_per_s"] = total[stars]
+    truth["v_mag"] += magnitude(np.asarray(total[stars] / light[stars]))
+    truth["clipped"] = np.bincount(owner, seen.truth["clipped"], len(owner))[stars] > 0
+    return replace(seen, truth=truth, x_px=centre(seen.x_px), y_px=centre(seen.y_px))
+
+
+def _owners(places: FloatArray, light: FloatArray) -> IntArray:
+    """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a brighter one."""
+    owner, near = np.arange(len(light)), defaultdict[int, list[int]](list)
+    a, b, _ = neighbours(places, places, BLEND_SIGMAS)
+    for star, other in np.stack([a, b], axis=1)[a != b].tolist():
+        near[star].append(other)
+    for star in sorted(near, key=lambda star: (-light[star], star)):
+        if owner[star] == star:
+            for other in near[star]:
+                if owner[other] == other and (light[other], -other) < (light[star], -star):
+                    owner[other] = star
+    return owner
+
+
+class Comparison:
+    """The stars of a twin's fields, compared one field after the other."""
+
+    def __init__(self, twin: Twin) -> None:
+        self.twin = twin
+        self.finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
+        self.tally = MatchTally()
+        self.field_count = 0
+
+    def add(self, seen: TwinField, rng: np.random.Generator) -> None:
+        """Compare the stars of one field; the generator is for the detector's noise."""
+        self.field_count += 1
+        tally, stars_listed = self.tally, len(seen.truth)
+        seen = with_blends_as_one(seen, self.finder.psf)
+        tally.summed += stars_listed - len(seen.truth)
+        windowed = [self.finder.find(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e)]
+        images_e, true_px = (seen.sky_e, seen.shown_e), (seen.x_px, seen.y_px)
+        each = {
+            kind: [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
+            for kind in dict.fromkeys([*FAMILY, self.finder.centroider])
+        }
+        sky, shown = each[self.finder.centroider]
+        assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
+        inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
+        tally.at_edge += int((self._on_detector(seen, 0.0) & ~inside).sum())
+        tally.not_shown += int((inside & ~drawn).sum())
+        tally.clipped += int((inside & drawn & clipped).sum())
+        whole, blended = inside & drawn & ~clipped, self._blended(seen, sky)
+        tally.blended += int((whole & blended).sum())
+        wanted = whole & ~blended
+        found = wanted & (sky.index >= 0) & (shown.index >= 0)
+        listed, both = np.flatnonzero(wanted), np.flatnonzero(found)
+        for k, star in zip(listed, self._stars(seen, listed, (sky, shown, assumed)), strict=True):
+            (tally.stars if found[k] else tally.lost).append(star)
+        for kind, (there, here) in each.items():
+            tally.off_px.setdefault(kind, []).extend(np.hypot(*here.against(there, both)[1:]).tolist())
+        if seen.by_channel:
+            tally.out_of_gamut += int((found & ~seen.truth["in_gamut"]).sum())
+            self._compare_channels(seen, np.flatnonzero(found & seen.truth["in_gamut"]))
+        tally.vanished += len(sky.found) - len(shown.found)
+        self._follow(seen, shown.found, wanted)
+        self._count_mirrored(seen, shown.found, wanted)
+        self._measure_noisy(seen, self.twin.detected_dn(seen, rng), wanted)
+
+    def _compare_channels(self, seen: TwinField, stars: IntArray) -> None:
+        """The light of each channel in squares about stars, shown against sky."""
+        self.tally.channels_mag = self.tally.channels_mag or [[] for _ in seen.by_channel]
+        reach = math.ceil(self.finder.settings.radius_px)
+        for x, y in np.rint([seen.x_px[stars], seen.y_px[stars]]).T.astype(int).tolist():
+            part = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            for off, (there, sky) in zip(self.tally.channels_mag, seen.by_channel, strict=True):
+                off.append(abs(magnitude(float(there[part].sum() / sky[part].sum()))))
+
+    def measured(self) -> Measured:
+        """All that was measured so far, with what a verdict has to know of the bench. Raises InputError (see `true_panel`)."""
+        bench, name = self.twin.bench, self.twin.config.verify.true_calibration
+        return Measured(
+            field_count=self.field_count,
+            tally=self.tally,
+            config=self.twin.config,
+            camera=self.twin.camera,
+            glow=self._glow(),
+            calibration=bench.calibration,
+            true_calibration=None if name is None else true_calibration(bench, name),
+            gl_renderer=bench.renderer.gl_renderer,
+            wide_bodies=wide_bodies(bench.moving, bench.camera),
+            star=star_size(self.twin.config, bench.file.folder, self.twin.true_camera),
+            stars_a_field=self._stars_a_field(),
+            glass=glass_effect(bench.tracker_psf, self.tally.stars),
+        )
+
+    def _stars_a_field(self) -> float:
+        """The bench's stars over the whole sky by the solid angle of the tracker's field."""
+        camera = self.twin.camera
+        right, down = (size / 2 / camera.focal_length_px for size in camera.resolution_px)
+        field_sr = 4 * math.atan(right * down / math.sqrt(1 + right**2 + down**2))
+        return len(self.twin.bench.stars) * field_sr / (4 * math.pi)
+
+    def _glow(self) -> GlowFit:
+        given = self.twin.config.verify.black_e_per_s_px
+        sigma_x, sigma_y = self.finder.psf.width_px
+        disc_px = 4 * math.pi * sigma_x * sigma_y
+        return GlowFit(
+            assumed_e_per_s_px=on_screen_median(self.twin.assumed_glow_e_per_s),
+            seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
+            limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px if given is None else given,
+        )
+
+    def _stars(self, seen: TwinField, k: IntArray, images: tuple[Matched, Matched, Matched]) -> list[Star]:
+        """Rows of the stars `k` (n,), from the images of the sky, of the display, and of one that is as assumed."""
+        sky, shown, assumed = images
+        rows, places = seen.truth[k], (seen.x_px[k], seen.y_px[k])
+        codes_mag, *codes_px = assumed.against(sky, k)
+        floor_mag, *floor_px = sky.against(self._catalogue(seen), k)
+        off = *shown.against(sky, k), codes_mag, np.hypot(*codes_px), floor_mag, np.hypot(*floor_px)
+        columns = rows["hip"], rows["v_mag"], *places, *off, rows["name"]
+        return list(itertools.starmap(Star, zip(*(column.tolist() for column in columns), strict=True)))
+
+    def _catalogue(self, seen: TwinField) -> Matched:
+        """The catalogue as if it had been found in an image."""
+        flux_e, count = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s, len(seen.truth)
+        ones = np.ones(count, dtype=np.intp)
+        return Matched(Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1), np.arange(count, dtype=np.intp))
+
+    def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
+        flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
+        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px))
+        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf) | by_disc)
+
+    def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+        """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
+        geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
+        match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
+        k = np.flatnonzero(wanted & (match >= 0) & ~shared(match))
+        x_px, y_px = seen.x_px[k], seen.y_px[k]
+        off_px = shown.x_px[match[k]] - x_px, shown.y_px[match[k]] - y_px
+        self.tally.displaced.append(np.column_stack([x_px, y_px, *off_px]))
+
+    def _count_mirrored(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+        """Count the stars that are where a mirrored screen would have them."""
+        for mirror in MIRRORS if self.twin.differs else ():
+            geometry = BenchGeometry(self.twin.true_camera, self.twin.camera, mirror)
+            places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
+            self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
+
+    def _measure_noisy(self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]) -> None:
+        """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
+        under = estimate_background(dn, 1.0)
+        if under.noise <= 1 / math.sqrt(12):  # rounding's: most of the image may be clipped at 0 DN, beside a glow
+            under = noisiest_background(dn)
+        windowed = find_stars(dn, self.finder.settings, under)
+        match, true_px = nearest(windowed, seen.x_px, seen.y_px), (seen.x_px, seen.y_px)
+        matched = Matched(windowed, match)
+        found = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
+        tracker = self.twin.config.tracker
+        expected_dn = seen.truth["electrons_per_s"] * (tracker.exposure_s / tracker.detector.gain_e_per_dn)
+        k = np.flatnonzero(wanted & (match >= 0))
+        k = k[found.flux[match[k]] > 0]
+        its = match[k]
+        self.tally.noisy_mag += magnitude(found.flux[its] / expected_dn[k]).tolist()
+        self.tally.noisy_px += np.hypot(found.x_px[its] - seen.x_px[k], found.y_px[its] - seen.y_px[k]).tolist()
+
+    def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
+        """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
+        margin = self.finder.settings.radius_px + 1.5
+        bench = self.twin.bench
+        reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
+        width, height = bench.camera.resolution_px
+        x, y = seen.truth["x_px"], seen.truth["y_px"]
+        inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)
+        return np.asarray(inside & self._on_detector(seen, margin))
+
+    def _on_detector(self, seen: TwinField, margin_px: float) -> npt.NDArray[np.bool_]:
+        """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
+        width, height = self.twin.camera.resolution_px
+        inside = (seen.x_px >= margin_px - 0.5) & (seen.x_px < width - 0.5 - margin_px)
+        return np.asarray(inside & (seen.y_px >= margin_px - 0.5) & (seen.y_px < height - 0.5 - margin_px))
+
+
+def on_screen_median(glow_e_per_s: FloatArray) -> float:
+    """The median over the detector's pixels that see the screen; 0 where the screen's black has no light."""
+    lit = glow_e_per_s[glow_e_per_s > 0]
+    return float(np.median(lit)) if len(lit) else 0.0

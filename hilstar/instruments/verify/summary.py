@@ -1,0 +1,215 @@
+"""`hilstar verify`: the twin over random fields, its figures as JSON and text, the table of stars and the charts."""
+
+import math
+from collections.abc import Callable
+from dataclasses import astuple, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.charts import BLUE, MUTED, RED, SMALL_PT, chart, label_ends, write_csv
+from hilstar.basics.error_spread import ErrorSpread, error_spread
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.quantise import MASK_TURNS
+from hilstar.instruments.simulate.star_finder import USUAL
+from hilstar.instruments.simulate.twin import Twin
+from hilstar.instruments.verify.faulty_fields import FaultyFields, fault_lines
+from hilstar.instruments.verify.measure import Comparison, Star
+from hilstar.instruments.verify.verdict import DisplayErrors, Verdict, judge, p95
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.scenario import Scenario
+from hilstar.server.bench.star_size import StarSize
+
+MIN_SHARE = 1e-4  # share of the limit at which smaller errors are drawn
+ARROW_SHARE = 0.06  # share of the chart's width, for the residual that 95 % of stars are within
+
+
+def verify(
+    file: BenchFile,
+    fields: int,
+    rng: np.random.Generator,
+    on_field: Callable[[int], None] = lambda done: None,
+    scenario: Scenario | None = None,
+) -> Verdict:
+    """Show `fields` random attitudes and judge the bench by them; then each fault of a scenario, which is only measured.
+
+    Raises InputError (see `Twin`, `FaultView.prepare`).
+    """
+    # Separate streams: the noise draws a number of values that depends on the light, and all benches shall see the same fields.
+    attitudes, noise, of_faults = rng.spawn(3)
+    with Twin(file) as twin:
+        comparison = Comparison(twin)
+        faulty = None if scenario is None else FaultyFields(twin, scenario, of_faults)
+        for number in range(fields):
+            q = attitudes.normal(size=4)
+            first_frame = int(attitudes.integers(0, MASK_TURNS))
+            comparison.add(twin.field(q / np.linalg.norm(q), first_frame), noise)
+            on_field(number + 1)
+        verdict = judge(comparison.measured())
+        return verdict if faulty is None else replace(verdict, faults=faulty.seen())
+
+
+def summarise(verdict: Verdict) -> dict[str, Any]:
+    """The figures of a verdict by the keys of --json; centroids in tracker pixels, and arcsec in the middle of its field.
+
+    They are as `centroider` finds the stars; `centroid_error_px_by` has those of each kind. `black_e_per_s_px` is the glow of
+    the screen's black, electrons per second in a tracker pixel; `estimator_floor` the estimator's own errors, of the linear
+    image against the catalogue; `codes_alone` those of the codes with all else as assumed; `noisy` the same with all of the
+    detector's noise.
+    """
+    measured, errors = verdict.measured, verdict.errors
+    tally, fit, centroid_px = measured.tally, errors.geometry, errors.centroid_px()
+    noisy_mag = np.abs(np.array(tally.noisy_mag) - errors.zero_point_mag)
+    noisy_px, glow, calibration = np.array(tally.noisy_px), measured.glow, measured.calibration
+
+    def spread(name: str) -> ErrorSpread:
+        return error_spread(np.abs(errors.of(name)))
+
+    return {
+        "fields": measured.field_count,
+        "stars": len(errors.stars),
+        "flux_error_mag": spread("flux_mag"),
+        "centroid_error_px": error_spread(centroid_px),
+        "centroid_error_arcsec": error_spread(centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px),
+        "centroider": measured.config.verify.centroider or USUAL,
+        "centroid_error_px_by": {kind: error_spread(np.array(off_px)) for kind, off_px in tally.off_px.items()},
+        "lost": len(errors.lost),
+        "passed": verdict.passed,
+        "reasons": verdict.reasons,
+        **{name: getattr(tally, name) for name in ("blended", "clipped", "not_shown", "at_edge", "summed")},
+        "channels_mag": {
+            key: error_spread(np.array(off))
+            for key, off in zip(measured.config.tracker.quantum_efficiencies, tally.channels_mag, strict=False)
+        },
+        "out_of_gamut": tally.out_of_gamut,
+        "zero_point_mag": _finite(errors.zero_point_mag),
+        "scale_error": None if fit is None else fit.scale_error,
+        "rotation_arcsec": None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
+        "offset_px": None if fit is None else fit.offset_px,
+        "tilt_deg": None if fit is None else tuple(map(math.degrees, fit.tilt_rad)),
+        "k1": None if fit is None else fit.k1,
+        "distortion_px": None if fit is None else fit.distortion_px,
+        "black_e_per_s_px": {"assumed": glow.assumed_e_per_s_px, "seen": glow.seen_e_per_s_px},
+        "estimator_floor": {"flux_mag": spread("floor_mag"), "centroid_px": spread("floor_px")},
+        "codes_alone": {
+            "flux_mag": spread("codes_mag"),
+            "centroid_px": spread("codes_px"),
+            "zero_point_mag": _finite(errors.codes_zero_point_mag),
+        },
+        "noisy": {"stars": len(noisy_px), "flux_mag": error_spread(noisy_mag), "centroid_px": error_spread(noisy_px)},
+        "by_magnitude": _by_magnitude(errors),
+        "calibration": {"name": calibration.name, "sha256": calibration.sha256},
+        "gl_renderer": measured.gl_renderer,
+        "drawn_as_discs": measured.wide_bodies,
+        "star": measured.star.keys(),
+        "faults": verdict.faults,
+    }
+
+
+def _finite(value: float) -> float | None:
+    """The value, or None for what JSON cannot hold."""
+    return value if math.isfinite(value) else None
+
+
+def _by_magnitude(errors: DisplayErrors) -> list[dict[str, Any]]:
+    """The errors of the stars of each whole magnitude."""
+    rows = []
+    v_mag, flux, centroid = errors.of("v_mag"), np.abs(errors.of("flux_mag")), errors.centroid_px()
+    for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
+        there = (v_mag >= low) & (v_mag < low + 1)
+        if there.any():
+            spreads = {"flux_error_mag": error_spread(flux[there]), "centroid_error_px": error_spread(centroid[there])}
+            rows.append({"v_from": low, "v_to": low + 1, "stars": int(there.sum()), **spreads})
+    return rows
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """The figures for a person."""
+
+    def three(errors: ErrorSpread) -> str:
+        return " / ".join(_number(value) for value in (errors.rms, errors.p95, errors.max))
+
+    noisy = summary["noisy"]
+    rest = f"{summary['lost']} lost, {summary['blended']} blended, {summary['clipped']} clipped"
+    rest += f", {summary['not_shown']} not shown, {summary['at_edge']} at edge"
+    rest += f", {summary['summed']} part of a blend" if summary["summed"] else ""
+    centroid = f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])} arcsec"
+    each = ", ".join(f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items())
+    return [
+        f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}",
+        f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
+        f"{'centroid error':20}{centroid}, by {summary['centroider']}",
+        f"{'by each centroider':20}{each} px rms",
+        *(f"{key:21}{three(errors)} mag" for key, errors in summary["channels_mag"].items()),
+        *([f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"] if summary["channels_mag"] else []),
+        f"{'with detector noise':20}{three(noisy['flux_mag'])} mag, {three(noisy['centroid_px'])} px",
+        *(
+            f"{'V {v_from} to {v_to}'.format(**row):>17}   {row['flux_error_mag'].rms:.4f} mag rms,"
+            f" {row['centroid_error_px'].rms:.4f} px rms, {row['stars']} stars"
+            for row in summary["by_magnitude"]
+        ),
+        *(f"{'':20}{line}" for line in summary["drawn_as_discs"]),
+        f"{'star':20}{_star_line(summary['star'])}",
+        *fault_lines(summary["faults"]),
+        *(f"{'':20}{reason}" for reason in summary["reasons"]),
+        f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}",
+    ]
+
+
+def _star_line(star: dict[str, Any]) -> str:
+    return StarSize(**star).line()
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
+def write_report(directory: Path, verdict: Verdict) -> None:
+    """stars.csv, and the charts errors and field, each as PNG and SVG. Raises InputError where one cannot be written."""
+    errors = verdict.errors
+    write_csv(directory / "stars.csv", [entry.name for entry in fields(Star)], map(astuple, errors.stars + errors.lost))
+    _draw_field(directory / "field", errors, verdict.measured.camera.resolution_px)
+    if errors.stars:
+        _draw_errors(directory / "errors", verdict)
+
+
+def _draw_errors(path: Path, verdict: Verdict) -> None:
+    errors, limits = verdict.errors, verdict.measured.config.verify
+    v_mag, flux, centroid = errors.of("v_mag"), errors.of("flux_mag"), errors.centroid_px()
+    word = "passes" if verdict.passed else "does not pass"
+    finding = (
+        f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within {p95(centroid):.3f} px, for 95 % of stars"
+    )
+    note = f"Each point is one of {len(v_mag)} stars. The limit is for 95 % of them."
+    with chart(path, finding, 2, note=note) as axes:
+        for axis, values, limit, label in (
+            (axes[0], np.abs(flux), limits.flux_mag, "flux error [mag]"),
+            (axes[1], centroid, limits.centroid_px, "place error [tracker px]"),
+        ):
+            axis.semilogy(v_mag, np.maximum(values, MIN_SHARE * limit), ".", color=MUTED, ms=5, alpha=0.7, label="_star")
+            axis.axhline(limit, color=RED, linestyle="--", linewidth=1.4, label="limit")
+            axis.axhline(max(p95(values), MIN_SHARE * limit), color=BLUE, linewidth=1.4, label="95 % of stars")
+            axis.set_ylabel(label)
+            label_ends(axis)
+        axes[1].set_xlabel("V [mag]")
+
+
+def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int]) -> None:
+    x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
+    longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
+    finding = f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are lost"
+    note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (" Red crosses: lost stars." if errors.lost else "")
+    with chart(path, finding, note=note, height_inch=7.4) as (axis,):
+        axis.plot(x, y, ".", color=MUTED, markersize=3)
+        arrows = axis.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=longest / arrow_px, width=0.002, color=BLUE)
+        key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
+        axis.quiverkey(arrows, 0.86, 1.03, longest, f"{longest:.2g} px", **key)
+        axis.plot([s.x_px for s in errors.lost], [s.y_px for s in errors.lost], "x", color=RED)
+        axis.set_xlim(0, resolution_px[0])
+        axis.set_ylim(resolution_px[1], 0)
+        axis.set_aspect("equal")
+        axis.set_xlabel("x [tracker px]")
+        axis.set_ylabel("y [tracker px]")
+        if errors.lost:
+            axis.annotate("lost", (0.6, 1.015), xycoords="axes fraction", color=RED, fontsize=SMALL_PT)

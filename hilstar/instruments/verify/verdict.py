@@ -1,0 +1,239 @@
+"""The verdict of a bench: the display's errors without their common zero point, the limits exceeded, and the likely causes."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.error_spread import error_spread
+from hilstar.display.quantisers import BY_COST
+from hilstar.instruments.verify.faulty_fields import FaultSeen
+from hilstar.instruments.verify.measure import GeometryFit, Measured, Star, fit_geometry
+
+# A fit that leaves more of the residuals' squares than this explains nothing: chance matches leave nearly all.
+MAX_LEFT = 0.5
+# A cause is named where it accounts for more than this share of the stars.
+MIN_SHARE = 0.5
+MIN_EXPECTED = 10.0  # stars over all fields: with fewer, that none can be measured is chance or an empty sky
+CURE = '; [verify] centroider = "psf" fits it, hilstar assess says which correction takes how much'
+MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
+
+
+@dataclass(frozen=True, slots=True)
+class DisplayErrors:
+    """The stars with their common zero point subtracted; `codes_zero_point_mag` is the one that the codes alone would have.
+
+    `lost` stars have NaN for errors; `geometry` is None with too few stars.
+    """
+
+    stars: list[Star]
+    lost: list[Star]
+    zero_point_mag: float
+    codes_zero_point_mag: float
+    geometry: GeometryFit | None
+
+    @property
+    def looked_for(self) -> int:
+        """How many stars should have been found."""
+        return len(self.stars) + len(self.lost)
+
+    def of(self, name: str) -> FloatArray:
+        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose the star."""
+        return np.array([getattr(star, name) for star in self.stars])
+
+    def centroid_px(self) -> FloatArray:
+        """Centroid errors (n,), tracker pixels."""
+        return np.asarray(np.hypot(self.of("dx_px"), self.of("dy_px")))
+
+
+def display_errors(measured: Measured) -> DisplayErrors:
+    """The errors of all fields' stars."""
+    stars = measured.tally.stars
+    zero_point, codes_zero_point = median([s.flux_mag for s in stars]), median([s.codes_mag for s in stars])
+    stars = [replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point) for s in stars]
+    displaced = np.concatenate([np.empty((0, 4)), *measured.tally.displaced])
+    geometry = fit_geometry(displaced, measured.camera, measured.config.verify.centroid_px)
+    return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
+
+
+def median(values: list[float]) -> float:
+    """The median of the finite values, 0 without any."""
+    finite_values = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite_values)) if finite_values else 0.0
+
+
+def p95(errors: FloatArray) -> float:
+    """The 95th percentile of some errors (n,), 0 without any."""
+    return error_spread(errors).p95 or 0.0
+
+
+def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The reasons against a bench; none where it passes."""
+    too_wide = _too_wide(measured)
+    if not errors.looked_for:
+        return [_none(measured), *too_wide]
+    lost = _lost(measured, errors)
+    centroid = _centroids(measured, errors)
+    geometry = _geometry(measured, errors) if lost or centroid else []
+    # A few stars found by chance, or far from the middle of their windows, say nothing about light.
+    mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
+    light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
+    return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors), *too_wide]
+
+
+def _none(measured: Measured) -> str:
+    """Why no star could be measured: too few in view, or none that can be."""
+    few, fields = measured.stars_a_field, measured.field_count
+    faintest = measured.config.sky.faintest_v_mag
+    text = f"no star could be measured: none of {fields} fields has one that is shown, unclipped and alone"
+    if few * fields > MIN_EXPECTED:
+        return text
+    return (
+        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: write a larger"
+        " [sky] faintest_v_mag, or a [sky] catalogue with fainter stars, or let `hilstar verify` look at more --fields"
+    )
+
+
+def _too_wide(measured: Measured) -> list[str]:
+    """A star of the display that is too wide for a tracker that knows the sky's."""
+    fault = measured.star.fault()
+    return [] if fault is None else [fault]
+
+
+def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
+    lost, looked_for, tally = len(errors.lost), errors.looked_for, measured.tally
+    limit = measured.config.verify.lost_share
+    if lost <= limit * looked_for:
+        return []
+    cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
+    if tally.vanished > MIN_SHARE * lost:
+        cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
+    for mirror, count in tally.mirrored.items():
+        if count > MIN_SHARE * looked_for:
+            cause = (
+                f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
+            )
+    return [f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
+
+
+def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
+    limit, seen = measured.config.verify.centroid_px, p95(errors.centroid_px())
+    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g})"] if seen > limit else []
+
+
+def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The parts of the geometry that are off by more than the centroid limit somewhere in the field."""
+    fit, limit = errors.geometry, measured.config.verify.centroid_px
+    if fit is None or fit.left > MAX_LEFT:
+        return []
+    reach_px, found, measured_lens = math.hypot(*measured.camera.resolution_px) / 2, [], measured.config.collimator.geometry
+    again = "its geometry file does not say so; run hilstar calibrate geometric again"
+    if abs(fit.scale_error) * reach_px > limit:
+        cure = again if measured_lens else "look at focal_length_mm and pixel_pitch_um"
+        found.append(f"the plate scale is {fit.scale_error:+.2%} off: {cure}")
+    if abs(fit.rotation_rad) * reach_px > limit:
+        cure = again if measured_lens else "look at q_cam_to_mon"
+        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: {cure}")
+    if math.hypot(*fit.offset_px) > limit:
+        right, down = fit.offset_px
+        cure = again if measured_lens else "look at q_cam_to_mon and principal_point_px"
+        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
+    return [*found, *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it")]
+
+
+def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
+    """Errors that only the key `geometry` can describe."""
+    found = []
+    if fit.tilt_px > limit_px:
+        a, b = (math.degrees(angle) for angle in fit.tilt_rad)
+        found.append(f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}")
+    if fit.distortion_px > limit_px:
+        found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
+    if fit.left_px > limit_px:
+        found.append(f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion")
+    return found
+
+
+def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """Errors of the field's stars relative to each other, then the error that all have in common."""
+    verify, found = measured.config.verify, []
+    limit = verify.flux_mag
+    seen, alone = p95(np.abs(errors.of("flux_mag"))), p95(np.abs(errors.of("codes_mag")))
+    if seen > limit:
+        response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
+        cause = ": light does not follow the codes as assumed, look at the monitor's response and uniformity"
+        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}")
+    offset, of_codes = errors.zero_point_mag, errors.codes_zero_point_mag
+    if abs(offset) > limit:
+        cause = f"the codes alone make {of_codes:+.3f}" if abs(of_codes) > limit else "look at flux_at_white_e_per_s"
+        # A wrong response moves the median star too: then white may well be right.
+        if not (found and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
+            found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
+    return found
+
+
+def _black(measured: Measured) -> list[str]:
+    glow = measured.glow
+    if abs(glow.seen_e_per_s_px - glow.assumed_e_per_s_px) <= glow.limit_e_per_s_px:
+        return []
+    return [
+        f"the screen's black gives {glow.seen_e_per_s_px:.4g} e-/s in a tracker pixel where {glow.assumed_e_per_s_px:.4g} are"
+        f" assumed (limit {glow.limit_e_per_s_px:.3g}): calibrate the black level"
+    ]
+
+
+def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The linear image against the catalogue: where that exceeds the limits, the differences above say nothing."""
+    limits = measured.config.verify
+    mag, px = p95(np.abs(errors.of("floor_mag"))), p95(errors.of("floor_px"))
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
+    glass = measured.glass
+    beside = glass is not None and px > limits.centroid_px and glass.px > MIN_SHARE * px
+    if glass is not None and (beside or (mag > limits.flux_mag and glass.mag > MIN_SHARE * mag)):
+        return [
+            f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the glass of"
+            f" [tracker.optics] psf has centroids {glass.px:.3f} px beside their chief rays and light {glass.mag:.3f} mag under"
+            f" the axis's at 95 %{CURE if limits.centroider != 'psf' else ''}"
+        ]
+    return [
+        f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
+        " narrow or too wide for its pixels, or lies beside its chief ray, so that nothing can be said about the display"
+    ]
+
+
+def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The errors of the codes alone, with all else as assumed, and the keys that make codes finer."""
+    limits, render = measured.config.verify, measured.config.render
+    mag, px = p95(np.abs(errors.of("codes_mag"))), p95(errors.of("codes_px"))
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
+    # What is proposed has to suit the monitor as it is, too.
+    calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
+    ways = [f'quantisation = "{BY_COST[-1]}"'] if render.quantisation != BY_COST[-1] else []
+    ways += ["bit_stealing = true"] if not render.bit_stealing and all(c.can_steal_bits for c in calibrations) else []
+    ways += ["more bits" if all(c.is_formula for c in calibrations) else "a monitor calibrated on more bits"]
+    ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
+    return [f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The measurement, its errors, every reason against the bench, and the scenario's faults as they were seen."""
+
+    measured: Measured
+    errors: DisplayErrors
+    reasons: list[str]
+    faults: list[FaultSeen] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        """True without any reason against it."""
+        return not self.reasons
+
+
+def judge(measured: Measured) -> Verdict:
+    """The verdict over all fields."""
+    errors = display_errors(measured)
+    return Verdict(measured, errors, reasons(measured, errors))

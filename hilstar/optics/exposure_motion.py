@@ -1,0 +1,171 @@
+"""Stars seen by a camera that turns during its exposure: each star's path as a chain of sprites.
+
+The mean of a star's light over the exposure is an integral over time; Gauss-Legendre quadrature turns it into a sum of
+sprites whose light adds up to the star's. It is exact in the limit, so each star gets only the sprites that its path needs.
+
+Where rows are exposed one after the other, time on a path is that of the row on which the star is. A star that runs with the
+rows is exposed for longer, by 1 / (1 - the rows that it crosses while one is read). Its PSF is as wide as at one moment.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.frame_motion import Scan
+from hilstar.optics.paths import MAX_NODES, Chords, Paths, node_counts, nodes_of
+from hilstar.optics.psf import Psf
+from hilstar.optics.sprites import Sprites, join_sprites, make_sprites, pack_sprites
+from hilstar.sky.stars import Stars
+
+# With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's flux (measured for sigma
+# 0.3 to 3 px and r up to 300; tests/unit/optics/test_exposure_motion.py holds it). A path under 0.005 sigma is a point to 1e-6.
+# results/tradeoff.csv, smear: evenly spaced sprites are slower and worse.
+NODES_PER_SIGMA = 1.02
+NODES_AT_REST = 3
+MIN_PATH_SIGMA = 0.005
+# A longer turn is cut into pieces of this angle, so that each is short compared with the field and has enough nodes.
+MAX_PIECE_RAD = 0.05
+MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
+# An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes farther apart.
+MAX_PIECES = 20_000
+MAX_SPRITES = 2_000_000
+COARSER = 0.25
+MIN_COARSENESS = COARSER**3
+MIDDLE_S = np.zeros(1)
+AT_ONCE = Scan()
+MAX_ROWS_A_ROW = 0.5  # rows that a star may cross while one is read
+ROUNDS, SETTLED_S = 40, 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """An exposure: the attitude in its middle, the rate of cam in icrs (3,) in cam components, how long it lasts, and when.
+
+    `t_ns` is the time of its middle, None where it has none.
+    """
+
+    q_icrs_to_cam: FloatArray
+    rate_cam_rad_s: FloatArray
+    exposure_s: float
+    t_ns: int | None = None
+
+    def icrs_to_image(self, seconds: FloatArray, camera: Camera) -> FloatArray:
+        """Matrices (k, 3, 3) from ICRS to image axes at `seconds` (k,) after the middle of the exposure.
+
+        A constant rate turns about one axis: Rodrigues' formula on the attitude in the middle.
+        """
+        speed = float(np.linalg.norm(self.rate_cam_rad_s))
+        x, y, z = self.rate_cam_rad_s / speed if speed else np.zeros(3)
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        angle = -speed * seconds[:, None, None]
+        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
+
+
+def own_row_s(paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan) -> tuple[FloatArray, FloatArray]:
+    """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt / ds: how much longer that is.
+
+    Seconds count from the middle of the middle row's exposure.
+    """
+    size_px, found, step_s = paths.camera.resolution_px, seconds, 0.01 * scan.scanout_s
+
+    def late_s(at_s: FloatArray) -> FloatArray:
+        return np.nan_to_num(scan.late_s(*paths.places_px(star, at_s), size_px))
+
+    for _ in range(ROUNDS):
+        before, found = found, seconds + late_s(found)
+        if not len(found) or np.abs(found - before).max() < SETTLED_S:
+            break
+    share = (late_s(found + step_s) - late_s(found - step_s)) / (2 * step_s)
+    return found, 1 / (1 - np.clip(share, -MAX_ROWS_A_ROW, MAX_ROWS_A_ROW))
+
+
+def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan: Scan = AT_ONCE) -> Sprites:
+    """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
+
+    `scan` says over how long rows begin, and in which direction. `capped` stars are drawn coarser than NODES_PER_SIGMA where
+    all would be more than MAX_SPRITES. Raises InputError for a turn too long to be drawn at all.
+    """
+    if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
+        return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px)
+    degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    turn = f"an exposure in which the camera turns by {degrees:.4g} deg"
+    fastest_px_s = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s)
+    row_s = scan.scanout_s / camera.resolution_px[1]
+    if fastest_px_s * row_s > MAX_ROWS_A_ROW:
+        raise InputError(
+            f"the camera turns by {fastest_px_s * row_s:.3g} px while a row is read; shorten row_time_us or turn more slowly"
+        )
+    # Each piece of the turn is short compared with the field and, anywhere on the image, with its nodes.
+    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    path_sigma = fastest_px_s * motion.exposure_s / min(psf.width_px)
+    needed = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
+    if needed > MAX_PIECES:
+        max_deg = np.degrees(angle_rad / needed * MAX_PIECES)
+        raise InputError(
+            f"{turn} is too long; at most {max_deg:.4g} deg can be drawn here: write a shorter exposure_s or a slower rate"
+        )
+    pieces = int(np.ceil(needed))
+    fineness = 1.0
+    while fineness >= MIN_COARSENESS:
+        smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness, scan)
+        chain: list[Sprites] = []
+        total = 0
+        for begin, end in itertools.pairwise(np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s):
+            chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
+            total += len(chain[-1])
+            if total > MAX_SPRITES:
+                break
+        else:
+            sprites = join_sprites(chain, psf.footprint_px)
+            return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
+        fineness *= COARSER
+    raise InputError(f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars")
+
+
+@dataclass(frozen=True, slots=True)
+class _Smear:
+    """Stars smeared on one image."""
+
+    stars: Stars
+    camera: Camera
+    psf: Psf
+    nodes_per_sigma: float
+    scan: Scan
+
+    def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> Sprites:
+        """The sprites of a piece of an exposure that is `part` of it."""
+        camera, stars = self.camera, self.stars
+        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (end_s - begin_s + self.scan.scanout_s)
+        middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
+        radius_rad, edges = camera.field(self.psf.footprint_px / 2 + 1)
+        near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
+        paths = Paths(stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
+        half_s = (end_s - begin_s) / 2
+        thrice_s = np.array([[-half_s], [0.0], [half_s]])
+        if self.scan.scanout_s:
+            every = np.tile(np.arange(len(paths)), 3)
+            thrice_s = own_row_s(paths, every, np.repeat(thrice_s, len(paths)), self.scan)[0].reshape(3, -1)
+        x_px, y_px = paths.all_places_px(thrice_s)
+        # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
+        length = sum(Chords(x_px[k : k + 2], y_px[k : k + 2]).length_sigma(self.psf.width_px) for k in (0, 1))
+        whole = Chords(x_px[::2], y_px[::2])
+        bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
+        begin, end = whole.on_image(camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
+        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
+        counts[end <= begin] = 0  # the path misses the image
+        nodes = nodes_of(np.minimum(counts, MAX_NODES))
+        share = begin[nodes.path] + (end - begin)[nodes.path] * (nodes.place + 1) / 2
+        seconds = (2 * share - 1) * half_s
+        star = near[nodes.path]
+        light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
+        if self.scan.scanout_s:
+            seconds, longer = own_row_s(paths, nodes.path, seconds, self.scan)
+            light = light * longer
+        x_px, y_px = paths.places_px(nodes.path, seconds)
+        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.psf.footprint_px)

@@ -1,0 +1,261 @@
+"""Light that is no star's sprite: discs of bodies and maps of light, added to the linear image before levels are chosen.
+
+Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's `Sprites.extended` and is
+drawn in order, before the sprites. Compared by identity: one object drawn twice is the same light. A small disc is a map of
+its spread places, a larger one is drawn ray by ray.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.optics.camera import Camera
+from hilstar.optics.psf import Psf
+from hilstar.sky.bodies.disc import AIR_TOP, Disc
+
+REACH_SIGMAS = 4.0  # as in disc.frag
+LIMB_PLACES = 128
+BEHIND = 0.05  # minimum z of a unit direction: a limb nearer to the camera's plane has no useful outline
+BOW = 1.01  # margin for the outline's curvature between its places
+Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
+# Below this radius (PSF and pixel combined) a disc's limb and centre cannot be told apart; disc.frag is off by 1 % at 5.5.
+SMALL_SIGMAS = 8.0
+NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
+WHOLE = 0.999  # coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times white
+MAX_NODES = 64  # enough for a Gaussian ten times as wide along one axis as along the other
+MIN_NODES = 10  # 1e-4 of the light
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightMap:
+    """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px` (x, y) of the image.
+
+    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing. `name` is the
+    body's whose disc it is; other light has the colour of its `bv_mag`, None: of the stars.
+
+    Keep one array for as long as the light is the same, and do not write to it: it is uploaded once. What a single frame has is
+    not `lasting`.
+    """
+
+    image: Float32Array
+    corner_px: tuple[int, int] = (0, 0)
+    times: float = 1.0
+    cover: Float32Array | None = None
+    name: str = ""
+    lasting: bool = True
+    bv_mag: float | None = None
+
+    def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
+        """The part of an image that it lights, None where that is nothing."""
+        height, width = self.image.shape
+        left, top = self.corner_px
+        return clipped((left, top, left + width, top + height), resolution_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlowLight:
+    """A glow about a direction (3,), unit, image axes: `peak_e_per_s` (1 + (angle / scale)^2)^(-exponent / 2) in each pixel.
+
+    The direction may be off the image, or behind the camera.
+    """
+
+    direction_image: FloatArray
+    peak_e_per_s: float
+    scale_rad: float
+    exponent: float
+    camera: Camera
+    bv_mag: float | None = None
+
+    def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
+        """The whole image."""
+        return (0, 0, *resolution_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shear:
+    """A camera that turns at `rate_image_rad_s` (3,), image axes, while pixels light up one after the other.
+
+    A pixel is lit `s_per_px` (x, y) times its distance from `middle_px` after the moment of the attitude.
+    """
+
+    rate_image_rad_s: FloatArray
+    s_per_px: tuple[float, float]
+    middle_px: tuple[float, float]
+
+    def late_s(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """How long after the attitude's moment pixels (n,) are lit."""
+        (a, b), (x, y) = self.s_per_px, self.middle_px
+        return a * (x_px - x) + b * (y_px - y)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscLight:
+    """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
+
+    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `disc_lights`
+    chooses between it and, for a small disc, a map.
+    """
+
+    disc: Disc
+    icrs_to_image: FloatArray
+    camera: Camera
+    psf: Psf
+    times: float = 1.0
+    covers: bool = True
+    shear: Shear | None = None
+
+    @property
+    def name(self) -> str:
+        """The body's name."""
+        return self.disc.name
+
+    def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
+        """The pixels within the outline of its limb, its air and the Gaussian's reach; all where that is partly behind."""
+        air = 1 + AIR_TOP * self.disc.air_radii
+        seen = self.disc.limb(LIMB_PLACES, air) @ self.icrs_to_image.T
+        if (seen[:, 2] < BEHIND).any():
+            return (0, 0, *resolution_px)
+        x_px, y_px = self.camera.project_outward(seen)
+        if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
+            return (0, 0, *resolution_px)
+        sheared_px = 0.0  # how far the first and the last pixels' light is moved at most, about
+        if self.shear is not None:
+            late_s = sum(abs(s) * size for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)) / 2
+            turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
+            sheared_px = 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
+        edges = []
+        for k, place in enumerate((x_px, y_px)):
+            low, high = float(place.min()), float(place.max())
+            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k])) + 1 + sheared_px
+            edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
+        return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
+
+
+ExtendedLight = LightMap | GlowLight | DiscLight
+
+
+def times(light: ExtendedLight, factor: float) -> ExtendedLight:
+    """Light with all of its electrons times a factor; what it hides stays hidden."""
+    if isinstance(light, GlowLight):
+        return replace(light, peak_e_per_s=light.peak_e_per_s * factor)
+    return replace(light, times=light.times * factor)
+
+
+def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLight:
+    """Light a part of a pixel to the right and down of its place; of a map by cubic splines."""
+    if not (right_px or down_px):
+        return light
+    if isinstance(light, LightMap):
+        from scipy.ndimage import shift
+
+        image, cover = (
+            None if one is None else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
+            for one, most in ((light.image, np.inf), (light.cover, 1.0))
+        )
+        corner = light.corner_px[0] - 1, light.corner_px[1] - 1
+        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
+    x_px, y_px = light.camera.principal_point_px
+    return replace(light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px)))
+
+
+def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
+    """The pixels of an image within left, top, right and bottom (the last two excluded); None where there is none."""
+    (left, right), (top, bottom) = (
+        np.clip((np.floor(edges_px[k]), np.ceil(edges_px[k + 2])), 0, resolution_px[k]).astype(int).tolist() for k in (0, 1)
+    )
+    return (left, top, right - left, bottom - top) if right > left and bottom > top else None
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The camera at one moment of a frame: the map (3, 3) of ICRS to image axes, and the moment's share of the light."""
+
+    icrs_to_image: FloatArray
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class DiscView:
+    """A camera and the PSF that spreads its image, at the poses of a frame, and how it turns meanwhile."""
+
+    camera: Camera
+    psf: Psf
+    poses: tuple[Pose, ...]
+    shear: Shear | None = None
+
+
+def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]:
+    """A body's disc at all poses, none of it where it does not touch the image; where it `covers`, it hides what is behind."""
+    if len(view.poses) == 1:
+        pose = view.poses[0]
+        return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, covers, view.shear))
+    lights: list[ExtendedLight] = []
+    if covers:
+        # Poses hide together what one in the middle hides: each after the other would hide the light of those before.
+        middle = view.poses[len(view.poses) // 2].icrs_to_image
+        lights += _at_pose(DiscLight(disc, middle, view.camera, view.psf, 0.0, True, view.shear))
+    for pose in view.poses:
+        lights += _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, False, view.shear))
+    return lights
+
+
+def _at_pose(light: DiscLight) -> list[ExtendedLight]:
+    camera = light.camera
+    radius_px = float(np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px)
+    if radius_px < SMALL_SIGMAS * max(light.psf.variance_px2) ** 0.5:
+        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.psf.variance_px2) ** 0.5))
+        drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
+        return [] if drawn is None else [drawn]
+    return [] if light.region(camera.resolution_px) is None else [light]
+
+
+def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
+    """Directions (n, 3), ICRS, in image axes while their own pixels are lit."""
+    seen = directions @ light.icrs_to_image.T
+    if light.shear is None:
+        return np.asarray(seen)
+    x_px, y_px = light.camera.project(seen)
+    late_s = np.nan_to_num(light.shear.late_s(x_px, y_px))
+    return np.asarray(seen - late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen))
+
+
+def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
+    """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
+    disc, camera, reach_px = light.disc, light.camera, light.psf.footprint_px / 2
+    lit = _places(light, disc, nodes)
+    whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else lit
+    if not len(whole.x_px):
+        return None
+    (left, right), (top, bottom) = ((float(part.min()), float(part.max())) for part in whole[:2])
+    edges = (left - reach_px, top - reach_px, right + reach_px + 1, bottom + reach_px + 1)
+    region = clipped(edges, camera.resolution_px)
+    if region is None:
+        return None
+    cover = None
+    if light.covers:
+        # Pixels to a steradian at the disc's middle: nearly the same over a small disc
+        u, v, w = light.icrs_to_image @ disc.direction
+        a, b, c, d = camera.slopes(np.array([u / w]), np.array([v / w]))
+        px_per_sr = float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)
+        share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * px_per_sr, region)
+        cover = np.where(share > WHOLE, np.float32(1), share)
+    image = light.psf.spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region)
+    return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
+
+
+class FacePlaces(NamedTuple):
+    """Places of a disc's face in pixels, and the value of its law times the steradians of each, (n,) each."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    law_sr: FloatArray
+
+
+def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
+    """Places of the face that have a pixel."""
+    directions, law_sr = disc.points(nodes)
+    x_px, y_px = light.camera.project(_seen(light, directions))
+    known = np.isfinite(x_px)
+    return FacePlaces(x_px, y_px, law_sr) if known.all() else FacePlaces(x_px[known], y_px[known], law_sr[known])

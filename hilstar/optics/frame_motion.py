@@ -1,0 +1,178 @@
+"""Stars of one frame of a screen that lights row by row, while the camera turns.
+
+Row y of a screen lights up a part of a refresh period later than the first row, and holds its light until it is written
+again. So a star is drawn where it is while its row is lit: on its path from the moment when that row lights up until the row
+that it has reached by then is written again, as a chain of sprites. Frame by frame the paths join to one streak. A star that
+runs with the scan meets fewer frames in a second, and has more light in each: 1 % at 10 deg/s, which would else be missing.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.paths import Chords, Paths, ShortPaths, bend_px, node_counts, nodes_of, points_within, within_budget
+from hilstar.optics.psf import Psf
+from hilstar.optics.sprites import Sprites, brightest, max_stars, pack_sprites
+from hilstar.sky.stars import Stars
+
+# With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
+# 0.5 to 2 px and r to 30; tests/unit/optics/test_frame_motion.py holds it): its flux and centroid are exact with any number.
+NODES_PER_SIGMA = 0.6
+# A path of this many sigmas is a point to 1e-3 of the star's flux.
+POINT_SIGMA = 0.27
+# A frame's work is bounded: beyond one sprite per star all paths together get EXTRA_SPRITES (of EXTRA_PX pixels), and no
+# path is longer than MAX_TURN_FIELD of the field's radius. Beyond that, paths have fewer nodes or are those of a slower turn,
+# and the stars are counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
+# (python -m tests.benchmarks.bench_motion).
+EXTRA_SPRITES = 1000
+EXTRA_PX = 400_000
+MAX_TURN_FIELD = 0.5
+EVERY = slice(None)
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """How the image lies on the screen: columns or rows reversed, and quarter turns clockwise."""
+
+    flip_x: bool = False
+    flip_y: bool = False
+    quarter_turns: int = 0
+
+    def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
+        """The screen that an image of `resolution_px` fills."""
+        return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+
+    @property
+    def down(self) -> tuple[int, int]:
+        """The direction of the screen's rows, from first to last, in image axes (x right, y down)."""
+        x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
+        return (-x, -y) if self.flip_y else (x, y)
+
+    def in_image(self, right: float, down: float) -> tuple[float, float]:
+        """A step on the screen, right and down, in image axes."""
+        right, down = -right if self.flip_x else right, -down if self.flip_y else down
+        for _ in range(self.quarter_turns % 4):
+            right, down = down, -right
+        return right, down
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """How a screen lights up: its rows in turn over `scanout_s`, each for `hold_s`.
+
+    `down` is the direction of the screen's rows in image axes (x right, y down), one of the four along an axis.
+    """
+
+    down: tuple[int, int] = (0, 1)
+    scanout_s: float = 0.0
+    hold_s: float = 0.0
+
+    @property
+    def whole_s(self) -> float:
+        """The time from the first row's first light to the last row's last."""
+        return self.scanout_s + self.hold_s
+
+    @property
+    def longest_s(self) -> float:
+        """The longest time that a star of the frame may have moved, counted from the middle row's first light."""
+        return self.scanout_s / 2 + self.hold_s
+
+    def late_s(self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
+        """How long after the middle row the row of a pixel lights up; off the image as at its edge."""
+        middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
+        rows = resolution_px[0] if self.down[0] else resolution_px[1]
+        place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
+        return np.asarray(np.clip(place, -0.5, 0.5) * self.scanout_s)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTurn:
+    """The attitude when the middle row lights up, and the rate of cam in icrs (3,), cam components, constant over the frame."""
+
+    q_icrs_to_cam: FloatArray
+    rate_cam_rad_s: FloatArray
+
+    @property
+    def speed_rad_s(self) -> float:
+        """How fast the camera turns."""
+        return float(np.linalg.norm(self.rate_cam_rad_s))
+
+
+def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, psf: Psf) -> Sprites:
+    """Sprites of each star on its path while its row is lit; the sprites of a star follow each other.
+
+    `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
+    """
+    turn, is_slower = slowed(turn, scan, camera)
+    middle = CameraTurn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
+    icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
+    footprint_px = psf.footprint_px
+    margin_px = footprint_px / 2 + 1
+    radius_rad, edges = camera.field(margin_px)
+    reach_rad = turn.speed_rad_s * scan.whole_s / 2
+    near = stars.near(icrs_to_middle[2], radius_rad, edges @ icrs_to_middle, reach_rad)
+    seen = (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam) @ stars.directions(near).T).T
+    close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
+    near = near[close]
+    paths = _paths(seen[close], turn, scan, camera)
+    late_s = np.zeros(len(paths))  # how long after the middle row each star's own row lights up
+    for _ in range(2 if scan.scanout_s else 0):
+        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
+        x_px, y_px = paths.places_px(EVERY, late_s)
+        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
+    late_s = np.where(np.isfinite(late_s), late_s, 0.0)
+    ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
+    chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
+    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
+    bulge_px = paths.speed_rad_s * scan.hold_s * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    # From the first light of the row where a path begins until the row where it ends is written again: a star that falls by a
+    # share s of the rows that the panel lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
+    span_s = np.zeros(len(late_s))
+    if scan.hold_s:
+        share = (scan.late_s(*ends[1], camera.resolution_px) - late_s) / scan.hold_s
+        span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
+        chords = chords.to(span_s / scan.hold_s)
+    first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)  # the part of each path, 0 to 1
+    wanted = node_counts(chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    wanted[last <= first] = 0  # the path misses the image
+    chosen, wanting = wanted, np.flatnonzero(wanted)
+    kept = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
+    if kept is not None:  # a frame has no room for the faintest
+        chosen = np.zeros_like(wanted)
+        chosen[wanting[kept]] = wanted[wanting[kept]]
+    counts = within_budget(chosen, min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2))
+    nodes = nodes_of(counts)
+    begin, length = first[nodes.path], (last - first)[nodes.path]
+    seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * span_s[nodes.path]
+    x_px, y_px = paths.places_px(nodes.path, seconds)
+    star = near[nodes.path]
+    light = nodes.share * length * stars.electrons_per_s[star]
+    if scan.hold_s:
+        light *= span_s[nodes.path] / scan.hold_s
+    sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
+    capped = int(((wanted > 0) if is_slower else (counts < wanted)).sum())
+    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
+
+
+def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
+    """The stars' paths while their rows are lit, seconds from the middle row's first light."""
+    exact = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
+    # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the star's.
+    wrong_px = bend_px(camera) + turn.speed_rad_s * scan.longest_s * camera.focal_length_px
+    half_s = scan.hold_s / 2 + scan.scanout_s * min(1.0, wrong_px / min(camera.resolution_px))
+    points = points_within(camera, turn.speed_rad_s * half_s)
+    if points is None:
+        return exact
+    x_px, y_px = exact.through(replace(camera, lens=None)).all_places_px(np.zeros((1, 1)))
+    return ShortPaths(exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points)
+
+
+def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
+    """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
+    angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
+    if angle_rad <= most_rad:
+        return turn, False
+    return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True

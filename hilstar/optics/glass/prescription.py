@@ -1,0 +1,448 @@
+"""A glass from a lens's prescription: optiland traces it, and its rays become PSFs with diffraction.
+
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path + L (x - x_ray) +
+M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the angular spectrum, Goodman,
+Fourier Optics, section 3.10). Where the pupil would need too many rays, because what diffraction spreads is far finer than
+the aberrations, rays are counted as they fall.
+
+Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its middle on the chief ray of the
+field's middle, its axes the surface's own.
+"""
+
+import contextlib
+import io
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, MachineError, one_line
+from hilstar.basics.reading import read_bytes
+from hilstar.optics.camera import Lens
+from hilstar.optics.glass.codev_file import read_codev
+from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription
+from hilstar.optics.glass.optiland_lens import optic_of
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+from hilstar.optics.glass.zemax_file import read_zemax
+
+CAN_INSTALL = "pip install 'hilstar[lens]'"
+ADVICE = "give a lens file: .zmx of Zemax, .seq of CODE V, or .json of optiland"
+ENDINGS = frozenset({".zmx", ".seq", ".json"})
+MAX_BYTES = 50_000_000
+POINTS = 5  # field points along each side
+MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
+MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does not say
+PERIOD_MARGIN = 2.0  # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
+FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
+EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
+MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
+
+
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """The detector behind a lens: its size and pixel pitch, focus positions (positive: farther from the lens), half a stamp."""
+
+    resolution_px: tuple[int, int]
+    pitch_um: float
+    focuses_um: tuple[float, ...] = (0.0,)
+    half_px: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Traced:
+    """The glass of a prescription, its focal length and F-number, and what was taken for granted."""
+
+    glass: Glass
+    focal_length_mm: float
+    f_number: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Lens:
+    """optiland's lens, its field points with their vignetting, and notes."""
+
+    optic: Any
+    fields: tuple[FieldPoint, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Bundle:
+    """Rays of a pupil's grid (n, n) at the image: places, direction cosines, path, all mm; and their light, 0 where blocked."""
+
+    x: FloatArray
+    y: FloatArray
+    cosines: FloatArray
+    path: FloatArray
+    light: FloatArray
+
+
+def glass_of_prescription(path: Path, plate: Plate, per_px: int | None, tolerance: float) -> Traced:
+    """The glass of a lens file. Raises InputError, and MachineError without optiland."""
+    lens = _read(path)
+    try:
+        return _traced(lens, plate, per_px, tolerance, f"hilstar optics lens of {path.name}")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read(path: Path) -> "_Lens":
+    if path.suffix.lower() not in ENDINGS:
+        raise InputError(f"{path}: no lens file by its name; {ADVICE}")
+    data = read_bytes(path, ADVICE, MAX_BYTES)
+    try:
+        # What the file states is read first: a refusal of it needs no optiland.
+        prescription = _stated(path, data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    try:
+        with _quiet() as warned:
+            import optiland  # noqa: F401
+    except ImportError as error:
+        raise MachineError(f"hilstar optics lens needs optiland: {CAN_INSTALL}") from error
+    try:
+        with _quiet() as warned:
+            lens = _optiland_s_own(path) if prescription is None else _of_prescription(prescription)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # optiland raises whatever a broken file causes in its layers
+        raise InputError(f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+    return replace(lens, notes=(*lens.notes, *warned))
+
+
+def _stated(path: Path, data: bytes) -> LensPrescription | None:
+    """What a file states; None for optiland's own, which are its to read."""
+    if path.suffix.lower() == ".zmx":
+        return read_zemax(data)
+    if path.suffix.lower() == ".seq":
+        return read_codev(data)
+    return None
+
+
+def _of_prescription(lens: LensPrescription) -> "_Lens":
+    optic, notes = optic_of(lens)
+    return _Lens(optic, lens.fields, (*lens.notes, *notes))
+
+
+def _optiland_s_own(path: Path) -> "_Lens":
+    from optiland import fileio
+
+    optic = fileio.load_optiland_file(str(path))
+    return _Lens(optic, _fields_of(optic))
+
+
+def _fields_of(optic: Any) -> tuple[FieldPoint, ...]:
+    """The field points of optiland's lens, whose vignetting is symmetrical."""
+    points = []
+    for point in optic.fields.fields:
+        compression = float(point.vx), float(point.vy)
+        points.append(FieldPoint(float(point.x), float(point.y), compression))
+    return tuple(points)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[list[str]]:
+    """Keeps what optiland prints from stdout; its own warnings are put into the list, those of numba's compiler are not."""
+    warned: list[str] = []
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield warned
+    for warning in caught:
+        if issubclass(warning.category, UserWarning) and "numba" not in str(warning.filename):
+            warned.append(f"optiland: {one_line(str(warning.message))}")
+
+
+def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
+    """The glass of an optic of optiland's, at its wavelengths and within its field. Raises InputError."""
+    return _traced(_Lens(optic, _fields_of(optic)), plate, per_px, tolerance, made_by)
+
+
+def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
+    try:
+        with _quiet() as warned:
+            made = _glass(_LensRays(lens.optic, lens.fields), plate, per_px, tolerance, made_by)
+        return replace(made, notes=(*lens.notes, *warned))
+    except InputError:
+        raise
+    except Exception as error:  # as in `_read`
+        raise InputError(f"optiland cannot trace it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+
+
+class _LensRays:
+    """Rays through an optic, with its vignetting factors interpolated over the field; optiland takes the nearest."""
+
+    def __init__(self, optic: Any, points: tuple[FieldPoint, ...]) -> None:
+        if not optic.object_surface.is_infinite:
+            raise InputError("its object is near; write a lens whose object is at infinity, as stars are")
+        self.optic = optic
+        self.max_field = float(optic.fields.max_field)
+        self._vignetting = _vignetting(points)
+        for field in optic.fields.fields:
+            field.vx = field.vy = 0.0
+        self.wavelengths_um = sorted({float(w.value) for w in optic.wavelengths.wavelengths})
+        self.primary_um = float(optic.primary_wavelength)
+        self.focal_length_mm = abs(float(np.asarray(optic.paraxial.f2()).ravel()[0]))
+        self.f_number = abs(float(np.asarray(optic.paraxial.FNO()).ravel()[0]))
+        if not math.isfinite(self.focal_length_mm) or not self.wavelengths_um:
+            raise InputError("it has no focal length or no wavelength; write a lens that forms an image")
+        frame = optic.image_surface.geometry.cs
+        self._image_mm, self._to_image = (np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform())
+        self.centre_mm, self.sign = np.zeros(2), 1.0
+        edge = np.array([[0.0, 0.0], [0.0, EDGE]])
+        tangents, places = self.chiefs(edge, self.primary_um)
+        if not np.isfinite(places).all():
+            raise InputError(
+                "the chief ray of its field's middle is lost; is a surface tilted too far, or its aperture beside it?"
+            )
+        # A lens with one field, on the axis, has no direction in which its image could be turned round.
+        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0]))) or 1.0
+        self.centre_mm = places[0]
+
+    def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
+        """Places (2, n), mm from the detector's middle, and direction cosines (3, n) of rays, by the image surface's axes."""
+        places, cosines = (
+            self._to_image.T @ np.stack([np.asarray(part) for part in parts])
+            for parts in ((rays.x, rays.y, rays.z - self._image_mm[2]), (rays.L, rays.M, rays.N))
+        )
+        moved = self._to_image.T @ np.array([*self._image_mm[:2], 0.0])
+        return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
+
+    def chiefs(self, fields: FloatArray, um: float) -> tuple[FloatArray, FloatArray]:
+        """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields (n, 2) relative to the largest."""
+        none = np.zeros(len(fields))
+        starts = self.optic.ray_tracer.ray_generator.generate_rays(fields[:, 0], fields[:, 1], none, none, um)
+        tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
+        return tangents, self.at_image(self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um))[0].T
+
+    def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
+        """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
+        if self.max_field == 0:
+            return np.zeros_like(places_mm)
+        tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
+        slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
+        fields = places_mm / slope_mm
+        for _ in range(CHIEF_ROUNDS):
+            fields = np.clip(fields, -1.5, 1.5)
+            fields = fields + (places_mm - camera.places_mm(self.chiefs(fields, self.primary_um)[0])) / slope_mm
+        return np.asarray(fields)
+
+    def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
+        at = (np.arange(rays) + 0.5) / rays * 2 - 1
+        across, down = np.meshgrid(at, at)
+        filled = _filled(rays)
+        radius = float(np.hypot(*field))
+        at_field = radius * self.max_field
+        beside_cut, along_cut, shift = (np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:])
+        turn = field / radius if radius else np.array([0.0, 1.0])  # the field's direction is the factors' y
+        along = across * turn[0] + down * turn[1]
+        beside = across * turn[1] - down * turn[0]
+        moved_along = shift - along_cut * along
+        moved_beside = beside_cut * beside
+        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)  # beyond it only where no light is
+        py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
+        hx, hy = np.full(px.size, field[0]), np.full(px.size, field[1])
+        generate = self.optic.ray_tracer.ray_generator.generate_rays
+        first = generate(hx, hy, px.ravel(), py.ravel(), um)
+        x0, y0, z0, l0, m0, n0 = (np.array(getattr(first, name)).reshape(px.shape) for name in ("x", "y", "z", "L", "M", "N"))
+        found = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
+        (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
+        path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
+        good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
+        # A plane wave's path up to where its rays start, and the area of the beam that each ray stands for.
+        path = path + l0 * x0 + m0 * y0 + n0 * z0
+        area = np.abs(_determinant(x0, y0)) * np.abs(n0)
+        return _Bundle(x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0))
+
+
+def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
+    """Field radii, and there: how much of the pupil is cut off across the field's direction and along it, and its shift.
+
+    Shape (4, n). Factors are of the pupil's x and y, so a field's direction has to be one of them. Raises InputError.
+    """
+    rows = []
+    for point in points:
+        radius = math.hypot(point.x, point.y)
+        beside, along = point.compression
+        beside_shift, along_shift = point.shift
+        sign = math.copysign(1.0, point.y)
+        if point.x and not point.y:
+            beside, along = along, beside
+            beside_shift, along_shift = along_shift, beside_shift
+            sign = math.copysign(1.0, point.x)
+        is_even = beside == along and not point.shift[0] and not point.shift[1]
+        is_diagonal = bool(point.x and point.y)
+        if point.is_vignetted and (beside_shift or (is_diagonal and not is_even)):
+            raise InputError(
+                f"its field at {point.x:g}, {point.y:g} is vignetted along neither x nor y; write apertures of surfaces instead"
+            )
+        rows.append((radius, beside, along, along_shift * sign))
+    return np.array(sorted(rows)).T
+
+
+@lru_cache(maxsize=4)
+def _filled(rays: int) -> FloatArray:
+    """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
+    fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
+    return np.asarray((fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3)))
+
+
+def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The area that neighbours of a grid span in (a, b)."""
+    (a_down, a_right), (b_down, b_right) = np.gradient(a), np.gradient(b)
+    return np.asarray(a_right * b_down - a_down * b_right)
+
+
+def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
+    pitch_mm, (width, height) = plate.pitch_um * 1e-3, plate.resolution_px
+    middle = (np.array([width, height]) - 1) / 2
+    camera = _Chiefs.of(lens)
+    places = _field_points(lens, plate)
+    fields = lens.fields_at(places * pitch_mm, camera)
+    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
+    samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(plate.pitch_um / finest_um)))
+    grid = 2 * plate.half_px * samples + 1, pitch_mm / samples
+    images, at, facts = [], [], []
+    axis_light: dict[float, float] = {}
+    for um in lens.wavelengths_um:
+        axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
+        if axis_light[um] <= 0:
+            raise InputError("no ray of its field's middle reaches the image; do apertures lie beside the beam?")
+        for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
+            slopes = _slopes(lens, field, um)
+            light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]
+            for focus_um in sorted(set(plate.focuses_um)):
+                if light > MIN_LIT:
+                    image, outside = _psf(lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid)
+                else:
+                    image, outside = _dark(grid[0]), 0.0
+                images.append(image)
+                at.append((*(middle + place), um * 1e3, focus_um))
+                moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
+                facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
+    stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
+    history = (made_by, f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}")
+    return Traced(glass_of(stack, tolerance, camera.lens, history=history), camera.focal_length_mm, lens.f_number)
+
+
+def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
+    """Places (n, 2) from the middle, px: a grid over the detector, or as much of it as the prescription's field has."""
+    half = (np.array(plate.resolution_px) - 1) / 2
+    if lens.max_field == 0:
+        return np.zeros((1, 2))
+    edge_px = float(np.linalg.norm(lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)[1])) / (plate.pitch_um * 1e-3)
+    scale = min(1.0, edge_px / float(np.hypot(*half)))
+    columns, rows = (np.unique(np.linspace(-size * scale, size * scale, POINTS)) for size in half)
+    return np.stack([part.ravel() for part in np.meshgrid(columns, rows)], axis=1)
+
+
+def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
+    rays = lens.optic.trace_generic(np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um)
+    cosines = lens.at_image(rays)[1][:, 0]
+    return np.asarray(cosines[:2] / cosines[2])
+
+
+def _dark(side: int) -> FloatArray:
+    image = np.zeros((side, side))
+    image[side // 2, side // 2] = 1.0
+    return image
+
+
+def _psf(
+    lens: _LensRays, light: tuple[FloatArray, float, float], centre: FloatArray, grid: tuple[int, float]
+) -> tuple[FloatArray, float]:
+    """A PSF about its chief ray's place `centre` on its stamp's samples, and the share of its light outside of them.
+
+    `light` is its field, wavelength (um) and defocus (mm), `grid` the stamp's side and step (mm).
+    """
+    (field, um, defocus_mm), (side, step_mm) = light, grid
+    needed = math.ceil(PERIOD_MARGIN * side * step_mm / (um * 1e-3 * lens.f_number))
+    if needed > MAX_RAYS:
+        return _counted(lens.bundle(field, um, GEOMETRIC_RAYS), defocus_mm, centre, side, step_mm)
+    return _waves(lens.bundle(field, um, max(MIN_RAYS, needed)), um, defocus_mm, centre, (side, step_mm))
+
+
+def _waves(
+    rays: _Bundle, um: float, defocus_mm: float, centre: FloatArray, grid: tuple[int, float]
+) -> tuple[FloatArray, float]:
+    side, step_mm = grid
+    finer = max(1, math.ceil(step_mm / (um * 1e-3 * 0.5 * _fastest(rays))) // 2 * 2 + 1)
+    at_mm = (np.arange(side * finer) - (side * finer) // 2) * step_mm / finer
+    wave = 2 * np.pi / (um * 1e-3)
+    cos_x, cos_y, cos_z = rays.cosines
+    # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
+    angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
+    lit = rays.light > 0
+    path = rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
+    path = path[lit] - np.median(path[lit])
+    light, angle, cos_x, cos_y = rays.light[lit], angle[lit], cos_x[lit], cos_y[lit]
+    part = np.sqrt(light * angle) * np.exp(1j * wave * path)
+    middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))  # a phase that no light shows
+    across = np.exp(1j * wave * np.outer(cos_x - middle_x, at_mm))
+    down = np.exp(1j * wave * np.outer(cos_y - middle_y, at_mm))
+    image = np.abs((down * part[:, None]).T @ across) ** 2
+    # Parseval: the integral over the image is the wavelength squared times that of the squared amplitude over solid angles.
+    total = float(light.sum()) * (um * 1e-3 / (step_mm / finer)) ** 2
+    image = image.reshape(side, finer, side, finer).sum(axis=(1, 3))
+    return image, float(np.clip(1 - image.sum() / total, 0, 0.999))
+
+
+def _fastest(rays: _Bundle) -> float:
+    lit = rays.light > 0
+    return 1 / max(1e-6, float(max(np.ptp(cosine[lit]) for cosine in rays.cosines[:2])))
+
+
+def _counted(rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, step_mm: float) -> tuple[FloatArray, float]:
+    """Rays shared out among the four samples nearest to each."""
+    lit = rays.light > 0
+    light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
+    x, y = (
+        (place[lit] + cosine / cos_z * defocus_mm - own) / step_mm + side // 2
+        for place, cosine, own in ((rays.x, cos_x, centre[0]), (rays.y, cos_y, centre[1]))
+    )
+    column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    image = np.zeros((side, side))
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = light * np.abs(1 - down - (y - row)) * np.abs(1 - right - (x - column))
+        inside = (column + right >= 0) & (column + right < side) & (row + down >= 0) & (row + down < side)
+        np.add.at(image, (row[inside] + down, column[inside] + right), share[inside])
+    return image, float(np.clip(1 - image.sum() / light.sum(), 0, 0.999))
+
+
+@dataclass(frozen=True, slots=True)
+class _Chiefs:
+    """The camera that the chief rays at the primary wavelength have: focal length, mm, and Brown-Conrady relative to it."""
+
+    focal_length_mm: float
+    lens: Lens | None
+
+    def places_mm(self, tangents: FloatArray) -> FloatArray:
+        """Where it has directions (n, 2)."""
+        bent = tangents if self.lens is None else np.stack(self.lens.bent(*tangents.T), axis=1)
+        return np.asarray(self.focal_length_mm * bent)
+
+    @classmethod
+    def of(cls, lens: _LensRays) -> "_Chiefs":
+        if lens.max_field == 0:
+            return cls(lens.focal_length_mm, None)
+        turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
+        radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
+        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(-1, 2)
+        tangents, places = lens.chiefs(fields, lens.primary_um)
+        known = np.isfinite(places).all(axis=1)
+        largest = float(np.hypot(*tangents.T).max())
+        (u, v), places = tangents[known].T / largest, places[known] / largest
+        r2 = u * u + v * v
+        radial = [np.concatenate([part * r2**power for part in (u, v)]) for power in range(4)]
+        sides = [np.concatenate(part) for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))]
+        found = np.linalg.lstsq(np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None)[0].tolist()
+        focal, *bent = found
+        k1, k2, k3, p1, p2 = (part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True))
+        return cls(focal, Lens((k1, k2, k3), (p1, p2)))

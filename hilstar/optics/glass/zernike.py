@@ -1,0 +1,187 @@
+"""A glass from its pupil and its aberrations: diffraction PSFs by Zernike or Seidel coefficients over field and wavelength.
+
+The pupil's field is exp(2 pi i W / wavelength) within the aperture, W the wavefront's lead over the reference sphere; poppy
+(Perrin et al. 2012, SPIE 8442) makes the Zernike polynomials and propagates it. Pupil axes are the detector's, x right and y
+down. Coordinates in the pupil are relative to its radius.
+"""
+
+import math
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, MachineError, shortened
+from hilstar.basics.reading import parse_toml, read_text
+from hilstar.basics.toml_tables import Table
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+
+MAX_BYTES = 1_000_000
+ADVICE = "give a TOML file as docs/optics.md has it"
+PUPIL, FINER = 256, 4  # samples across the pupil, and of each of them along an axis at its edges
+MIN_SAMPLES, MAX_SAMPLES = 4, 32  # a tracker pixel, where --oversampling does not say
+MAX_STEP_WAVES = 0.5  # wavefront step between pupil samples; beyond it the PSF is an alias
+CAN_INSTALL = "pip install 'hilstar[optics]'"
+Positive = Annotated[float, Meta(gt=0, le=1e6)]
+Nm = Annotated[float, Meta(ge=-1e6, le=1e6)]
+
+
+class Term(Table, frozen=True):
+    """A Zernike term by Noll's index (rms), or a Seidel one (at the pupil's edge), in nm at the field's corner or on the axis.
+
+    A Zernike term grows with the field's radius to the power `field_power`, 0 for the same everywhere, and keeps its
+    orientation. Seidel terms grow as they do (W131 with the field, W222 and W220 with its square) and turn with the field.
+    `per_nm` is added for each nm of wavelength over `reference_nm`.
+    """
+
+    kind: Literal["zernike", "W020", "W040", "W131", "W222", "W220"]
+    nm: Nm
+    noll: Annotated[int, Meta(ge=2, le=200)] = 4
+    field_power: Annotated[int, Meta(ge=0, le=8)] = 0
+    per_nm: Nm = 0.0
+
+
+class Pupil(Table, frozen=True):
+    """The file of `hilstar optics zernike`."""
+
+    aperture_mm: Positive
+    focal_length_mm: Positive
+    pixel_pitch_um: Positive
+    resolution_px: tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
+    wavelengths_nm: Annotated[tuple[Annotated[float, Meta(ge=100, le=20_000)], ...], Meta(min_length=1, max_length=50)]
+    reference_nm: Positive = 550.0
+    focuses_um: Annotated[tuple[Annotated[float, Meta(ge=-1e5, le=1e5)], ...], Meta(min_length=1, max_length=50)] = (0.0,)
+    points: Annotated[int, Meta(ge=1, le=50)] = 5
+    half_px: Annotated[int, Meta(ge=1, le=100)] = 8
+    obstruction: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    spiders: Annotated[int, Meta(ge=0, le=12)] = 0
+    spider_width_mm: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    spider_angle_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    lateral_per_nm: Annotated[float, Meta(ge=-0.01, le=0.01)] = 0.0
+    cos4: bool = True
+    terms: tuple[Term, ...] = ()
+
+
+def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
+    """The glass of a file's pupil. Raises InputError, and MachineError without poppy."""
+    try:
+        pupil = msgspec.convert(parse_toml(path, read_text(path, ADVICE, MAX_BYTES)), Pupil)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
+    finest_um = min(pupil.wavelengths_nm) * 1e-3 * pupil.focal_length_mm / pupil.aperture_mm / 2
+    samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(pupil.pixel_pitch_um / finest_um)))
+    try:
+        stack = diffracted(pupil, samples)
+        return glass_of(stack, tolerance, history=(f"hilstar optics zernike of {path.name}",))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def diffracted(pupil: Pupil, per_px: int) -> Stack:
+    """The PSFs of a pupil at its field points, wavelengths and focus positions. Raises InputError and MachineError."""
+    pupil_field = PupilField(pupil)
+    (width, height), middle = pupil.resolution_px, (np.array(pupil.resolution_px) - 1) / 2
+    columns, rows = (
+        np.linspace(0, size - 1, pupil.points) if pupil.points > 1 else [(size - 1) / 2] for size in (width, height)
+    )
+    images, places, facts = [], [], []
+    for x_px, y_px, nm, focus_um in product(columns, rows, sorted(set(pupil.wavelengths_nm)), sorted(set(pupil.focuses_um))):
+        off_px = np.array([x_px, y_px]) - middle
+        image, outside = psf_of(pupil, pupil_field(off_px, nm, focus_um), nm, per_px)
+        images.append(image)
+        places.append((x_px, y_px, nm, focus_um))
+        slope2 = (pupil.pixel_pitch_um * 1e-3 / pupil.focal_length_mm) ** 2 * (off_px @ off_px)
+        lateral_px = pupil.lateral_per_nm * (nm - pupil.reference_nm) * off_px
+        facts.append(((1 + slope2) ** -2 if pupil.cos4 else 1.0, outside, *lateral_px))
+    return Stack(np.array(images), np.array(places), np.array(facts), per_px)
+
+
+class PupilField:
+    """The complex field of a pupil (PUPIL, PUPIL) at a place of the image, a wavelength and a focus."""
+
+    def __init__(self, pupil: Pupil) -> None:
+        zernike = _poppy().zernike
+        self._pupil = pupil
+        self._amplitude = aperture(pupil)
+        at = (np.arange(PUPIL) + 0.5) / PUPIL * 2 - 1
+        self._x, self._y = np.meshgrid(at, at)
+        self._r2 = self._x**2 + self._y**2
+        polar = {"rho": np.minimum(np.sqrt(self._r2), 1.0), "theta": np.arctan2(self._y, self._x), "outside": 0.0}
+        nolls = {term.noll for term in pupil.terms if term.kind == "zernike"}
+        self._zernikes: dict[int, FloatArray] = {j: zernike.zernike1(j, **polar) for j in nolls}
+
+    def __call__(self, off_px: FloatArray, nm: float, focus_um: float) -> FloatArray:
+        """The field at a place, px from the image's middle. Raises InputError where its samples are too coarse."""
+        pupil = self._pupil
+        radius = float(np.hypot(*off_px)) / (float(np.hypot(*pupil.resolution_px)) / 2)
+        direction = off_px / max(float(np.hypot(*off_px)), 1e-12)
+        along = self._x * direction[0] + self._y * direction[1]
+        wave_nm = 1e3 * focus_um / 8 * (pupil.aperture_mm / pupil.focal_length_mm) ** 2 * self._r2
+        for term in pupil.terms:
+            size_nm = term.nm + term.per_nm * (nm - pupil.reference_nm)
+            match term.kind:
+                case "zernike":
+                    wave_nm = wave_nm + size_nm * radius**term.field_power * self._zernikes[term.noll]
+                case "W020":
+                    wave_nm = wave_nm + size_nm * self._r2
+                case "W040":
+                    wave_nm = wave_nm + size_nm * self._r2**2
+                case "W131":
+                    wave_nm = wave_nm + size_nm * radius * self._r2 * along
+                case "W222":
+                    wave_nm = wave_nm + size_nm * radius**2 * along**2
+                case "W220":
+                    wave_nm = wave_nm + size_nm * radius**2 * self._r2
+        lit = self._amplitude > 0
+        steps = [np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(initial=0.0) / nm for k in (0, 1)]
+        if max(steps) > MAX_STEP_WAVES:
+            raise InputError(
+                f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g} waves from one of {PUPIL} "
+                "pupil samples to the next; write smaller coefficients or focus positions"
+            )
+        return np.asarray(self._amplitude * np.exp(2j * np.pi / nm * wave_nm))
+
+
+def aperture(pupil: Pupil) -> FloatArray:
+    """How much of each of the pupil's samples (PUPIL, PUPIL) is open, 0 to 1."""
+    at = (np.arange(PUPIL * FINER) + 0.5) / (PUPIL * FINER) * 2 - 1
+    x, y = np.meshgrid(at, at)
+    r2 = x * x + y * y
+    is_open = (r2 <= 1) & (r2 >= pupil.obstruction**2)
+    half = pupil.spider_width_mm / pupil.aperture_mm
+    for k in range(pupil.spiders):
+        angle = math.radians(pupil.spider_angle_deg + 360 * k / pupil.spiders)
+        along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+        is_open &= (np.abs(across) > half) | (along < 0)
+    return np.asarray(is_open.reshape(PUPIL, FINER, PUPIL, FINER).mean(axis=(1, 3)))
+
+
+def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[FloatArray, float]:
+    """The PSF of a pupil's field on the stamp's samples, and the share of its light outside of them.
+
+    poppy's transform keeps the light by Parseval's theorem; that of a sample at the pupil's edge is its open part. The kernel
+    is exp(+i), so that light goes against the slope of a leading wavefront, as rays do. Raises InputError for samples too
+    coarse for the diffraction.
+    """
+    side = 2 * pupil.half_px * per_px + 1
+    resolution_um = nm * 1e-3 * pupil.focal_length_mm / pupil.aperture_mm
+    step = pupil.pixel_pitch_um / per_px / resolution_um  # in units of wavelength / D
+    if step >= 1:
+        finest = math.ceil(2 * pupil.pixel_pitch_um / resolution_um)
+        raise InputError(f"{per_px} samples a pixel are too few for light of {nm:g} nm; write --oversampling {finest}")
+    transform = _poppy().matrixDFT.MatrixFourierTransform(centering="SYMMETRIC")
+    image = np.abs(transform.perform(field, side * step, side)) ** 2
+    return image, max(0.0, 1 - float(image.sum() / np.abs(field).sum()))
+
+
+def _poppy() -> Any:
+    try:
+        import poppy.matrixDFT
+        import poppy.zernike
+    except ImportError as error:
+        raise MachineError(f"hilstar optics zernike needs poppy: {CAN_INSTALL}") from error
+    return poppy

@@ -1,0 +1,196 @@
+"""Bodies that a camera sees as discs: what they hide, and the light that they add."""
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, Shear, disc_lights
+from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.sprites import Sprites
+from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
+from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
+# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85 px by 0.2 %.
+POINT_PX = 0.2
+HIDDEN = 0.005  # a star or a body is not drawn if less than this share of its light comes through
+MAX_POSES = 7  # camera poses at which a disc is drawn in a frame
+MAX_POSED_PX = 120  # a disc of a larger radius is drawn at one pose, in the middle of the time, which bounds the work
+# Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most 1.6 sigma apart.
+EXPOSED_PER_SIGMA = 1.0
+MAX_EXPOSED = 63
+LIMB_PLACES = 24  # places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
+LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested
+
+
+class BodyLayer:
+    """Bodies wider than POINT_PX as discs; narrower ones are points among the stars."""
+
+    def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
+        self.canvas, self._moving = canvas, moving
+        px_rad = canvas.camera.scales_px_rad()
+        self._px_sr, self._px_per_rad = px_rad[0] ** -2, px_rad[1]
+        self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before without what discs hide, and with the light of the discs, which ends up farthest first."""
+        discs = self._near(view)
+        if not discs:
+            return light
+        if view.exposed:
+            posed = self._exposed(view)
+        elif view.turns:
+            large = any(disc.radius_rad * self._px_per_rad > MAX_POSED_PX for disc in discs)
+            posed = self._turning(view, 1 if large else MAX_POSES)
+        else:
+            posed = self._still(view.icrs_to_image(self.canvas.camera))
+        lights = self._lights(discs, posed)
+        names = [disc.name for disc in reversed(discs)]
+        white_e_per_s = self.canvas.white_in(view)
+        return replace(
+            self.unhidden(light, stars, discs, view),
+            extended=(*light.extended, *itertools.chain.from_iterable(lights)),
+            discs=tuple(name for name, its in zip(names, lights, strict=True) if its),
+            over_white=tuple(name for name, its in zip(names, lights, strict=True) if self._clips(its, white_e_per_s)),
+        )
+
+    def on_image(self, view: View) -> list[Disc]:
+        """Discs that touch the image of a camera at rest, nearest first."""
+        camera, icrs_to_image = self.canvas.camera, view.icrs_to_image(self.canvas.camera)
+        lights = (DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view))
+        return [light.disc for light in lights if light.region(camera.resolution_px) is not None]
+
+    def alone(self, disc: Disc, view: View) -> tuple[ExtendedLight, ...]:
+        """The light of a disc that nothing covers, at rest."""
+        return tuple(self._lights([disc], self._still(view.icrs_to_image(self.canvas.camera)))[0])
+
+    def any_lights(self) -> tuple[ExtendedLight, ...]:
+        """Discs of several sizes in the middle of the image: for a driver that compiles a shader for each kind."""
+        ahead = np.array([0.0, 0.0, 1.0])
+        radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
+        discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
+        return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
+
+    def unhidden(self, light: Sprites, stars: Stars, discs: list[Disc], view: View) -> Sprites:
+        """Sprites as seen past `discs` and through their air, without those of the discs themselves."""
+        which, first = light.star, len(stars) - len(self._moving.names)
+        through, directions = np.ones(len(which)), stars.directions(which)
+        # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds those that nothing hides.
+        satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
+        point = np.flatnonzero(which >= first)
+        far_km = self._moving.distances_km(*view.observer)[which[point] - first] if len(point) else np.empty(0)
+        for disc in discs:
+            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
+            near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
+            near[point[far_km <= disc.distance_km]] = False  # itself among them
+            near[satellite] = False
+            behind = np.flatnonzero(near)
+            if len(behind):
+                through[behind] *= disc.transmission(directions[behind])
+        through[np.isin(light.star, disc_stars(stars, (disc.name for disc in discs)))] = 0.0
+        kept = through >= HIDDEN
+        if kept.all() and (through == 1).all():
+            return light
+        data = light.data[kept]
+        data["electrons_per_s"] *= through[kept].astype(np.float32)
+        return replace(light, data=data, star=light.star[kept], x_px=light.x_px[kept], y_px=light.y_px[kept])
+
+    def _near(self, view: View) -> list[Disc]:
+        """Discs that may be on the image at some time of a view, and that no other hides, nearest first."""
+        reach_rad, wide_rad = self._reach_rad, POINT_PX / self._px_per_rad
+        if view.turns:
+            reach_rad += view.turn.speed_rad_s * (view.scan.whole_s / 2 if view.exposed else view.scan.longest_s)
+        axis = view.icrs_to_image(self.canvas.camera)[2]
+        found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
+        kept = []
+        for k, disc in enumerate(found):
+            places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
+            through = np.ones(len(places))
+            for nearer in found[:k]:
+                through *= nearer.transmission(places)
+            if through.max() >= HIDDEN:
+                kept.append(disc)
+        return kept
+
+    def _still(self, icrs_to_image: FloatArray) -> DiscView:
+        return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
+
+    def _exposed(self, view: View) -> DiscView:
+        """The camera during an exposure: poses that follow one another along its turn, all with the exposure's mean light."""
+        camera, exposure_s = self.canvas.camera, view.scan.hold_s
+        length_sigma = view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
+        place, weight = gauss_legendre(count)
+        maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
+        poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
+        return DiscView(camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera))
+
+    def _turning(self, view: View, max_poses: int) -> DiscView:
+        """The camera while a screen's rows light up one after the other, each held for a time."""
+        camera, scan = self.canvas.camera, view.scan
+        turn, _ = slowed(view.turn, scan, camera)
+        length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        count = 1
+        if length_sigma > POINT_SIGMA:
+            count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)  # odd: one is in the middle
+        place, weight = gauss_legendre(count)
+        times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
+        attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
+        poses = tuple(Pose(camera.cam_to_image @ to_matrix(q), share) for q, share in attitudes)
+        return DiscView(camera, self.canvas.psf, poses, _shear(scan, turn.rate_cam_rad_s, camera))
+
+    def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
+        """The light of each of some discs, which are nearest first, in the order in which they are drawn."""
+        ordered = reversed([*enumerate(discs, 1)])
+        return [disc_lights(disc, posed, covers=k < len(discs)) for k, disc in ordered]
+
+    def _clips(self, lights: list[ExtendedLight], white_e_per_s: float) -> bool:
+        """Whether a disc's lights have more than white in a pixel; a large disc is tested at a lattice of places."""
+        if not math.isfinite(white_e_per_s):
+            return False
+        brightest = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
+        large = [light for light in lights if isinstance(light, DiscLight)]
+        if large:
+            brightest = self._px_sr * self._brightest(large[len(large) // 2])
+        return brightest > white_e_per_s
+
+    def _brightest(self, light: DiscLight) -> float:
+        """The largest radiance at a lattice of places of a large disc that are on the image."""
+        camera = self.canvas.camera
+        region = light.region(camera.resolution_px)
+        if region is None:
+            return 0.0
+        left, top, width, height = region
+        x, y = np.meshgrid(np.linspace(left, left + width - 1, LATTICE), np.linspace(top, top + height - 1, LATTICE))
+        u, v = camera.tangents(x.ravel(), y.ravel())
+        seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
+        # And of its lit face: a crescent may lie between those of the lattice
+        places, _ = light.disc.points(LATTICE)
+        on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
+        of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
+        return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
+
+
+def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | None:
+    """What the turn of a camera does to an image whose rows are lit one after the other."""
+    if not scan.scanout_s:
+        return None
+    late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
+    middle = tuple((size - 1) / 2 for size in camera.resolution_px)
+    return Shear(camera.cam_to_image @ rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
+
+
+def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:
+    """The places of discs among `stars`, whose last are the bodies."""
+    last_first = stars.bodies[::-1]  # a satellite may have a body's name; satellites come before
+    return np.array([len(stars) - 1 - last_first.index(name) for name in names], dtype=np.intp)

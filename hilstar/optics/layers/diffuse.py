@@ -1,0 +1,174 @@
+"""Light that stands on the sky, as `[sky.diffuse]` has it: a map of it for each view, where it is bright enough to be seen.
+
+The image is divided into cells. What the map has in a cell decides whether it is drawn; each group of cells that touch becomes
+a map of light. Places in the map are exact at the cells' corners and linear between them. A pixel has the map's value in its
+middle, spread by a round Gaussian of the PSF's variance, times its solid angle. The camera's turn within a frame, which changes
+smooth light little, is left out.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray
+from hilstar.basics.rotation import normalise, to_matrix
+from hilstar.optics.camera import linear_shares
+from hilstar.optics.extended import LightMap
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.sprites import Sprites
+from hilstar.sky.diffuse import TangentImage
+from hilstar.sky.stars import Stars
+
+CELL_PX = 16
+ON_EDGE_PX = 0.01
+MOVED_PX = 0.25  # at most, by taking one attitude for a cell of them
+
+
+class DiffuseLayer:
+    """The light of tangent images in electrons/s/sr; of a monitor only cells that pass its first step in a pixel."""
+
+    def __init__(self, images: tuple[TangentImage, ...], canvas: Canvas) -> None:
+        self._camera, self._faintest = canvas.camera, canvas.first_step_e_per_s
+        camera = canvas.camera
+        finest_rad, coarsest_rad = (1 / scale for scale in reversed(camera.scales_px_rad()))
+        width, height = camera.resolution_px
+        self._counts = -(-width // CELL_PX) + 1, -(-height // CELL_PX) + 1
+        self._across, self._down = map(linear_shares, camera.resolution_px, self._counts)
+        places, shape = camera.grid_px(self._counts), self._counts[::-1]
+        rays = camera.rays(*places).reshape(*shape, 3)
+        self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        self._sr = np.nan_to_num(camera.pixel_sr(*places)).reshape(shape)
+        least = self._faintest / self._sr.max()
+        sigma_px = math.sqrt(math.fsum(canvas.psf.variance_px2) / 2)
+        seen = [one.seen_by(finest_rad, sigma_px) for one in images]
+        self._brightest = max((float(one.image.max() * self._sr.max()) for one in seen), default=0.0)
+        self._faces = [_Face(one, coarsest_rad, least) for one in seen if one.image.max() > least]
+        self._middles = np.array([face.middle for face in self._faces]).reshape(-1, 3)
+        reach_rad = math.acos(float(np.nanmin(self._rays[..., 2])))
+        radii_rad = np.arccos([face.cos_radius for face in self._faces])
+        self._cos_reach = np.cos(np.minimum(radii_rad + reach_rad, np.pi))
+        # Half a step of each component turns by twice that, and moves the image's farthest pixel.
+        lever_px = math.hypot(*camera.resolution_px, camera.focal_length_px)
+        self._cell_q = MOVED_PX / (2 * lever_px) if self._faintest else 0.0
+        self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before, and the map's; a screen's is that of its attitude's cell, and the same objects within a cell."""
+        cell = view.q_icrs_to_cam
+        if self._cell_q:
+            cell = np.rint(cell * np.sign(cell[np.argmax(np.abs(cell))]) / self._cell_q) * self._cell_q
+        if self._kept is None or not np.array_equal(cell, self._kept[0]):
+            icrs_to_cam = to_matrix(normalise(cell))
+            near = [self._faces[k] for k in np.flatnonzero(self._middles @ icrs_to_cam[2] >= self._cos_reach)]
+            faces_of_cube = sum(face.is_of_cube for face in near)
+            taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool) if faces_of_cube > 1 else None
+            lit = (self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near)
+            self._kept = cell, tuple(itertools.chain.from_iterable(lit))
+        maps = self._kept[1]
+        return replace(light, extended=(*light.extended, *maps)) if maps else light
+
+    def line(self) -> str:
+        """How bright it is on a monitor."""
+        steps = self._brightest / (self._faintest or math.inf)
+        drawn = "is drawn where it passes one" if steps > 1 else "is not drawn; the virtual tracker has it"
+        return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
+
+    def _lit(self, face: "_Face", icrs_to_cam: FloatArray, taken: BoolArray | None) -> list[LightMap]:
+        """The map of each group of cells that have light at an attitude.
+
+        Pixels (h, w) that another face has `taken` are left out, and those of this one are noted.
+        """
+        from scipy.ndimage import find_objects, label, map_coordinates
+
+        near = self._rays @ (icrs_to_cam @ face.middle) >= face.cos_radius
+        lit = [np.flatnonzero(near.any(axis=axis)) for axis in (1, 0)]
+        if min(map(len, lit)) < 2:  # no whole cell: its light is two cells and more beside the image
+            return []
+        around = tuple(slice(int(one[0]), int(one[-1]) + 1) for one in lit)
+        x_px, y_px = face.image.places_px(self._rays[around] @ icrs_to_cam)
+        bright = face.most_at(x_px, y_px) * self._sr[around] > self._faintest
+        cells = bright[:-1, :-1] | bright[1:, :-1] | bright[:-1, 1:] | bright[1:, 1:]
+        groups, _ = label(cells)
+        found = []
+        for number, box in enumerate(find_objects(groups), start=1):
+            part = self._part(box, around, groups[box] == number)
+            x, y, sr = (part.spread(of) for of in (x_px, y_px, self._sr[around]))
+            if taken is not None:
+                part.keep(face.holds(x, y), taken)
+            image = map_coordinates(face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32)
+            found.append(LightMap(image * sr * part.own, part.corner_px, bv_mag=face.image.bv_mag))
+        return found
+
+    def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> "_Part":
+        """The pixels of a box of cells, counted from the first ones `around`, of which some are `own`."""
+        first = [part.start + whole.start for part, whole in zip(box, around, strict=True)]
+        rows, columns = (
+            np.ceil(np.arange(at, at + part.stop - part.start + 1) * size / (count - 1) - 0.5).astype(int)
+            for at, part, size, count in zip(first, box, self._camera.resolution_px[::-1], self._counts[::-1], strict=True)
+        )
+        return _Part(
+            (int(columns[0]), int(rows[0])),
+            tuple(slice(part.start, part.stop + 1) for part in box),
+            self._down[rows[0] : rows[-1], first[0] : first[0] + len(rows)].astype(np.float32),
+            self._across[columns[0] : columns[-1], first[1] : first[1] + len(columns)].astype(np.float32),
+            np.repeat(np.repeat(own, np.diff(rows), axis=0), np.diff(columns), axis=1),
+        )
+
+
+@dataclass(slots=True)
+class _Part:
+    """A rectangle of an image: its first pixel, its cells' corners, their shares in its rows and columns, which are its own."""
+
+    corner_px: tuple[int, int]
+    nodes: tuple[slice, ...]
+    down: Float32Array
+    across: Float32Array
+    own: BoolArray
+
+    def spread(self, at_corners: FloatArray) -> Float32Array:
+        """Values at all cells' corners, interpolated to this part's pixels."""
+        return np.asarray(self.down @ np.nan_to_num(at_corners[self.nodes]).astype(np.float32) @ self.across.T)
+
+    def keep(self, held: BoolArray, taken: BoolArray) -> None:
+        """Leave pixels that are not `held` here or `taken` before, and take the others, in an image's `taken` (h, w)."""
+        (left, top), (rows, columns) = self.corner_px, self.own.shape
+        here = taken[top : top + rows, left : left + columns]
+        self.own &= held & ~here
+        here |= self.own
+
+
+class _Face:
+    """A tangent image, and the most light that any place has within a cell of it.
+
+    What has more light than `least` is within a radius of the direction `middle` (3,), ICRS, cells that touch it included.
+    """
+
+    def __init__(self, image: TangentImage, px_rad: float, least: float) -> None:
+        from scipy.ndimage import maximum_filter
+
+        self.image = image
+        self.middle_px, self.is_of_cube = (len(image.image) - 1) / 2, math.isfinite(image.max_tangent)
+        # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's corner
+        self._reach_px = math.ceil(CELL_PX * px_rad * image.px_per_tangent * 3 * math.sqrt(2)) + 1
+        rows, columns = np.nonzero(image.image > least)
+        lit = np.stack([columns - self.middle_px, rows - self.middle_px, np.full(len(rows), image.px_per_tangent)], axis=-1)
+        lit = (lit / np.linalg.norm(lit, axis=1, keepdims=True)) @ image.axes
+        self.middle = lit.mean(axis=0)
+        self.middle /= np.linalg.norm(self.middle)
+        radius_rad = math.acos(np.clip((lit @ self.middle).min(), -1.0, 1.0)) + 3 * CELL_PX * px_rad
+        self.cos_radius = math.cos(min(radius_rad, math.pi))
+        self.most = maximum_filter(np.pad(image.image, self._reach_px), 2 * self._reach_px + 1, mode="constant")
+
+    def most_at(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """The most light near places; none at NaN."""
+        size = len(self.most)
+        x, y = (np.nan_to_num(np.rint(at) + self._reach_px, nan=-1.0) for at in (x_px, y_px))
+        inside = (x >= 0) & (y >= 0) & (x < size) & (y < size)
+        return np.where(inside, self.most[(y * inside).astype(np.intp), (x * inside).astype(np.intp)], 0.0)
+
+    def holds(self, x_px: Float32Array, y_px: Float32Array) -> BoolArray:
+        """Which places are not beyond its edge, or hardly: two faces both hold a place on their edge."""
+        half_px = self.image.max_tangent * self.image.px_per_tangent + ON_EDGE_PX
+        return np.asarray((np.abs(x_px - self.middle_px) <= half_px) & (np.abs(y_px - self.middle_px) <= half_px))

@@ -1,0 +1,139 @@
+"""The faults that are on in one image: what they do to its view and to its light, and whether it is shown at all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.extended import DiscLight, LightMap
+from hilstar.optics.layers.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now, StarGone
+from hilstar.optics.layers.fault_light import FaultView
+from hilstar.optics.layers.layers import no_light
+from hilstar.optics.layers.view import View
+from hilstar.optics.sprites import AddedLight, Sprites, with_sprites
+from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars
+
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+FRAME_SEED = 1  # beside the number of a frame
+
+
+@dataclass(frozen=True, slots=True)
+class FaultLayer:
+    """The faults that are on in one image of one camera: the last layer."""
+
+    view: FaultView
+    now: tuple[Now, ...] = ()
+
+    def _has(self, kind: type[Fault]) -> bool:
+        return any(isinstance(one.fault, kind) for one in self.now)
+
+    @property
+    def blank(self) -> bool:
+        """Whether there is no light at all."""
+        return self._has(Blank)
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the last frame stays."""
+        return self._has(Freeze)
+
+    def drops(self, frame: int) -> bool:
+        """Whether frame number `frame` is never shown."""
+        return any(
+            one.fault.share == 1 or self.view.rng(one.fault.name, FRAME_SEED, frame).random() < one.fault.share
+            for one in self.now
+            if isinstance(one.fault, Drop)
+        )
+
+    def turned(self, view: View) -> View:
+        """The view that is shown in place of another: its attitude, and its rate in the axes of the camera as turned."""
+        if not self._has(AttitudeStep):
+            return view
+        q, step = view.q_icrs_to_cam, NO_TURN
+        for one in self.now:
+            if isinstance(one.fault, AttitudeStep):
+                turn_rad = np.array(one.fault.turn_rad)
+                q, step = propagate(q, turn_rad, 1.0), propagate(step, turn_rad, 1.0)
+        rate = view.rate_cam_rad_s
+        return replace(view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate)
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before without the stars that faults take away, and with the light that they add."""
+        by, now = self.view, self.now
+        if self.blank:
+            return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
+        gone = by.gone(now, stars)
+        if gone:
+            removed = {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star}
+            light = _without_discs(_dimmed(light, gone), removed)
+        directions, named = by.sky_points(now, stars)
+        chains, lines = by.camera_points(now, None if view.rate_cam_rad_s is None else view.scan)
+        surfaces = by.surfaces(now, view.q_icrs_to_cam)
+        parts = by.footprints(chains)
+        if named:
+            drawn = by.by.points.add(no_light(light.footprint_px), few_stars(directions, named, stars), view)
+            parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
+        if parts:
+            longest = (int(np.unique(part.star, return_counts=True)[1].max(initial=1)) for part in parts)
+            per_star = max(light.per_star, *(part.per_star for part in parts), *longest)
+            light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
+        return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
+
+
+def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
+    """Sprites without some stars, or with a share of their light."""
+    data, kept = sprites.data, np.ones(len(sprites), dtype=bool)
+    for star, left in gone:
+        its = sprites.star == star
+        if left <= 0:
+            kept &= ~its
+        elif its.any():
+            data = data.copy()
+            data["electrons_per_s"][its] *= np.float32(left)
+    whole = replace(sprites, data=data)
+    if kept.all():
+        return whole
+    return replace(whole, data=data[kept], star=sprites.star[kept], x_px=sprites.x_px[kept], y_px=sprites.y_px[kept])
+
+
+def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
+    """Sprites whose discs of some bodies are dark, or have a share of their light; what they hide stays hidden."""
+    if not any(name in gone for name in sprites.discs):
+        return sprites
+    lights = tuple(
+        replace(light, times=light.times * gone[light.name])
+        if isinstance(light, LightMap | DiscLight) and light.name in gone
+        else light
+        for light in sprites.extended
+    )
+    discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)
+    return replace(sprites, extended=lights, discs=discs, over_white=tuple(n for n in sprites.over_white if n in discs))
+
+
+def few_stars(vectors: FloatArray, lights: Sequence[AddedLight], like: Stars) -> Stars:
+    """Stars of a frame's own at ICRS directions (n, 3), for the observer of `like`."""
+    count = len(lights)
+    order = np.arange(count)
+    grid = CellGrid(
+        order=order,
+        start=order,
+        count=np.ones(count, dtype=np.intp),
+        centre=vectors,
+        cos_radius=np.full(count, np.cos(BODY_CELL_RAD)),
+        sin_radius=np.full(count, np.sin(BODY_CELL_RAD)),
+    )
+    return Stars(
+        hip=np.zeros(count, dtype=np.int32),
+        vectors=vectors,
+        v_mag=np.array([light.v_mag for light in lights]),
+        bv_mag=np.array([light.bv_mag for light in lights]),
+        temperature_k=np.full(count, np.nan),
+        electrons_per_s=np.array([light.electrons_per_s for light in lights]),
+        grid=grid,
+        catalog=like.catalog,
+        row=np.full(count, -1),
+        velocity_km_s=like.velocity_km_s,
+        bodies=tuple(light.name for light in lights),
+    )

@@ -1,0 +1,104 @@
+"""The light of a view: stars, then diffuse light, bodies, then satellites, then faults."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+from hilstar.optics.exposure_motion import MIDDLE_S, smeared_sprites
+from hilstar.optics.frame_motion import swept_sprites
+from hilstar.optics.layers.bodies import BodyLayer
+from hilstar.optics.layers.view import Canvas, Layer, View
+from hilstar.optics.sprites import Candidates, Sprites, join_sprites, make_sprites, with_sprites
+from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+    from hilstar.sky.diffuse import TangentImage
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """The light of a bench's sky beside its stars.
+
+    That is bodies, satellites and the observer (`moving`, None where the sky stands still), and `diffuse` light, e-/s/sr.
+    """
+
+    moving: "MovingSky | None" = None
+    diffuse: "tuple[TangentImage, ...]" = ()
+
+
+NO_SOURCES = Sources()
+
+
+def seen_in(view: View, stars: Stars, moving: "MovingSky | None") -> Stars:
+    """A bench's stars as a view has them; bodies are moved to their places in the arrays of `stars`."""
+    return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
+
+
+def sky_layers(
+    canvas: Canvas,
+    sources: Sources = NO_SOURCES,
+    faintest_e_per_s: float = 0.0,
+    frequent: Stars | None = None,
+    *,
+    paths: bool = True,
+) -> tuple[Layer, ...]:
+    """The layers of the sky: a bench's stars, diffuse light, bodies, and satellites of at least `faintest_e_per_s`.
+
+    For `frequent` and `paths` see `StarLayer`.
+    """
+    layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
+    if sources.diffuse:
+        from hilstar.optics.layers.diffuse import DiffuseLayer  # its libraries take 30 ms, which only a map needs
+
+        layers.append(DiffuseLayer(sources.diffuse, canvas))
+    moving = sources.moving
+    if moving is not None and moving.names:
+        layers.append(BodyLayer(moving, canvas))
+    if moving is not None and moving.satellites is not None:
+        from hilstar.optics.layers.satellites import SatelliteLayer
+
+        layers.append(SatelliteLayer(moving, canvas, faintest_e_per_s))
+    return tuple(layers)
+
+
+def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> Sprites:
+    """The light of a view, layer by layer; `stars` are as seen in it (see `seen_in`)."""
+    light = no_light(canvas.psf.footprint_px)
+    for layer in layers:
+        light = layer.add(light, stars, view)
+    return light
+
+
+@cache
+def no_light(footprint_px: int) -> Sprites:
+    """The light of no layer."""
+    return join_sprites([], footprint_px)
+
+
+@dataclass(frozen=True, slots=True)
+class StarLayer:
+    """Stars: points where the camera is at rest or without `paths`, otherwise each along its path while light arrives.
+
+    The stars `frequent` are drawn in most frames: those near the field are kept from one frame to the next.
+    """
+
+    canvas: Canvas
+    frequent: Stars | None = None
+    paths: bool = True
+    candidates: Candidates = field(default_factory=Candidates, repr=False)
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before, with a sprite or a chain of sprites for each star on the image."""
+        canvas, camera = self.canvas, self.canvas.camera
+        if self.paths and view.exposed and view.rate_cam_rad_s is not None:
+            made = smeared_sprites(stars, view.motion, camera, canvas.psf, view.scan)
+        elif self.paths and view.turns and not view.exposed:
+            made = swept_sprites(stars, view.turn, view.scan, camera, canvas.psf)
+            made = replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
+        else:
+            icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
+            candidates = self.candidates if stars is self.frequent else None
+            made = make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
+        return with_sprites(light, [made]) if light.extended or len(light.data) else made

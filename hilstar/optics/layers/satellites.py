@@ -1,0 +1,119 @@
+"""Satellites in an image: each a streak along its path, a disc where it is wide enough to have a face."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.optics.frame_motion import slowed
+from hilstar.optics.layers.bodies import POINT_PX
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.sprites import Sprites
+from hilstar.optics.trails import EVERY, Brush, Lit, TrailView, disc_of, disc_trail, hidden, trails, wide, with_trails
+from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.disc import Disc
+    from hilstar.sky.bodies.moving import MovingSky
+    from hilstar.sky.bodies.passes import Pass, Satellites
+
+# Limits of the work: sprites of all satellites together in a frame (the cost of 60 stars' paths of 16 px) and in an exposure,
+# and poses of one disc.
+FRAME_SPRITES, EXPOSURE_SPRITES = 1000, 200_000
+FRAME_POSES, EXPOSURE_POSES = 33, 500
+ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
+
+
+@dataclass(frozen=True, slots=True)
+class SatelliteLayer:
+    """The satellites of a sky of at least `faintest_e_per_s` in an image."""
+
+    moving: "MovingSky"
+    canvas: Canvas
+    faintest_e_per_s: float = 0.0
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before and that of the satellites in the image, which are written into the arrays of `stars`."""
+        canvas, satellites = self.canvas, self.moving.satellites
+        rows, turn = view.rows, view.turn
+        if not view.exposed:
+            turn, _ = slowed(turn, view.scan, canvas.camera)
+        longest_s = max(abs(view.begin_s), rows.longest_s)  # between the moment of the attitude and any light
+        margin_px = canvas.psf.footprint_px / 2 + 1
+        reach_rad = canvas.camera.field_radius_rad(margin_px) + turn.speed_rad_s * longest_s
+        seen = self._passing(view, reach_rad, longest_s)
+        if seen is None or satellites is None:
+            return light
+        icrs_to_image = view.icrs_to_image(canvas.camera)
+        path = TrailView(canvas.camera, icrs_to_image, canvas.camera.cam_to_image @ turn.rate_cam_rad_s, stars.velocity_km_s)
+        close = path.in_reach(seen, longest_s, margin_px)
+        if not len(close):
+            return light
+        seen, brush = seen.only(close), self._brush(view)
+        if satellites.sized:
+            broad = wide(seen, canvas.camera.scales_px_rad()[1], POINT_PX)
+            if broad.any():
+                wide_ones = seen.only(np.flatnonzero(broad))
+                light = self._with_discs(light, stars, wide_ones, path, view)
+                seen = seen.only(np.flatnonzero(~broad))
+        found = trails(seen, path, self._lit(seen, path, view), brush, self.faintest_e_per_s)
+        if not len(found.index):
+            return light
+        satellites.write(stars, found.index, found.middle, found.electrons_per_s)
+        return with_trails(light, found, len(stars) - len(stars.bodies))
+
+    def discs(self, stars: Stars, view: View) -> "list[Disc]":
+        """The satellites in the image of a camera at rest that are discs."""
+        satellites = self.moving.satellites
+        if satellites is None or not satellites.sized:
+            return []
+        seen = self._passing(view, self.canvas.camera.field_radius_rad(0.0), 0.0, faintest_e_per_s=0.0)
+        if seen is None:
+            return []
+        broad = np.flatnonzero(wide(seen, self.canvas.camera.scales_px_rad()[1], POINT_PX))
+        names = satellites.names
+        return [disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s) for k in broad.tolist()]
+
+    def _passing(self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None) -> "Pass | None":
+        """The satellites that may be within `reach_rad` of the boresight; None for none."""
+        from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
+
+        axis = view.icrs_to_image(self.canvas.camera)[2]
+        faintest = self.faintest_e_per_s if faintest_e_per_s is None else faintest_e_per_s
+        return self.moving.passing(Cone(axis, reach_rad, longest_s, faintest), *view.observer)
+
+    def _brush(self, view: View) -> Brush:
+        most, poses = (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
+        return Brush(self.canvas.psf, most, poses)
+
+    def _lit(self, seen: "Pass", path: TrailView, view: View) -> Lit:
+        """When each satellite's row is lit."""
+        rows, late_s = view.rows, np.zeros(len(seen))
+        for _ in range(ROW_ROUNDS if rows.scanout_s else 0):
+            x_px, y_px = path.places_px(seen, EVERY, late_s)
+            late_s = np.nan_to_num(rows.late_s(x_px, y_px, self.canvas.camera.resolution_px))
+        return Lit(view.begin_s + late_s, rows.hold_s)
+
+    def _with_discs(self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View) -> Sprites:
+        """The light before with satellites as discs, the farthest first, and without what they hide."""
+        satellites: Satellites | None = self.moving.satellites
+        if satellites is None:
+            return light
+        lit, drawn = self._lit(seen, path, view), []
+        for k in np.argsort(-np.linalg.norm(seen.seen_km[0], axis=1)):
+            own = Lit(lit.begin_s[[k]], lit.length_s)
+            name = satellites.names[seen.index[k]]
+            found = disc_trail(seen.only(np.array([k])), name, path, own, self._brush(view))
+            if found is not None:
+                drawn.append(found)
+                light = hidden(light, stars.directions(light.star), found)
+        index, rates = np.array([one.index for one in drawn], dtype=np.intp), np.array([one.electrons_per_s for one in drawn])
+        satellites.write(stars, index, np.array([one.middle for one in drawn]).reshape(-1, 3), rates)
+        white_e_per_s = self.canvas.white_in(view)
+        names = tuple(one.along[0].name for one in drawn)
+        return replace(
+            light,
+            extended=(*light.extended, *(part for one in drawn for part in one.lights)),
+            discs=(*light.discs, *names),
+            over_white=(*light.over_white, *(one.along[0].name for one in drawn if one.brightest_e_per_s > white_e_per_s)),
+        )

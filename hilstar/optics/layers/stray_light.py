@@ -1,0 +1,124 @@
+"""Stray light over an image: a gradient and a measured map, as one camera sees them.
+
+Both are computed once, in the camera's own pixels: what each collects of the light of a tracker pixel.
+"""
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.errors import InputError, cannot_read
+from hilstar.basics.fits_headers import read_fits_image
+from hilstar.basics.image_files import ImageSizeError, is_fits, npy_array, opened_picture
+from hilstar.basics.reading import read_bytes
+from hilstar.optics.camera import Camera
+from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
+
+GRID_PX = 8  # a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
+MAX_FILE_BYTES = 200_000_000
+MAX_SIDE_PX = 16_384
+MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
+
+
+def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32Array:
+    """Electrons per second of each camera pixel (h, w) where the brightest corner of the detector has 1 in a tracker pixel."""
+    x_px, y_px, area = pixels_in(camera, tracker)
+    width, height = tracker.resolution_px
+    right, down = math.cos(math.radians(fault.towards_deg)), math.sin(math.radians(fault.towards_deg))
+    extent_px = abs(right) * width + abs(down) * height
+    rise = 0.5 + ((x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down) / extent_px
+    return as_light(np.maximum(rise, 0.0) * area)
+
+
+def map_image(values: FloatArray, fault: MeasuredMap, camera: Camera, source: Camera) -> Float32Array:
+    """Electrons per second of each camera pixel (h, w) of a map over the whole image of `source`; nothing outside it."""
+    from scipy.ndimage import map_coordinates
+
+    x_px, y_px, area = pixels_in(camera, source)
+    width, height = source.resolution_px
+    rows, columns = values.shape
+    inside = source.contains_px(x_px, y_px)
+    place = np.stack([(y_px + 0.5) * rows / height - 0.5, (x_px + 0.5) * columns / width - 0.5])
+    found = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
+    return as_light(np.where(inside, found * area, 0.0))
+
+
+def as_light(image: FloatArray) -> Float32Array:
+    """A map for the renderer: places without one are dark."""
+    return np.ascontiguousarray(np.nan_to_num(image, nan=0.0, posinf=0.0), dtype=np.float32)
+
+
+class PixelsIn(NamedTuple):
+    """Where each pixel of a camera is in another's pixels, and how many of those it covers: (h, w) each, NaN for nowhere."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    area: FloatArray
+
+
+def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
+    """Where each pixel of `camera` is in `other`'s pixels."""
+    width, height = camera.resolution_px
+    if camera is other:
+        y, x = np.mgrid[0:height, 0:width].astype(np.float64)
+        return PixelsIn(x, y, np.ones((height, width)))
+    from scipy.interpolate import RectBivariateSpline
+
+    across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
+    x, y = np.meshgrid(across, down)
+    places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
+    if not all(np.isfinite(place).all() for place in places):
+        rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
+        seen = other.pixels_from(camera, columns.ravel(), rows.ravel())
+        seen_x, seen_y = (part.reshape(height, width) for part in seen)
+        (a, b), (c, d) = np.gradient(seen_x), np.gradient(seen_y)
+        return PixelsIn(seen_x, seen_y, np.abs(b * c - a * d))
+    along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
+    x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
+    x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
+    covered = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
+    return PixelsIn(*(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered)))
+
+
+def map_sha256(path: Path) -> str:
+    """The SHA-256 of a map's file. Raises InputError."""
+    return hashlib.sha256(read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)).hexdigest()
+
+
+def read_map(path: Path) -> FloatArray:
+    """The image (h, w) in a file, its first row at the top. Raises InputError for one that is no map of light."""
+    raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
+    values = _decoded(path, raw)
+    if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:
+        raise InputError(f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a side")
+    if values.dtype.kind not in "fiub":
+        raise InputError(f"{path}: values of type {values.dtype}; {MAP_ADVICE}")
+    image = values.astype(np.float64)
+    if not (np.isfinite(image).all() and image.min() >= 0):
+        raise InputError(f"{path}: a value is negative or not finite; give electrons per second, 0 or more")
+    if not image.max() > 0:
+        raise InputError(f"{path}: is dark everywhere; {MAP_ADVICE}")
+    return image
+
+
+def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
+    try:
+        if raw.startswith(b"\x93NUMPY"):
+            return npy_array(raw)
+        if raw.startswith(b"\x89PNG"):
+            with opened_picture(raw, formats=("PNG",)) as picture:
+                return np.asarray(picture)
+        if is_fits(raw):
+            return read_fits_image(raw).pixels
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {MAP_ADVICE}") from error
+    except Exception as error:  # each library raises its own for a damaged file
+        raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
+    raise cannot_read(path, "it is neither FITS, PNG nor npy", MAP_ADVICE)

@@ -1,0 +1,223 @@
+"""The truth of an image: which stars are in it, where, and how bright."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.rotation import to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.layers.bodies import disc_stars
+from hilstar.optics.sprites import Sprites
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
+from hilstar.sky.stars import Stars
+
+ERROR_DECIMALS = 4  # errors in a written table
+CHANNEL_COLUMNS = ("electrons_r_per_s", "electrons_g_per_s", "electrons_b_per_s")
+
+TRUTH_DTYPE = np.dtype(
+    [
+        ("hip", "i4"),
+        ("x_px", "f8"),
+        ("y_px", "f8"),
+        ("v_mag", "f8"),
+        ("bv", "f8"),
+        ("temperature_k", "f8"),
+        ("electrons_per_s", "f8"),
+        ("drawn", "?"),
+        ("clipped", "?"),
+        ("variable", "U1"),
+        ("range_mag", "f8"),
+        ("period_d", "f8"),
+        ("double", "U1"),
+        ("separation_arcsec", "f8"),
+        ("name", "U32"),
+        ("sigma_pos_mas", "f8"),
+        ("sigma_mag", "f8"),
+    ]
+)
+
+
+def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
+    """The rows of a table of TRUTH_DTYPE that clip: HIP numbers, or names without one."""
+    rows = truth[truth["clipped"]]
+    return [name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)]
+
+
+def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none clipped yet."""
+    truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
+    truth["hip"], truth["name"] = stars.hip[star], stars.names(star)
+    truth["x_px"], truth["y_px"] = x_px, y_px
+    truth["v_mag"], truth["bv"] = stars.v_mag[star], stars.bv_mag[star]
+    truth["temperature_k"] = stars.temperature_k[star]
+    truth["electrons_per_s"] = stars.electrons_per_s[star]
+    truth["drawn"] = True
+    truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
+    listed = stars.row[star] >= 0
+    row, catalog = stars.row[star[listed]], stars.catalog
+    truth["variable"][listed], truth["double"][listed] = catalog.variable[row], catalog.multiple[row]
+    for name in ("range_mag", "period_d", "separation_arcsec"):
+        truth[name] = np.nan
+        # Back to the catalogue's decimals from float32.
+        truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
+    return truth
+
+
+def with_columns(
+    truth: npt.NDArray[np.void], added: Mapping[str, npt.NDArray[Any]], rows: IntArray | None = None
+) -> npt.NDArray[np.void]:
+    """Rows (n,) with columns more, of values of all rows or of `rows` (k,); others have NaN or False."""
+    where = np.arange(len(truth)) if rows is None else rows
+    found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())])
+    for name in truth.dtype.names or ():
+        found[name] = truth[name]
+    for name, values in added.items():
+        found[name] = False if values.dtype == np.bool_ else np.nan
+        found[name][where] = values
+    return found
+
+
+def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> npt.NDArray[np.void]:
+    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares (n, 3) of a star's.
+
+    `colours` None, of a tracker with one channel: the rows themselves.
+    """
+    light = (
+        None
+        if colours is None
+        else dict(zip(CHANNEL_COLUMNS, (truth["electrons_per_s"] * part for part in colours.T), strict=True))
+    )
+    return truth if light is None else with_columns(truth, light)
+
+
+def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`, rms of its two axes.
+
+    Both stay NaN for bodies, and for stars that have no errors in their `catalog`, whose facts are
+    read here.
+    """
+    listed = np.flatnonzero(truth["hip"] > 0)
+    near = np.flatnonzero(np.isin(catalog.hip, truth["hip"][listed]))  # a tenth of the time that sorting a catalogue takes
+    order = near[np.argsort(catalog.hip[near])]
+    stars = catalog.taken(order[np.searchsorted(catalog.hip[order], truth["hip"][listed])])
+    facts = errors_of(stars)
+    covariance = motion_at(stars, facts, epoch_jyear).covariance
+    found = truth.copy()
+    found["sigma_pos_mas"][listed] = np.round(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS)
+    found["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
+    return found
+
+
+def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
+    """The stars of the sprites at positions `which` (n,), each once: HIP numbers, or names without one."""
+    star = np.unique(sprites.star[which])
+    added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
+    return (*stars.designations(star[star >= 0]), *added)
+
+
+def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
+    """The star of each sprite: its HIP number, or its name without one."""
+    found = iter(stars.designations(sprites.star[sprites.star >= 0]))
+    return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
+
+
+def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
+    """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped` are positions of sprites.
+
+    Light that a fault adds has a row too, with its name, at the middle of its sprites.
+    """
+    over = np.zeros(len(sprites), dtype=bool)
+    over[clipped] = True
+    own = sprites.star >= 0
+    star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
+    once, which = np.unique(star, return_inverse=True)
+    if len(once) < len(star):  # each star once, a satellite in the middle of its streak's light
+        light = sprites.data["electrons_per_s"][own].astype(np.float64)
+        total = np.bincount(which, light)
+        x_px, y_px = (np.bincount(which, light * places) / total for places in (x_px, y_px))
+        star = once
+    truth = truth_table(stars, star, x_px, y_px)
+    truth["clipped"] = over[own] if len(star) == own.sum() else np.isin(star, sprites.star[over])
+    if not sprites.added:
+        return truth, star
+    added = added_truth(sprites, over)
+    return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
+
+
+def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE for the light that faults add, by the index of each; `over` (n,) says which sprites clip."""
+    of_added = np.flatnonzero(sprites.star < 0)
+    star, line = np.unique(sprites.star[of_added], return_inverse=True)
+    light = sprites.data["electrons_per_s"][of_added].astype(np.float64)
+    rows = np.zeros(len(star), dtype=TRUTH_DTYPE)
+    total = np.bincount(line, light, minlength=len(star))
+    for name, places in (("x_px", sprites.x_px), ("y_px", sprites.y_px)):
+        rows[name] = np.bincount(line, light * places[of_added], minlength=len(star)) / total
+    for k, added in enumerate(sprites.added[-1 - index] for index in star.tolist()):
+        rows[k]["name"], rows[k]["v_mag"], rows[k]["bv"] = added.name, added.v_mag, added.bv_mag
+        rows[k]["electrons_per_s"] = added.electrons_per_s
+    for name in ("temperature_k", "range_mag", "period_d", "separation_arcsec", "sigma_pos_mas", "sigma_mag"):
+        rows[name] = np.nan
+    rows["drawn"] = True
+    rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class StarInView:
+    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from the boresight.
+
+    A body has a `name`, and 0 for `hip`.
+    """
+
+    hip: int
+    v_mag: float
+    ra_deg: float
+    dec_deg: float
+    constellation: str
+    x_px: float
+    y_px: float
+    from_boresight_deg: float
+    name: str
+
+
+def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
+    """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the brightest first.
+
+    `stars` are those of the light, as seen at the attitude.
+    """
+    found = np.union1d(light.star[light.star >= 0], disc_stars(stars, light.discs))
+    vectors = stars.directions(found)
+    cam = vectors @ to_matrix(q_icrs_to_cam).T
+    x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
+    inside = np.flatnonzero(camera.contains_px(x_px, y_px))
+    kept = inside[np.argsort(stars.v_mag[found[inside]], kind="stable")][:count]
+    found, cam, vectors, x_px, y_px = found[kept], cam[kept], vectors[kept], x_px[kept], y_px[kept]
+    off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
+    x, y, z = vectors.T
+    ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    constellations: list[str] = []
+    if len(found):
+        from astropy.coordinates import SkyCoord, get_constellation  # takes half a second, which only this needs
+
+        # IAU boundaries of 1930
+        constellations = [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]
+    columns = (
+        stars.hip[found].tolist(),
+        stars.v_mag[found].tolist(),
+        ra_deg.tolist(),
+        dec_deg.tolist(),
+        constellations,
+        x_px.tolist(),
+        y_px.tolist(),
+        np.degrees(off_rad).tolist(),
+        stars.names(found),
+    )
+    return [StarInView(*row) for row in zip(*columns, strict=True)]

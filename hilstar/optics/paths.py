@@ -1,0 +1,353 @@
+"""A star's path across the image as sprites: the part on the image, and the number of its Gauss-Legendre nodes.
+
+Paths of stars over a short turn as polynomials in time, through a few places that are exact.
+
+A place on such a path costs two short sums, where an exact one costs a rotation and, behind a real lens, a hundred operations.
+"""
+
+from bisect import bisect_left
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.optics.camera import Camera, Lens
+
+MAX_NODES = 64  # on one path: leggauss is an eigenvalue problem, 1 ms for 64 nodes and minutes for 10 000
+# A place may be off by the larger of these: px, and of the path's length within the turn. Either changes a pixel of a star of
+# sigma 0.5 px by 5e-4 of its flux, half of what the nodes may: the longer a path, the fainter it is.
+LIMIT_PX = 1e-3
+LIMIT_SHARE = 5e-4
+POINTS = (2, 3)
+# Through a lens one place, with slopes and curvature of the lens there, costs less than two exact ones and reaches farther.
+LENS_POINTS = (1, 3)
+TABLE_STEPS = 240  # across the wider side of a lens's table, which reaches BESIDE_TABLE of a side beyond the lens's box
+BESIDE_TABLE = 0.05
+TABLE_PX = LIMIT_PX / 2  # what a table may be off on the image
+WIDEST_TABLE = 2.5  # largest tangent: beyond it a path may begin behind the camera
+# Half a turn that 3 points draw through 350 mm and a strong lens with a field of degree 6: 0.29 deg, 28 deg/s at 60 Hz.
+MAX_HALF_TURN_RAD = 0.04
+NARROWER = 2**-0.25  # from one half turn that is tried to the next; the error falls with its power of the number of points
+TRIES = 40
+TRIED_PLACES, TRIED_MOMENTS = 13, 9  # along each side of the image, and within a turn
+TRIED_AXES = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (0.0, 1.0) if (x, y, z) != (0.0, 0.0, 0.0)]
+# A path may begin or end beyond what its lens is known for. Straight lines from there would put a kink into it.
+BEYOND_LENS = 1.05
+
+
+class NodeTable(NamedTuple):
+    """Gauss-Legendre nodes and weights over -1 to 1 for all counts to MAX_NODES, end to end; each count's begin at `first`."""
+
+    first: IntArray
+    places: FloatArray
+    weights: FloatArray
+
+
+@lru_cache(maxsize=1)
+def _node_table() -> NodeTable:
+    rules = [np.polynomial.legendre.leggauss(count) for count in range(1, MAX_NODES + 1)]
+    first = np.cumsum([0, 0, *range(1, MAX_NODES)])
+    return NodeTable(first, np.concatenate([nodes for nodes, _ in rules]), np.concatenate([weights for _, weights in rules]))
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """Nodes of several paths, end to end: the path of each, its place from -1 to 1 on it, and its share of the path's light."""
+
+    path: IntArray
+    place: FloatArray
+    share: FloatArray
+
+
+def nodes_of(counts: IntArray) -> Nodes:
+    """The Gauss-Legendre nodes of paths that have `counts` (n,) of them, each 0 to MAX_NODES."""
+    table = _node_table()
+    path = np.repeat(np.arange(len(counts)), counts)
+    begin = np.cumsum(counts) - counts
+    entry = np.arange(len(path)) + np.repeat(table.first[counts] - begin, counts)
+    return Nodes(path, table.places[entry], table.weights[entry] / 2)
+
+
+def within_budget(wanted: IntArray, extra: int) -> IntArray:
+    """The nodes (n,) that paths get of those they want: at most MAX_NODES each, and at most `extra` beyond one each.
+
+    What exceeds `extra` is reduced in proportion; a path that wants any keeps one.
+    """
+    counts = np.minimum(wanted, MAX_NODES)
+    beyond = np.maximum(counts - 1, 0)
+    total = int(beyond.sum())
+    if total <= extra:
+        return np.asarray(counts)
+    return np.asarray(np.minimum(counts, 1) + (beyond * (extra / total)).astype(np.intp))
+
+
+class Paths:
+    """Directions (n, 3) in image axes, seen by a camera that turns with a constant rate (3,) in the same axes, rad/s.
+
+    By Rodrigues' formula; seconds count from the moment when the directions are those given.
+    """
+
+    def __init__(self, seen: FloatArray, rate_image_rad_s: FloatArray, camera: Camera) -> None:
+        self.camera = camera
+        self.speed_rad_s = float(np.linalg.norm(rate_image_rad_s))
+        x, y, z = rate_image_rad_s / (self.speed_rad_s or 1.0)
+        axis = np.array([x, y, z])
+        # Component by component (3, n): several times faster than direction by direction.
+        self._seen = np.ascontiguousarray(seen.T)
+        self._cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ self._seen
+        self._along = axis[:, None] * (axis @ self._seen)
+
+    def __len__(self) -> int:
+        return int(self._seen.shape[1])
+
+    def through(self, camera: Camera) -> "Paths":
+        """The same paths seen by another camera that turns with this one."""
+        paths = copy(self)
+        paths.camera = camera
+        return paths
+
+    def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,); NaN behind the camera."""
+        return self._places_px(self._seen[:, star], self._cross[:, star], self._along[:, star], seconds)
+
+    def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN behind the camera."""
+        shape = len(seconds), len(self)
+        x_px, y_px = self._places_px(self._seen[:, None], self._cross[:, None], self._along[:, None], seconds)
+        return x_px.reshape(shape), y_px.reshape(shape)
+
+    def tangents_at(self, seconds: FloatArray, unit_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of the change of that."""
+        angle, turn = self.speed_rad_s * seconds, self.speed_rad_s * unit_s
+        cosine, sine = np.cos(angle), np.sin(angle)
+        across, faster = self._seen - self._along, self._cross * cosine
+        seen = across * cosine
+        seen -= self._cross * sine
+        faster += across * sine  # the axis times what is seen
+        bend = seen * (-turn * turn / 2)
+        seen += self._along
+        faster *= -turn
+        near = 1 / seen[2]
+        at = seen[:2] * near
+        first = (faster[:2] - at * faster[2]) * near
+        return at, first, (bend[:2] - at * bend[2] - first * faster[2]) * near
+
+    def _places_px(
+        self, seen: FloatArray, cross: FloatArray, along: FloatArray, seconds: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        angle = self.speed_rad_s * seconds
+        cosine = np.cos(angle)
+        turned = seen * cosine
+        turned -= cross * np.sin(angle)
+        turned += along * (1 - cosine)
+        return self.camera.project_outward(turned.reshape(3, -1).T)
+
+
+@dataclass(frozen=True, slots=True)
+class Chords:
+    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind the camera."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+
+    def to(self, longer: FloatArray) -> "Chords":
+        """The same ways from their begins, so many times (n,) as long."""
+        x_px, y_px = (np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer]) for ends in (self.x_px, self.y_px))
+        return Chords(x_px, y_px)
+
+    def length_sigma(self, width_px: tuple[float, float]) -> FloatArray:
+        """How long each is in widths of a PSF (see `Psf.width_px`); NaN where an end is behind the camera."""
+        return np.asarray(
+            np.hypot(*(np.diff(ends, axis=0)[0] / s for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)))
+        )
+
+    def on_image(self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Begin and end (n,) of the part of each, 0 to 1, that is within `margin_px` of the image; 1 and 0 for none.
+
+        (Liang and Barsky 1984.) A chord with one end behind the camera counts whole where the other end is on the image.
+        """
+        begin, end = np.zeros(self.x_px.shape[1]), np.ones(self.x_px.shape[1])
+        for ends, size in ((self.x_px, resolution_px[0]), (self.y_px, resolution_px[1])):
+            low, high = -0.5 - np.asarray(margin_px), size - 0.5 + np.asarray(margin_px)
+            step = ends[1] - ends[0]
+            still = np.abs(step) < 1e-9
+            step = np.where(still, 1.0, step)
+            a, b = (low - ends[0]) / step, (high - ends[0]) / step
+            outside = still & ((ends[0] < low) | (ends[0] > high))
+            begin = np.maximum(begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b)))
+            end = np.minimum(end, np.where(still, np.where(outside, 0.0, 1.0), np.maximum(a, b)))
+        seen = end > begin
+        finite, (width, height) = np.isfinite(self.x_px), resolution_px
+        there = (np.abs(self.x_px - width / 2) <= width) & (np.abs(self.y_px - height / 2) <= height)
+        half_seen = (finite.sum(axis=0) == 1) & there.any(axis=0)
+        begin, end = np.where(seen, begin, 1.0), np.where(seen, end, 0.0)
+        begin[half_seen], end[half_seen] = 0.0, 1.0
+        return begin, end
+
+
+def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shortest_sigma: float) -> IntArray:
+    """ceil(per_sigma length + at_rest) nodes for each length in sigmas, 1 under `shortest_sigma`.
+
+    A length that is not finite gets MAX_NODES.
+    """
+    length = np.where(np.isfinite(length_sigma), np.minimum(length_sigma, 1e9), MAX_NODES / per_sigma)
+    counts = np.ceil(per_sigma * length + at_rest)
+    return np.asarray(np.where(length < shortest_sigma, 1, counts), dtype=np.intp)
+
+
+class ShortPaths:
+    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of its places as `points`.
+
+    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature are the path's too.
+    Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
+    """
+
+    def __init__(self, exact: Paths, middle_s: FloatArray, half_s: float, points: int) -> None:
+        self.camera = exact.camera
+        self.speed_rad_s = exact.speed_rad_s
+        self._count = len(exact)
+        self._middle_s, self._half_s = middle_s, half_s
+        if points == 1:
+            self._terms = _lens_table(*_mapping(exact.camera)).along(*exact.tangents_at(middle_s, half_s))
+            return
+        at = np.cos((np.arange(points) + 0.5) * (np.pi / points))
+        places = np.stack(exact.through(_beyond(exact.camera)).all_places_px(middle_s + half_s * at[:, None]), axis=1)
+        powers = np.linalg.inv(np.vander(at, increasing=True))
+        self._terms = (powers @ places.reshape(points, -1)).reshape(places.shape)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,)."""
+        at = (seconds - self._middle_s[star]) / self._half_s
+        terms = self._terms[:, :, star] if isinstance(star, slice) else self._terms.take(star, axis=2)
+        places = terms[-1] * at
+        for term in terms[-2:0:-1]:
+            places += term
+            places *= at
+        places += terms[0]
+        return places[0], places[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensTable:
+    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over its box.
+
+    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and vv / 2. On the image places
+    are off by up to `off_px`.
+    """
+
+    first: FloatArray
+    steps: float  # a tangent
+    shape: tuple[int, int]  # along u and v
+    terms: FloatArray
+    off_px: float = 0.0
+
+    def along(self, at: FloatArray, by: FloatArray, bend: FloatArray) -> FloatArray:
+        """The terms (3, 2, n) of 1, t and t^2 of the pixels of tangents at + by t + bend t^2, each (2, n)."""
+        off = (at - self.first) * self.steps
+        node = np.rint(off)
+        for of_side, size in zip(node, self.shape, strict=True):
+            of_side.clip(0, size - 1, out=of_side)
+        off -= node
+        place, by_u, by_v, uu, uv, vv = self.terms.take((node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2)
+        (u, v), (first_u, first_v), (bend_u, bend_v) = off, by * self.steps, bend * self.steps
+        steep_u, steep_v = uu * u, vv * v
+        place += u * (by_u + steep_u)
+        cross = uv * u
+        place += v * (by_v + cross + steep_v)
+        by_u += uv * v + 2 * steep_u
+        by_v += cross + 2 * steep_v
+        first = by_u * first_u + by_v * first_v
+        second = by_u * bend_u + by_v * bend_v + (uu * first_u + uv * first_v) * first_u + vv * (first_v * first_v)
+        return np.stack([place, first, second])
+
+
+def _mapping(camera: Camera) -> tuple[tuple[int, int], float, tuple[float, float], Lens | None]:
+    """What places depend on: the same of many cameras, by which tables are kept."""
+    return camera.resolution_px, camera.focal_length_px, camera.principal_point_px, camera.lens
+
+
+@lru_cache(maxsize=4)
+def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens) -> LensTable:
+    """The table of a bounded lens: its places at the grid's nodes, their slopes and bends by differences."""
+    camera = _beyond(Camera(size_px, focal_px, principal_px, np.eye(3), lens))
+    low, high = np.clip(np.array(lens.box).T, -lens.max_tangent, lens.max_tangent)
+    low, high = low - BESIDE_TABLE * (high - low), high + BESIDE_TABLE * (high - low)
+    step = float((high - low).max()) / TABLE_STEPS
+    across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)  # one more node at each end
+    u, v = np.meshgrid(low[0] + step * across, low[1] + step * down)
+    at = np.stack(camera.places_outward_px(u.ravel(), v.ravel())).reshape(2, *u.shape)
+    middle, row, column = at[:, 1:-1, 1:-1], at[:, 1:-1], at[..., 1:-1]
+    left, right, above, below = row[..., :-2], row[..., 2:], column[:, :-2], column[:, 2:]
+    cross = (at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]) / 4
+    bends = (left + right) / 2 - middle, cross, (above + below) / 2 - middle
+    terms = np.stack([middle, (right - left) / 2, (below - above) / 2, *bends]).reshape(6, 2, -1)
+    table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
+    between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
+    found, exact = table.along(between, *np.zeros((2, 2, 1)))[0], np.stack(camera.places_outward_px(*between))
+    return replace(table, off_px=float(np.hypot(*(found - exact))[camera.contains_px(*exact)].max(initial=0.0)))
+
+
+def points_within(camera: Camera, half_turn_rad: float) -> int | None:
+    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle; None where no few do."""
+    for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
+        if 0 < half_turn_rad <= longest_rad:
+            return points
+    return None
+
+
+@lru_cache(maxsize=16)
+def bend_px(camera: Camera) -> float:
+    """The farthest that a lens moves a direction from where a pinhole has it, on the image."""
+    if camera.lens is None:
+        return 0.0
+    u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
+    bent, ideal = (np.stack(seen.places_px(u, v)) for seen in (camera, replace(camera, lens=None)))
+    return float(np.nanmax(np.hypot(*(bent - ideal))))
+
+
+@lru_cache(maxsize=16)
+def _longest_half_turns_rad(
+    size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens | None
+) -> tuple[tuple[int, float], ...]:
+    """Numbers of points, and the longest half turn that each can draw, tried on such a camera; 0 where none is short enough."""
+    camera = Camera(size_px, focal_px, principal_px, np.eye(3), lens)
+    turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
+    few = POINTS
+    if lens is not None and lens.max_tangent < WIDEST_TABLE:
+        few = LENS_POINTS if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX else POINTS
+    firsts = [bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0) for points in few]
+    return tuple((points, [*turns, 0.0][first]) for points, first in zip(few, firsts, strict=True))
+
+
+def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
+    """The largest error on the image, about several axes, as a multiple of what it may be: of paths that begin on the image."""
+    camera = _beyond(camera)
+    u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
+    seen = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    middle_px, half_px = ((np.array(camera.resolution_px)[:, None, None] - k) / 2 for k in (1, 0))
+    worst = 0.0
+    for axis in TRIED_AXES:
+        exact = Paths(seen, np.array(axis), camera)
+        half_s = half_turn_rad / exact.speed_rad_s
+        moments = np.linspace(0.0, 2 * half_s, TRIED_MOMENTS)
+        short = ShortPaths(exact, np.full(len(seen), half_s), half_s, points)
+        found = [short.places_px(slice(None), np.full(len(seen), moment)) for moment in moments]
+        places = np.stack(exact.all_places_px(moments[:, None]))
+        allowed = np.maximum(LIMIT_PX, LIMIT_SHARE * np.hypot(*(places[:, -1] - places[:, 0])))
+        on_image = (np.abs(places - middle_px) <= half_px).all(axis=0)
+        excess = np.hypot(*(np.stack(found, axis=1) - places)) / allowed
+        worst = max(worst, float(excess[on_image].max(initial=0.0)))
+    return worst
+
+
+def _beyond(camera: Camera) -> Camera:
+    lens = camera.lens
+    return camera if lens is None else replace(camera, lens=replace(lens, max_tangent=lens.max_tangent * BEYOND_LENS))

@@ -1,0 +1,516 @@
+"""Point spread functions: how the light of a point spreads over pixels.
+
+A `Psf` says what share of a star's light falls into a pixel at any offset, how far that reaches, and gives the shaders the
+same arithmetic (shaders/shares.glsl). `GaussianPsf` is the Gaussian of thesis eq. 4.7: along one axis a pixel's share is
+(erf((d + 1/2)/(s sqrt 2)) - erf((d - 1/2)/(s sqrt 2)))/2, d from the star's centre to the pixel's centre and s the sigma,
+both in pixels. `SampledPsf` is an image on a fine grid: its shares are tabulated by offset and interpolated.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from bisect import bisect_left
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, reduce
+from itertools import count, zip_longest
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.image_files import ImageSizeError, opened_fits
+from hilstar.basics.reading import read_bytes
+
+# The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would be enough for the
+# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the cost of one pixel.
+# results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
+MAX_CUT = 1e-6
+MAX_GAUSSIAN_PX = 100_000
+PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
+SQRT2 = math.sqrt(2.0)
+# Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is 4.4e-7 off.
+MAX_SHARE_ERROR = 1e-7
+MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
+FIT_PLACES, FIT_ROUNDS = 120, 15
+BOUND_PLACES = 200
+# A sampled PSF. Its footprint leaves out so much of its light at the worst phase; what is left is scaled to the star's rate.
+MAX_SAMPLED_CUT = 1e-4
+MAX_NEGATIVE = 0.02  # share of a PSF's light below zero, of noise or of a spline's overshoot: it is set to zero
+MAX_UNEVEN = 0.05  # by which the light of a star's pixels may change with its place in a pixel
+SPLINE_DEGREE: Final = 5  # the spline through the samples
+BLACK_SAMPLES = 12  # so many stand round them
+# Shares are tabulated at most so finely, and with so many places along a side, or twice as many for FINE_STEPS_A_PX.
+# Interpolated linearly they are off by an eighth of the squared step times their curvatures: 7e-5 of a star's light in a pixel
+# at a sigma of 0.5 px. An Airy pattern with a core of 0.6 px is off by 3e-4 in a footprint of 100 px, by 1.2e-3 in one of 200.
+MAX_STEPS_A_PX, FINE_STEPS_A_PX, MAX_TABLE_SIDE = 64, 20, 1024
+MAX_FOOTPRINT_PX = 255  # as any OpenGL draws
+MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # the Gaussian nearest to a sampled PSF; how often it is fitted anew
+# Gaussians along the side of a lit square, in sides, in place of its light. Thirds of it: against squares a star's centroid is
+# off by 3e-6 px and its flux by 1e-9 mag on the demo's bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by
+# 1e-5 px with a PSF of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench
+# too, for their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
+TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
+# A Gaussian's side of a wide square: its edge is then softer than the PSF's by 2 % of sigma. By thirds of 4.2 tracker pixels
+# before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to dots takes for the PSF's own. What is sharper than
+# SHARPEST_PX is summed up by pixels anyway.
+FINE_SIGMAS, MIN_PARTS, MAX_PARTS, SHARPEST_PX = 0.7, 3, 16, 0.2
+
+
+class ShareShader(NamedTuple):
+    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w, channels)."""
+
+    defines: tuple[str, ...]
+    uniforms: dict[str, tuple[float, float]]
+    table: Float32Array | None = None
+
+
+class Reach(NamedTuple):
+    """How far a share of light may lie from its star: an ellipse.
+
+    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` under
+    log(`factor` / s).
+    """
+
+    axes_px2: tuple[float, float]
+    factor: float
+
+
+class Psf(ABC):
+    """How the light of a point spreads over pixels. Offsets are pixel centre minus star, px, x right and y down.
+
+    `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum.
+    """
+
+    by_place = False
+    by_colour = False
+    separable = False  # whether a share is the product of one along x and one along y, as exact.comp takes it
+
+    @property
+    @abstractmethod
+    def width_px(self) -> tuple[float, float]:
+        """The sigma of the Gaussian nearest to it, before the pixel, along x and y: paths and windows are sized by it."""
+
+    @property
+    @abstractmethod
+    def footprint_px(self) -> int:
+        """The side of the square within which a star is drawn."""
+
+    @property
+    @abstractmethod
+    def peak_share(self) -> float:
+        """The largest share that one pixel can get, at any phase."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> Reach:
+        """The ellipse beyond which a pixel of a footprint has less than a share of the light."""
+
+    @abstractmethod
+    def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Shares of a star's light in pixels at these offsets, which are broadcast against each other."""
+
+    @abstractmethod
+    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+        """The light of n stars in squares of pixels (side, side, n): rows, columns, stars.
+
+        `fraction_px` (2, n) is each star's x and y from the middle of its pixel, which is the (side - 1) // 2-th of its square.
+        """
+
+    @abstractmethod
+    def spread(
+        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+    ) -> Float32Array:
+        """The light of n points in all pixels of a region: left, top, width, height."""
+
+    @abstractmethod
+    def cut_share(self, size_px: int) -> float:
+        """The flux outside a square of `size_px`, for a star half a pixel off its centre (the worst)."""
+
+    @abstractmethod
+    def outside_share(self, size_px: int) -> float:
+        """The largest share of a star's light in one pixel outside a square sprite, at the worst phase."""
+
+    @abstractmethod
+    def shader(self, side_px: int) -> ShareShader:
+        """The same shares for shaders/shares.glsl, right within a footprint of `side_px`."""
+
+    @abstractmethod
+    def blurred(self, sigma_px: float) -> "Psf":
+        """This PSF convolved with a round Gaussian."""
+
+    @property
+    def variance_px2(self) -> tuple[float, float]:
+        """Variance of the nearest Gaussian and of a square pixel together, along x and y."""
+        x, y = self.width_px
+        return x**2 + PIXEL_VARIANCE, y**2 + PIXEL_VARIANCE
+
+
+@dataclass(frozen=True)
+class GaussianPsf(Psf):
+    """A Gaussian of its own sigma along x and along y."""
+
+    sigma_px: tuple[float, float]
+    separable = True
+
+    @property
+    def width_px(self) -> tuple[float, float]:
+        """The sigmas."""
+        return self.sigma_px
+
+    @cached_property
+    def footprint_px(self) -> int:
+        """The side of the smallest square that cuts at most MAX_CUT of a star's flux. InputError where none is enough."""
+        sizes = range(1, MAX_GAUSSIAN_PX + 1)
+        place = bisect_left(sizes, -MAX_CUT, key=lambda size: -self.cut_share(size))
+        if place == len(sizes):
+            raise InputError(f"sprite sigma {self.sigma_px} px: too large for any footprint; write a few pixels")
+        return sizes[place]
+
+    @cached_property
+    def peak_share(self) -> float:
+        """The share of the pixel that a star is centred on."""
+        return pixel_share(0.0, self.sigma_px[0]) * pixel_share(0.0, self.sigma_px[1])
+
+    @cached_property
+    def reach(self) -> Reach:
+        """A Gaussian's ellipse with the factor that the integral over pixels needs."""
+        scale = [2 * (sigma**2 + 1 / 12) for sigma in self.sigma_px]
+        places = np.linspace(0.0, self.footprint_px / 2 + 0.5, BOUND_PLACES)
+        shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in self.sigma_px]
+        more = [float((np.log(share) + places**2 / along).max()) for share, along in zip(shares, scale, strict=True)]
+        return Reach((scale[0], scale[1]), math.exp(sum(more)))
+
+    def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """The product of the shares along both axes."""
+        sigma_x, sigma_y = self.sigma_px
+        if sigma_x == sigma_y and x_px.shape == y_px.shape:  # one call in place of two
+            both = pixel_shares(np.stack([x_px, y_px]), sigma_x)
+            return np.asarray(both[0] * both[1])
+        return pixel_shares(x_px, sigma_x) * pixel_shares(y_px, sigma_y)
+
+    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+        """Row by row the product of what each column and each row has."""
+        from scipy.special import ndtr  # 0.1 s of every command that needs none of it
+
+        edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
+        across, down = (np.diff(ndtr((edges - at) / s), axis=0) for at, s in zip(fraction_px, self.sigma_px, strict=True))
+        down *= electrons_per_s
+        return np.asarray(across.astype(np.float32)[None] * down.astype(np.float32)[:, None])
+
+    def spread(
+        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+    ) -> Float32Array:
+        """One product of all rows and all columns."""
+        from scipy.special import ndtr  # as in `stamps`
+
+        left, top, width, height = region
+        across = np.diff(ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / self.sigma_px[0]), axis=1)
+        down = np.diff(ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / self.sigma_px[1]), axis=1)
+        return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
+
+    def cut_share(self, size_px: int) -> float:
+        """Axis by axis, from the complements of both edges."""
+        inside = 1.0
+        for sigma in self.sigma_px:
+            inside_axis = 1.0 - 0.5 * sum(math.erfc((size_px / 2 + side) / (sigma * SQRT2)) for side in (-0.5, 0.5))
+            inside *= inside_axis
+        return 1.0 - inside
+
+    def outside_share(self, size_px: int) -> float:
+        """The share of a pixel beside the middle of an edge."""
+        (x, y), beyond = self.sigma_px, size_px / 2
+        return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
+
+    def shader(self, side_px: int) -> ShareShader:
+        """A polynomial for each axis where one is exact enough (`share_polynomial`), else error functions."""
+        inverse_x, inverse_y = (1 / (sigma * SQRT2) for sigma in self.sigma_px)
+        uniforms = {"inverse_sigma_sqrt2": (inverse_x, inverse_y)}
+        axes = [share_polynomial(sigma, side_px / 2 + 0.5) for sigma in self.sigma_px]
+        if axes[0] is None or axes[1] is None:
+            return ShareShader((), uniforms)
+        terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
+        # Written out: from an array of uniforms llvmpipe takes twice as long.
+        polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
+        return ShareShader((f"LOG2_SHARE(square) {polynomial}",), uniforms)
+
+    def blurred(self, sigma_px: float) -> "GaussianPsf":
+        """A wider Gaussian."""
+        x, y = (math.hypot(sigma, sigma_px) for sigma in self.sigma_px)
+        return GaussianPsf((x, y))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledPsf(Psf):
+    """An image of a PSF, `per_px` samples a pixel along each axis, the chief ray in the middle of its middle sample.
+
+    `samples` (height, width), odd sides, x right and y down, is relative light. That of an image that is `pixel_integrated` is
+    what pixels centred there would get. Between samples runs a spline, and beyond them all is black. A star's pixels sum to
+    its rate: the light outside the footprint is shared out among them. Raises InputError for an image that is no PSF.
+    """
+
+    samples: FloatArray
+    per_px: int = 1
+    pixel_integrated: bool = False
+    max_negative = MAX_NEGATIVE
+
+    def __post_init__(self) -> None:
+        """Refuse what is no PSF."""
+        samples = self.samples
+        if samples.ndim != 2 or not all(side % 2 for side in samples.shape):
+            found = " x ".join(map(str, samples.shape[::-1]))
+            raise InputError(f"a PSF of {found} samples has no middle; write an image of odd width and height")
+        if self.per_px < 1:
+            raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")
+        if not np.isfinite(samples).all() or samples.sum() <= 0:
+            raise InputError("a PSF has samples that are not finite, or no light; write finite ones with a positive sum")
+        # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the largest of those below zero
+        phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
+        least, negative = min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
+        if negative > self.max_negative:
+            raise InputError(
+                f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample it more finely than "
+                f"{self.per_px} a pixel"
+            )
+        if least < 1 - MAX_UNEVEN:
+            raise InputError(
+                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and more at others: it is not "
+                "pixel-integrated; write PIXINT = F"
+            )
+        if self.cut_share(MAX_FOOTPRINT_PX) > MAX_SAMPLED_CUT:
+            raise InputError(f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies further out")
+
+    def _before_cut(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Shares of pixels at these columns and rows, (len(y_px), len(x_px)), of all the light of the image."""
+        from scipy.interpolate import make_interp_spline  # 0.2 s of every command that needs none of it
+
+        found = self.samples / self.samples.sum() * self.per_px**2
+        for axis, at_px in ((0, y_px), (1, x_px)):
+            black = [(BLACK_SAMPLES, BLACK_SAMPLES) if k == axis else (0, 0) for k in (0, 1)]
+            found = np.pad(found, black)
+            place_px = (np.arange(found.shape[axis]) - found.shape[axis] // 2) / self.per_px
+            spline, last_px = make_interp_spline(place_px, found, SPLINE_DEGREE, axis=axis), place_px[-1]
+            if self.pixel_integrated:
+                found = spline(np.clip(at_px, -last_px, last_px))
+            else:
+                light = spline.antiderivative()
+                low, high = (light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5))
+                found = high - low
+        return np.asarray(found)
+
+    @cached_property
+    def _halves(self) -> FloatArray:
+        """Shares at each half pixel, far enough that the last are black."""
+        last = 2 * math.ceil((max(self.samples.shape) // 2 + BLACK_SAMPLES) / self.per_px + 1)
+        at_px = np.arange(-last, last + 1) / 2
+        return self._before_cut(at_px, at_px)
+
+    @cached_property
+    def width_px(self) -> tuple[float, float]:
+        """Adaptive moments (Bernstein and Jarvis 2002), less a pixel's own variance."""
+        at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
+        middle, variance = np.zeros(2), np.ones(2)
+        for _ in range(WIDTH_ROUNDS):  # a Gaussian weight as wide as the PSF halves its variance and its distance
+            powers = at_px ** np.arange(3)[:, None]
+            across, down = (powers * np.exp(-((at_px - m) ** 2) / (2 * v)) for m, v in zip(middle, variance, strict=True))
+            sums = down @ self._table @ across.T  # powers of y, powers of x
+            mean = np.array([sums[0, 1], sums[1, 0]]) / sums[0, 0]
+            variance = np.maximum(2 * (np.array([sums[0, 2], sums[2, 0]]) / sums[0, 0] - mean**2), PIXEL_VARIANCE)
+            middle = 2 * mean - middle
+        x, y = np.sqrt(np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)).tolist()
+        return x, y
+
+    @cached_property
+    def footprint_px(self) -> int:
+        """The side of the smallest odd square that cuts at most MAX_SAMPLED_CUT of the light."""
+        return next(size for size in count(1, 2) if self.cut_share(size) <= MAX_SAMPLED_CUT)
+
+    @cached_property
+    def _steps(self) -> int:
+        """Places of the table to a pixel, an even number."""
+        fine = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
+        return min(MAX_STEPS_A_PX, max(fine, MAX_TABLE_SIDE // self.footprint_px)) // 2 * 2
+
+    @cached_property
+    def _table(self) -> Float32Array:
+        """Shares by offset, 1 / `_steps` px apart, from -footprint / 2 px: those of a star's pixels sum to 1 at each phase.
+
+        Linear interpolation keeps their sum, and their centroid, at all phases between. At the edges they are 0.
+        """
+        side_px, steps = self.footprint_px, self._steps
+        at_px = np.arange(side_px * steps) / steps - side_px / 2
+        shares = np.maximum(self._before_cut(at_px, at_px), 0.0)
+        shares[0], shares[:, 0] = 0.0, 0.0
+        of_phases = shares.reshape(side_px, steps, side_px, steps)
+        of_phases /= of_phases.sum(axis=(0, 2), keepdims=True)
+        return np.pad(shares, (0, 1)).astype(np.float32)
+
+    @cached_property
+    def peak_share(self) -> float:
+        """The largest of the table."""
+        return float(self._table.max())
+
+    @cached_property
+    def reach(self) -> Reach:
+        """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth of the largest."""
+        squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
+        logs = np.log(np.maximum(self._table, 1e-30))
+
+        found = []
+        for scale in 2 * np.geomspace(1.0, 300.0, 20):
+            x, y = (float(scale) * variance for variance in self.variance_px2)
+            log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01  # the table is interpolated
+            found.append((scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y)))
+        _, log_factor, axes_px2 = min(found)
+        return Reach(axes_px2, math.exp(log_factor))
+
+    def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Linear between the four nearest of the table; 0 beyond it."""
+        last = len(self._table) - 1
+        at_x, at_y = (np.clip(at * self._steps + last / 2, 0, last) for at in (x_px, y_px))
+        column, row = (np.minimum(at.astype(np.intp), last - 1) for at in (at_x, at_y))
+        x, y, first = at_x - column, at_y - row, row * (last + 1) + column
+        table = self._table.ravel()
+        above, below = ((1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1))
+        return np.asarray((1 - y) * above + y * below)
+
+    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+        """See `Psf.stamps`: all offsets at once."""
+        pixel = np.arange(side_px) - (side_px - 1) // 2
+        x, y = (pixel[:, None] - at for at in fraction_px)
+        return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)
+
+    def spread(
+        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+    ) -> Float32Array:
+        """Point after point: each has its own pixels."""
+        left, top, width, height = region
+        image = np.zeros((height, width))
+        columns, rows = np.arange(left, left + width), np.arange(top, top + height)
+        for x, y, light in zip(x_px, y_px, electrons_per_s, strict=True):
+            near_x, near_y = (np.abs(at - middle) < self.footprint_px / 2 for at, middle in ((columns, x), (rows, y)))
+            image[np.ix_(near_y, near_x)] += light * self.shares(columns[near_x] - x, rows[near_y, None] - y)
+        return image.astype(np.float32)
+
+    def cut_share(self, size_px: int) -> float:
+        """The largest of the four corners' of a pixel, by the shares at half pixels."""
+        first = len(self._halves) // 2 - size_px
+        if first < 0:
+            return 0.0
+        insides = [
+            self._halves[y : y + 2 * size_px : 2, x : x + 2 * size_px : 2]
+            for y in (first, first + 2)
+            for x in (first, first + 2)
+        ]
+        return max(0.0, 1 - min(float(part.sum()) for part in insides))
+
+    def outside_share(self, size_px: int) -> float:
+        """The largest of the table beyond half of that side."""
+        far = np.abs(np.arange(len(self._table)) - len(self._table) // 2) >= size_px * self._steps / 2
+        return max(float(self._table[far].max(initial=1e-30)), float(self._table[:, far].max(initial=1e-30)))
+
+    def shader(self, side_px: int) -> ShareShader:
+        """The same table: in each cell between four places what its bilinear interpolation is made of."""
+        near, right, down, both = self._table[:-1, :-1], self._table[:-1, 1:], self._table[1:, :-1], self._table[1:, 1:]
+        cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
+        return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
+
+    def blurred(self, sigma_px: float) -> "SampledPsf":
+        """The samples convolved, with room for what spreads beyond them."""
+        from scipy.ndimage import fourier_gaussian
+
+        sigma = sigma_px * self.per_px
+        wide = np.pad(self.samples, math.ceil(6 * sigma))
+        spread = np.fft.ifft2(fourier_gaussian(np.fft.fft2(wide), sigma)).real
+        return SampledPsf(spread, self.per_px, self.pixel_integrated)
+
+
+MAX_FILE_BYTES = 20_000_000
+FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in its middle"
+
+
+def read_psf(path: Path) -> SampledPsf:
+    """The PSF of a FITS file's first image, by OVERSAMP (1) and PIXINT (F) of its header; its first row is the top one.
+
+    The same file again is the same PSF. Raises InputError for a file that is no such image.
+    """
+    return _psf_in(path, read_bytes(path, FILE_ADVICE, MAX_FILE_BYTES))
+
+
+@lru_cache(maxsize=4)
+def _psf_in(path: Path, content: bytes) -> SampledPsf:
+    try:
+        with opened_fits(content) as hdus:
+            image, header = np.asarray(hdus[0].data), hdus[0].header
+            per_px, integrated = header.get("OVERSAMP", 1), header.get("PIXINT", False)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {FILE_ADVICE}") from error
+    except Exception as error:  # astropy raises whatever a broken header causes in its layers
+        raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}") from error
+    if not image.ndim:
+        raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}")
+    if image.ndim == 3 and len(image) > 1:
+        raise InputError(f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one of them")
+    if type(per_px) is not int or type(integrated) is not bool:
+        raise InputError(f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F")
+    try:
+        return SampledPsf(image.astype(np.float64), per_px, integrated)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
+    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and the PSF of each.
+
+    The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
+    """
+    narrow_px = min(psf.width_px)
+    if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:
+        points = TWO
+    else:
+        wanted = math.ceil(side_px / (FINE_SIGMAS * max(narrow_px, SHARPEST_PX)))
+        parts = min(max(wanted, MIN_PARTS), MAX_PARTS)
+        points = (np.arange(parts) + 0.5) / parts - 0.5
+    return points, psf.blurred(side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2))))
+
+
+def pixel_share(offset_px: float, sigma_px: float) -> float:
+    """The share of a Gaussian star's light, along one axis, in the pixel `offset_px` from its centre.
+
+    The complement erfc of both edges keeps the far wings positive and exact where erf differences cancel.
+    """
+    near, far = abs(offset_px) - 0.5, abs(offset_px) + 0.5
+    return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
+
+
+def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
+    """As `pixel_share`, of an array of offsets; same shape."""
+    if np.size(offset_px) <= BOUND_PLACES:  # as a bench that opens asks for
+        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(np.shape(offset_px))
+    from scipy.special import erfc  # as in `stamps`
+
+    near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5
+    return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
+
+
+@lru_cache(maxsize=8)
+def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | None:
+    """Coefficients, constant first, of log2 of a pixel's share as a polynomial of its distance squared (px^2).
+
+    Within `reach_px` its power of two is within MAX_SHARE_ERROR of `pixel_share`: one power for both axes takes half the time
+    of four error functions. None where no degree up to MAX_DEGREE is enough: under a sigma of 0.5 px.
+    """
+    distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))  # close together at the edge, as Chebyshev's
+    shares = np.array([pixel_share(float(place), sigma_px) for place in distance_px])
+    wanted, scaled = np.log2(np.maximum(shares, shares[0] * 1e-12)), (distance_px / reach_px) ** 2
+    for degree in range(MIN_DEGREE, MAX_DEGREE + 1):
+        terms = np.polynomial.chebyshev.chebvander(2 * scaled - 1, degree)
+        weight = np.maximum(shares / shares[0], 1e-7)
+        for _ in range(FIT_ROUNDS):
+            found = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
+            error = np.abs(np.exp2(np.minimum(terms @ found, 0.0)) - shares)
+            if error.max() <= MAX_SHARE_ERROR:
+                power = np.polynomial.Chebyshev(found, domain=[0.0, reach_px**2]).convert(kind=np.polynomial.Polynomial)
+                return tuple(power.coef.tolist())
+            weight = weight * np.sqrt(error / error.max() + 1e-3)  # Lawson (1961): towards the smallest maximum
+    return None

@@ -1,0 +1,237 @@
+"""Satellites of one image: each a chain of sprites along its own path while the camera turns.
+
+The light of such a path is not even: a satellite flashes, and goes into the Earth's shadow or behind the Earth. So a path is
+cut into equal times, each with a sprite in its middle that has the mean light of that time: the sum is exact for any flash.
+
+Satellites wide enough to have a face: diffuse spheres along their paths, which hide the stars behind them.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, disc_lights
+from hilstar.optics.paths import Chords, Paths
+from hilstar.optics.psf import Psf
+from hilstar.optics.sprites import Sprites, pack_sprites, with_sprites
+from hilstar.sky.bodies.disc import Disc
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.passes import Pass
+
+# At this spacing no pixel of a streak is wrong by more than 1e-3 of the satellite's light: spacing^2 / 24 times the slope at
+# its end (held by tests/unit/optics/test_trails.py).
+SPACING_SIGMA = 0.3
+LIGHT_S = 0.25  # the longest time of one sprite; a low orbit enters the shadow in 8 s
+SAMPLES = 9  # samples of a path that give its length and its part on the image
+REACH = 2.0  # times the speed at a moment, as a bound for some seconds about it
+BULGE = 2.0  # how much farther than its samples a path may be from the line between its ends
+EVERY = slice(None)
+STEPS_A_RADIUS = 4.0  # places of a disc along its path: its edge is then uneven by 1 % of the radius
+AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
+NORTH = np.array([0.0, 0.0, 1.0])
+M_PER_KM = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrailView:
+    """A camera that turns: `icrs_to_image` (3, 3) and the rate (3,) in image axes, rad/s, both at the moment of a pass.
+
+    `velocity_km_s` (3,) is the observer's against that for which directions are aberrated (see `Stars`), None for the same.
+    """
+
+    camera: Camera
+    icrs_to_image: FloatArray
+    rate_image_rad_s: FloatArray
+    velocity_km_s: FloatArray | None = None
+
+    def places_px(self, seen: "Pass", which: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of satellites `which` (k,) of a pass, each at its own of `seconds` (k,); NaN behind the camera."""
+        turned = seen.directions(which, seconds, self.velocity_km_s) @ self.icrs_to_image.T
+        if not self.rate_image_rad_s.any():
+            return self.camera.project_outward(turned)
+        return Paths(turned, self.rate_image_rad_s, self.camera).places_px(EVERY, seconds)
+
+    def in_reach(self, seen: "Pass", longest_s: float, margin_px: float) -> IntArray:
+        """Places of the satellites that can come within a margin of the image within that time of the moment, and some more."""
+        turned = seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
+        reach_rad = (float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))) * longest_s
+        return self.camera.in_view(turned, margin_px, REACH * reach_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Brush:
+    """A sprite's PSF, and the maximum number for all satellites together; above it sprites are spaced more widely.
+
+    A satellite that is a disc is drawn at up to `poses` places.
+    """
+
+    psf: Psf
+    most: int
+    poses: int = 33
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """When satellites (n,) send light to an image, seconds: each from its own `begin_s` for `length_s`."""
+
+    begin_s: FloatArray
+    length_s: float
+
+    @property
+    def middle_s(self) -> FloatArray:
+        """The middle of each one's time."""
+        return np.asarray(self.begin_s + self.length_s / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Trails:
+    """Sprites of satellites, their `star` the place in the list, and those in the image: `index`, their mean rates (k,)."""
+
+    sprites: Sprites
+    index: IntArray
+    electrons_per_s: FloatArray
+    middle: FloatArray  # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
+
+
+def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
+    """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
+    wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
+    counts, total = wanted, int(wanted.sum())
+    if total > brush.most:  # in proportion, one at least
+        counts = np.minimum(wanted, np.maximum(1, (wanted * (brush.most / total)).astype(np.intp)))
+    path = np.repeat(np.arange(len(seen)), counts)
+    order = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
+    part = ((end - begin) / np.maximum(counts, 1))[path]
+    first_s = lit.begin_s[path] + (begin[path] + order * part) * lit.length_s
+    last_s = first_s + part * lit.length_s
+    x_px, y_px = view.places_px(seen, path, (first_s + last_s) / 2)
+    light = seen.rates_e_per_s(path, first_s, last_s) * part
+    rates = np.asarray(np.bincount(path, light, minlength=len(seen)), dtype=np.float64)
+    shown = (rates > 0) & (rates >= faintest_e_per_s)
+    kept = shown[path] & (light > 0)
+    star, size_px = seen.index[path[kept]], view.camera.resolution_px
+    sprites = pack_sprites(x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px)
+    found = np.flatnonzero(np.isin(seen.index, sprites.star))
+    most = int(np.bincount(path[kept], minlength=1).max(initial=1))
+    sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[found].sum()))
+    return Trails(sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found]))
+
+
+def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+    """How many sprites each path should have (0: it misses the image), and its part on the image."""
+    at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+    which = np.tile(np.arange(len(seen)), SAMPLES)
+    x_px, y_px = view.places_px(seen, which, (lit.begin_s + at * lit.length_s).ravel())
+    x_px, y_px = x_px.reshape(SAMPLES, -1), y_px.reshape(SAMPLES, -1)
+    ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
+    off_x, off_y = ((1 - at) * place[0] + at * place[-1] - place for place in (x_px, y_px))
+    bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
+    begin, end = ends.on_image(view.camera.resolution_px, brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px))
+    step_x, step_y = (np.diff(place, axis=0) / s for place, s in zip((x_px, y_px), brush.psf.width_px, strict=True))
+    length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
+    length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
+    wanted = 1 + np.floor(np.minimum(length / SPACING_SIGMA, brush.most)).astype(np.intp)
+    wanted = np.maximum(wanted, np.ceil((end - begin) * lit.length_s / LIGHT_S).astype(np.intp))
+    wanted[end <= begin] = 0
+    return wanted, (begin, end)
+
+
+def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
+    """Stars' sprites and after them those of satellites, whose places in `Stars` begin at `first`."""
+    own = found.sprites
+    whole = with_sprites(sprites, [replace(own, star=own.star + first)])
+    return replace(whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped)
+
+
+@dataclass(frozen=True, slots=True)
+class DiscTrail:
+    """One satellite in an image: its place in the list, its mean rate, its discs, one after the other, and the share of each.
+
+    `lights` draw them in this order, `brightest_e_per_s` is about their brightest pixel.
+    """
+
+    index: int
+    electrons_per_s: float
+    middle: FloatArray
+    along: tuple[Disc, ...]
+    shares: FloatArray
+    lights: tuple[ExtendedLight, ...]
+    brightest_e_per_s: float
+
+
+def wide(seen: "Pass", px_per_rad: float, wider_px: float) -> BoolArray:
+    """Which satellites (n,) of a pass are wider than so many pixels."""
+    size_km = seen.brightness.size_m[seen.index] / M_PER_KM
+    return np.asarray(size_km * px_per_rad > wider_px * np.linalg.norm(seen.seen_km[0], axis=1))
+
+
+def disc_of(seen: "Pass", name: str, second: float, velocity_km_s: FloatArray | None) -> Disc:
+    """The disc of the only satellite of a pass at a time after its moment, without light."""
+    at = np.array([second])
+    radius_km = float(seen.brightness.size_m[seen.index[0]]) / M_PER_KM / 2
+    return Disc(
+        name=name,
+        direction=seen.directions(slice(None), at, velocity_km_s)[0],
+        distance_km=max(float(np.linalg.norm(seen.vectors_km(at)[0])), 1.001 * radius_km),
+        equator_km=radius_km,
+        polar_km=radius_km,
+        pole=NORTH,
+        sun=seen.now.sun_km / np.linalg.norm(seen.now.sun_km),
+        law="lambert",
+        normal_e_per_s_sr=0.0,
+    )
+
+
+def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
+    """The only satellite of a pass along its path; None where it misses the image or has no light."""
+    counts, (begin, end) = sprite_counts(seen, view, lit, brush)
+    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.psf.width_px)
+    coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
+    count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
+    if not count:
+        return None
+    edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s
+    middles_s, share = (edges_s[1:] + edges_s[:-1]) / 2, float(end[0] - begin[0]) / count
+    rates = seen.rates_e_per_s(np.zeros(count, dtype=np.intp), edges_s[:-1], edges_s[1:])
+    if not rates.any():
+        return None
+    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s.tolist()]
+    lights: list[ExtendedLight] = []
+    if count > 1:
+        # Together they hide what the one in the middle hides: each after the other would hide the light of those before.
+        lights += _lights(bare[count // 2], view, middles_s[count // 2], brush, 0.0, covers=True)
+    along = tuple(disc.of_rate(float(rate)) for disc, rate in zip(bare, rates, strict=True))
+    for disc, second in zip(along, middles_s.tolist(), strict=True):
+        lights += _lights(disc, view, second, brush, share, covers=count == 1)
+    if not lights:
+        return None
+    middle = seen.directions(slice(None), lit.middle_s)[0]
+    maps = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
+    radiance = sum(light.times * light.disc.normal_e_per_s_sr for light in lights if isinstance(light, DiscLight))
+    brightest = maps + radiance / view.camera.scales_px_rad()[0] ** 2
+    return DiscTrail(
+        int(seen.index[0]), float(rates.sum()) * share, middle, along, np.full(count, share), tuple(lights), brightest
+    )
+
+
+def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool) -> list[ExtendedLight]:
+    turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
+    return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
+
+
+def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprites:
+    """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a satellite hides."""
+    left = np.ones(len(sprites))
+    for disc, share in zip(found.along, found.shares, strict=True):
+        left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
+    kept = left > 0
+    data = sprites.data[kept]
+    data["electrons_per_s"] *= left[kept].astype(np.float32)
+    star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
+    return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)

@@ -1,1 +1,0 @@
-"""The scene: stars through a camera become sprites."""

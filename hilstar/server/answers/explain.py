@@ -1,0 +1,116 @@
+"""An answer explained: which bytes became which field, why bytes were refused, and which convention makes it what is shown."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.wire.source import Convention, Mounting, SentAttitudes
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import printable, shortened
+from hilstar.basics.rotation import angle_between_rad, to_radec_roll_deg, turn_text
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.formats import CHECKSUMS, AnswerDecoder, RefusedAnswer
+from hilstar.server.bench.config.answers import field_format
+
+MAX_SHOWN_BYTES = 96
+NEAR_RAD = np.radians(5.0)  # an answer this near to what is shown has its convention, whatever its bias
+APART = 20.0  # and other conventions are so many times further off
+
+
+@dataclass(frozen=True, slots=True)
+class UnderConvention:
+    """An answer under a convention: q_icrs_to_cam, and how far it is from what is shown, rad (None: not known)."""
+
+    convention: Convention
+    q_icrs_to_cam: FloatArray
+    off_rad: float | None = None
+    matches: bool = False
+
+    def line(self) -> str:
+        """For a person."""
+        c = self.convention
+        ra_deg, dec_deg, roll_deg = to_radec_roll_deg(self.q_icrs_to_cam)
+        ra, roll = turn_text(ra_deg), turn_text(roll_deg)
+        said = f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra:>8}  Dec {dec_deg:+8.4f}  roll {roll:>8}"
+        off = "" if self.off_rad is None else f"  {_angle(self.off_rad)} from what is shown"
+        return f"{'>' if self.matches else ' '} {said}{off}"
+
+
+def _angle(off_rad: float) -> str:
+    return f"{np.degrees(off_rad):.2f} deg" if off_rad > np.radians(1.0) else f"{off_rad * ARCSEC_PER_RAD:.1f} arcsec"
+
+
+def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[UnderConvention]:
+    """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of what is shown."""
+    mounted = decoder.q_body_to_cam
+    if answer.q_icrs_to_cam is None:
+        return []
+    sent = decoder.sent.as_sent(answer.q_icrs_to_cam)
+    frames = ("cam", "body") if mounted is not None else ("cam",)
+    found = []
+    for scalar, direction, frame in product(("first", "last"), ("icrs_to_cam", "cam_to_icrs"), frames):
+        convention = Convention(scalar=scalar, direction=direction, frame=frame)  # type: ignore[arg-type]
+        q = SentAttitudes(convention, Mounting(mounted)).q_icrs_to_cam(sent)
+        found.append(UnderConvention(convention, q, None if shown is None else angle_between_rad(q, shown)))
+    if shown is None:
+        return found
+    nearest, *others = sorted(found, key=lambda each: each.off_rad or 0.0)
+    off, next_off = nearest.off_rad or 0.0, min((other.off_rad or 0.0 for other in others), default=np.pi)
+    certain = off < NEAR_RAD and next_off > APART * off
+    return [replace(each, matches=certain and each is nearest) for each in found]
+
+
+def hex_line(raw: bytes) -> str:
+    """Bytes in hexadecimal, cut where there are many."""
+    more = f" ... ({len(raw)} bytes)" if len(raw) > MAX_SHOWN_BYTES else ""
+    return raw[:MAX_SHOWN_BYTES].hex(" ") + more
+
+
+def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
+    """Which bytes of an answer became which field."""
+    settings = decoder.settings
+    if settings.format != "frame":
+        text = raw[:1] in {b"{", b" "}
+        return [f"  {printable(shortened(raw.decode(errors='replace'))) if text else hex_line(raw)}"]
+    lines = [f"  {hex_line(raw)}"]
+    if settings.checksum != "none" and raw:
+        _, size = CHECKSUMS[settings.checksum]
+        at = (-size if settings.checksum_at is None else settings.checksum_at) % len(raw)
+        said = decoder.frames.fault(raw) or f"{settings.checksum}, right"
+        lines.append(f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum: {said}")
+    for field in sorted(settings.fields, key=lambda field: field.at):
+        _, size, _ = field_format(field.type) or ("u", 1, False)
+        part = raw[field.at : field.at + size]
+        try:
+            value = f"{decoder.frames.value(raw, field):.12g}"
+        except IndexError as error:
+            value = f"beyond the frame ({error})"
+        by = "".join(
+            f", {name} {number:.12g}" for name, number in (("x", field.scale), ("+", field.add)) if number != (name == "x")
+        )
+        span = f"{field.at:3} to {field.at + size - 1:3}"
+        lines.append(f"  bytes {span}  {part.hex(' '):<24} {field.name:<5} = {value}  ({field.type}{by})")
+    return lines
+
+
+def lines_of(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[str]:
+    """An answer or a refusal explained, a line each."""
+    if isinstance(found, RefusedAnswer):
+        return [f"  {hex_line(found.raw)}"] if found.reason == "framing" else byte_lines(found.raw, decoder)
+    said = under_conventions(found, decoder, shown)
+    lines = [*byte_lines(found.raw, decoder), *(each.line() for each in said)]
+    matching = next((each for each in said if each.matches), None)
+    if matching is not None:
+        found_as, form = matching.convention, decoder.settings.format
+        scalar = "first" if form == "frame" else found_as.scalar
+        written = msgspec.structs.replace(found_as, scalar=scalar)
+        own = found_as == decoder.sent.convention
+        lines.append("  the bench file's convention matches" if own else f"  write [answers] convention = {written}")
+        if form == "frame" and found_as.scalar == "last":
+            lines.append("  and name its four fields qx, qy, qz, qw in the order in which they now are qw, qx, qy, qz")
+    elif shown is not None and said:
+        lines.append("  no convention matches what is shown: is it another sky, another mounting, or a mirrored frame?")
+    return lines

@@ -1,0 +1,443 @@
+"""The bytes of a tracker to answers: frames cut out of a stream, checked and decoded; no I/O.
+
+Laws:
+1. Nothing that a tracker sends raises. Bytes that are no answer give a `RefusedAnswer`, which says why.
+2. However a stream is cut into chunks, the answers are the same, while no pause lasts PAUSE_NS. After one a frame begins anew:
+   what was kept is then looked through for whole frames, and dropped.
+3. At most MAX_KEPT_BYTES are kept between chunks.
+4. A frame whose checksum is wrong is never an answer.
+"""
+
+import binascii
+import math
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain
+from operator import xor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from cobs import cobs
+
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.packet import INT64, AnswerPacket, Refusal, checked_sample, decode
+from hilstar.attitude.wire.source import Components, Mounting, SentAttitudes
+from hilstar.basics.errors import InputError, one_line, printable, shortened
+from hilstar.basics.process.user_code import PREFIX, UserCodeError, user_function
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.answers.answer import Answer, ReportedStar
+from hilstar.server.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, FrameField, FrameLength, field_format
+
+MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
+MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
+MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64  # a number beyond its limit is left out, a word is cut
+PAUSE_NS = NS_PER_S // 10
+CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
+SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
+CHECKSUMS: dict[str, tuple[Callable[[bytes], int], int]] = {
+    "crc16-ccitt-false": (lambda data: binascii.crc_hqx(data, 0xFFFF), 2),
+    "crc16-xmodem": (lambda data: binascii.crc_hqx(data, 0), 2),
+    "crc32": (zlib.crc32, 4),
+    "sum8": (lambda data: sum(data) & 0xFF, 1),
+    "xor8": (lambda data: reduce(xor, data, 0), 1),
+}
+MODES = (
+    (protocol.ANSWER_BLINDED, "blinded"),
+    (protocol.ANSWER_TOO_FEW_STARS, "too few stars"),
+    (protocol.ANSWER_LOST_IN_SPACE, "lost in space"),
+    (protocol.ANSWER_TRACKING, "tracking"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedAnswer:
+    """Bytes that are no answer, and why: a reason in one word, and a line for a person."""
+
+    reason: str
+    detail: str
+    raw: bytes = b""
+
+
+class JsonAnswer(msgspec.Struct, frozen=True):
+    """An answer as a JSON object, and as a Python function gives it."""
+
+    t_ns: int | None = None
+    q: tuple[float, float, float, float] | None = None
+    rate: tuple[float, float, float] | None = None
+    valid: bool = True
+    mode: str | int | None = None
+    stars: int | None = None
+    rms_arcsec: float | None = None
+    centroids: list[list[float | None]] = []
+
+
+def answer_of(sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer) -> Answer | RefusedAnswer:
+    """The answer that a tracker's numbers are, or why they are none; `sent` says what its
+    quaternions mean.
+    """
+    t_ns = said.t_ns
+    if t_ns is not None and t_ns not in INT64:
+        return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
+    mode = "" if said.mode is None else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+    stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
+    plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, stars, said.rms_arcsec, _reported(said.centroids))
+    if said.q is None or not said.valid:  # without an attitude its numbers may be anything
+        return replace(plain, valid=False) if said.q is None else plain
+    checked = checked_sample(0, said.q, said.rate)
+    if isinstance(checked, Refusal):
+        return RefusedAnswer(checked.reason, checked.detail, raw)
+    camera = sent.sample(checked)
+    return replace(plain, q_icrs_to_cam=camera.q_icrs_to_cam, rate_cam_rad_s=camera.rate_cam_rad_s)
+
+
+def _reported(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
+    """The stars of rows [x_px, y_px, dn, hip]; rows that are none of that are left out."""
+    stars = []
+    for row in rows:
+        x_px, y_px, dn, hip = [*row, None, None, None, None][:4]
+        if x_px is not None and y_px is not None and math.isfinite(x_px) and math.isfinite(y_px):
+            stars.append(ReportedStar(x_px, y_px, dn, int(hip) if hip is not None and 0 < hip <= MAX_HIP else None))
+    return tuple(stars)
+
+
+# ---- frames out of a stream ----
+
+
+class Cut(NamedTuple):
+    """What was cut out of a stream: a frame's bytes, or with `reason` what is none."""
+
+    body: bytes
+    reason: str = ""
+    detail: str = ""
+
+
+class Delimited:
+    """Frames that end with a delimiter: COBS, SLIP and lines. What precedes the first delimiter of a stream may be cut off."""
+
+    def __init__(self, end: bytes, max_bytes: int, unstuff: Callable[[bytes], bytes], word: str, whole: bool = False) -> None:
+        self._end, self._max, self._unstuff, self._word = end, max_bytes, unstuff, word
+        self._kept, self._overlong, self._whole = bytearray(), False, whole
+
+    def cut(self, chunk: bytes) -> Iterator[Cut]:
+        """The frames that `chunk` completes."""
+        *bodies, rest = chunk.split(self._end)
+        for body in bodies:
+            self._keep(body)
+            kept, overlong, whole = bytes(self._kept), self._overlong, self._whole
+            self._kept.clear()
+            self._overlong, self._whole = False, True
+            if overlong:
+                yield Cut(kept, "framing", f"no end of {self._word} within {self._max} bytes")
+            elif kept:
+                try:
+                    yield Cut(self._unstuff(kept))
+                except ValueError as error:
+                    if whole:
+                        yield Cut(kept, "framing", f"not {self._word} ({error})")
+        self._keep(rest)
+
+    def _keep(self, part: bytes) -> None:
+        room = self._max - len(self._kept)
+        self._kept += part[:room]
+        self._overlong = self._overlong or len(part) > room
+
+
+def uncobs(body: bytes) -> bytes:
+    """The bytes that a COBS frame holds. Raises ValueError."""
+    try:
+        return bytes(cobs.decode(body))
+    except cobs.DecodeError as error:
+        raise ValueError(str(error)) from error
+
+
+def unslip(body: bytes) -> bytes:
+    """The bytes that a SLIP frame holds (RFC 1055). Raises ValueError."""
+    first, *others = body.split(SLIP_ESC)
+    out = bytearray(first)
+    for part in others:
+        if part[:1] not in {SLIP_ESC_END, SLIP_ESC_ESC}:
+            raise ValueError("an escape before another byte")
+        out += (SLIP_END if part[:1] == SLIP_ESC_END else SLIP_ESC) + part[1:]
+    return bytes(out)
+
+
+class Measured:
+    """Frames told apart by what they begin with and how long they are: sync bytes, Space Packets, or a fixed length.
+
+    A frame that is wrong may have begun at the wrong byte: the next is looked for from its second byte on.
+    """
+
+    def __init__(self, settings: AnswersSettings, check: Callable[[bytes], str], certain: bool) -> None:
+        self._sync = b"" if settings.sync_hex is None else bytes.fromhex(settings.sync_hex)
+        self._length, self._ccsds = settings.length, settings.framing == "ccsds"
+        self._check, self._certain = check, certain
+        self._kept = bytearray()
+        self._silent_bytes = 0  # lost bytes of which nothing more is said
+
+    def pause(self) -> Iterator[Cut]:
+        """Nothing came for a while: what is kept is no frame from its beginning on, or one whose end is lost."""
+        if not self._certain and not self._sync and not self._ccsds:
+            self._kept.clear()
+        while self._kept:
+            yield from self._lose(bytes(self._kept), "its end has not come")
+            del self._kept[:1]
+            yield from self._cut()
+
+    def cut(self, chunk: bytes) -> Iterator[Cut]:
+        """The frames that `chunk` completes."""
+        for begin in range(0, len(chunk), MAX_FRAME_BYTES):
+            self._kept += chunk[begin : begin + MAX_FRAME_BYTES]
+            yield from self._cut()
+
+    def _cut(self) -> Iterator[Cut]:
+        kept, at = self._kept, 0
+        while at < len(kept):
+            if self._sync and not kept.startswith(self._sync, at):
+                found = kept.find(self._sync, at)
+                # The last bytes may be the beginning of the sync bytes.
+                beyond = found if found >= 0 else max(at, len(kept) - len(self._sync) + 1)
+                yield from self._lose(bytes(kept[at:beyond]), "no sync bytes")
+                at = beyond
+                if found < 0:
+                    break
+            size = self._size(at)
+            if size is None or (size > 0 and at + size > len(kept)):
+                break
+            body = bytes(kept[at : at + size])
+            wrong = "a length that no frame has" if size <= 0 else self._check(body)
+            if wrong and size > 0 and not self._certain:
+                wrong = ""
+            if wrong:
+                yield from self._lose(body or bytes(kept[at : at + 1]), wrong)
+                at += 1
+                continue
+            self._silent_bytes = 0
+            at += size
+            yield Cut(body)
+        del kept[:at]
+
+    def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
+        """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first of as many as a frame has.
+
+        Where nothing tells where a frame begins, each of a damaged one's bytes is tried.
+        """
+        of_checksum = "checksum" in detail
+        told = (of_checksum and bool(self._sync)) or self._silent_bytes <= 0
+        self._silent_bytes -= 1
+        if raw and told:
+            self._silent_bytes = len(raw) - 1 if of_checksum else MAX_FRAME_BYTES
+            yield Cut(raw, "checksum" if of_checksum else "framing", detail)
+
+    def _size(self, at: int) -> int | None:
+        """Bytes of the frame that begins there; 0 where none can, None where too few have come to tell."""
+        kept = self._kept
+        if self._ccsds:
+            if len(kept) - at < CCSDS_HEADER_BYTES:
+                return None
+            size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(kept[at + 4 : at + 6], "big")
+            wanted = self._length if isinstance(self._length, int) else size
+            return size if not kept[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES else 0
+        if not isinstance(self._length, FrameLength):
+            return self._length
+        end = self._length.at + (field_format(self._length.type) or ("u", 1, False))[1]
+        if len(kept) - at < end:
+            return None
+        size = int(raw_number(bytes(kept[at : at + end]), self._length.at, self._length.type)) + self._length.add
+        return size if end <= size <= MAX_FRAME_BYTES else 0
+
+
+def raw_number(body: bytes, at: int, kind: str) -> int | float:
+    """A number in a frame. Raises IndexError beyond its end."""
+    form, size, big = field_format(kind) or ("u", 1, False)
+    raw = body[at : at + size]
+    if len(raw) < size:
+        raise IndexError(f"byte {at + size - 1} of {len(body)}")
+    if form == "f":
+        (number,) = struct.unpack(f"{'>' if big else '<'}{'f' if size == 4 else 'd'}", raw)
+        return float(number)
+    return int.from_bytes(raw, "big" if big else "little", signed=form == "i")
+
+
+class FrameDecoder:
+    """A tracker's own frames, as a bench file declares them."""
+
+    def __init__(self, settings: AnswersSettings) -> None:
+        self.settings = settings
+        self._matches = [(each.at, bytes.fromhex(each.hex)) for each in settings.match]
+
+    def fault(self, body: bytes) -> str:
+        """What is wrong with a frame's checksum; "" where it is right, or there is none."""
+        settings = self.settings
+        if settings.checksum == "none":
+            return ""
+        calculate, size = CHECKSUMS[settings.checksum]
+        at = -size if settings.checksum_at is None else settings.checksum_at
+        at += len(body) if at < 0 else 0
+        if at < settings.checksum_from or at + size > len(body):
+            return f"too short for its checksum: {len(body)} bytes"
+        found = int.from_bytes(body[at : at + size], settings.checksum_order)
+        wanted = calculate(body[settings.checksum_from : at])
+        return "" if found == wanted else f"the {settings.checksum} checksum is {found:#x}, and {wanted:#x} by the bytes"
+
+    def decoded(self, body: bytes) -> JsonAnswer | RefusedAnswer:
+        """What a frame says."""
+        if fault := self.fault(body):
+            return RefusedAnswer("checksum", fault, body)
+        if any(body[at : at + len(wanted)] != wanted for at, wanted in self._matches):
+            return RefusedAnswer("other", "a frame of another kind ([answers] match)", body)
+        try:
+            found: dict[str, int | float] = {field.name: self.value(body, field) for field in self.settings.fields}
+        except IndexError as error:
+            return RefusedAnswer("length", f"a field needs {error}", body)
+        return said_by(found, body)
+
+    def value(self, body: bytes, field: FrameField) -> int | float:
+        """The value of a field: whole where neither scale nor sum says otherwise. Raises IndexError beyond the frame's end."""
+        raw = raw_number(body, field.at, field.type)
+        if field.mask is not None and isinstance(raw, int):
+            raw = (raw & field.mask) >> ((field.mask & -field.mask).bit_length() - 1)
+        if isinstance(raw, int) and field.scale.is_integer() and field.add.is_integer():
+            return raw * int(field.scale) + int(field.add)
+        return raw * field.scale + field.add
+
+
+def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | RefusedAnswer:
+    """An answer of the named numbers of a frame."""
+    q = tuple(float(found[name]) for name in ("qw", "qx", "qy", "qz"))
+    rate = tuple(float(found[name]) for name in ("wx", "wy", "wz")) if "wx" in found else None
+    # Each by itself: whole seconds and a fraction stay exact.
+    times_ns = [
+        found[name] * unit_ns for name, unit_ns in (("t_ns", 1), ("t_s", NS_PER_S), ("t_sub", NS_PER_S)) if name in found
+    ]
+    if not all(map(math.isfinite, times_ns)):
+        return RefusedAnswer("nan", "its time is not finite", body)
+    t_ns = sum(map(round, times_ns)) if times_ns else None
+    stars, mode = found.get("stars"), found.get("mode")
+    if not all(number is None or math.isfinite(number) for number in (stars, mode)):
+        stars = mode = None
+    valid = "valid" not in found or (math.isfinite(found["valid"]) and found["valid"] != 0)
+    # Numbers of another kind in a frame are the tracker's own affair; four and three of them are fixed by the bench file.
+    return JsonAnswer(
+        t_ns, (q[0], q[1], q[2], q[3]), None if rate is None else (rate[0], rate[1], rate[2]), valid,
+        None if mode is None else f"{mode:g}", None if stars is None else int(stars),
+    )  # fmt: skip
+
+
+# ---- the formats ----
+
+
+class AnswerDecoder:
+    """Bytes in, answers and refusals out, by the format that a bench file names.
+
+    `messages` says that each chunk is whole by itself (UDP, ZeroMQ). Raises InputError where a Python function cannot be
+    loaded, whose module stands in `folder` or in a package of `trust`.
+    """
+
+    def __init__(
+        self, settings: AnswersSettings, q_body_to_cam: Components | None, messages: bool, folder: Path | None = None
+    ) -> None:
+        self.settings, self.q_body_to_cam = settings, q_body_to_cam
+        self.sent = SentAttitudes(settings.convention, Mounting(q_body_to_cam))
+        self._messages, self._last_ns = messages, 0
+        self.frames = FrameDecoder(settings)
+        self._function = _load(settings, folder) if settings.format.startswith(PREFIX) else None
+        self._cutter = self._make_cutter()
+
+    def _make_cutter(self) -> Delimited | Measured | None:
+        settings = self.settings
+        if settings.format == "frame":
+            if settings.framing == "cobs":
+                return Delimited(b"\0", MAX_KEPT_BYTES, uncobs, "a COBS frame")
+            if settings.framing == "slip":
+                return Delimited(SLIP_END, MAX_KEPT_BYTES, unslip, "a SLIP frame")
+            return Measured(settings, self.frames.fault, certain=settings.checksum != "none")
+        if self._messages or self._function is not None:
+            return None
+        if settings.format == "json":
+            return Delimited(b"\n", MAX_JSON_BYTES, bytes.strip, "a line", whole=True)
+        return Delimited(b"\0", MAX_KEPT_BYTES, uncobs, "a COBS frame")
+
+    def feed(self, host_ns: int, chunk: bytes) -> list[Answer | RefusedAnswer]:
+        """What `chunk` completes, which came at a host time, ns."""
+        cutter = self._cutter
+        if cutter is None:
+            return [self._answer(host_ns, said, chunk) for said in self._said(chunk)]
+        cuts = cutter.cut(chunk + self._end() if self._messages else chunk)
+        # A program that writes a file may leave a frame in two for as long as it likes.
+        if isinstance(cutter, Measured) and host_ns - self._last_ns > PAUSE_NS and self.settings.source != "file":
+            cuts = chain(cutter.pause(), cuts)
+        self._last_ns = host_ns
+        found: list[Answer | RefusedAnswer] = []
+        for cut in cuts:
+            if cut.reason:
+                found.append(RefusedAnswer(cut.reason, cut.detail, cut.body))
+            else:
+                found += [self._answer(host_ns, said, cut.body) for said in self._said(cut.body)]
+        return found
+
+    def _end(self) -> bytes:
+        """A message over UDP or ZeroMQ need not have the end that its framing has on a line."""
+        return {"cobs": b"\0", "slip": SLIP_END}.get(self.settings.framing or "", b"")
+
+    def _answer(self, host_ns: int, said: JsonAnswer | RefusedAnswer, raw: bytes) -> Answer | RefusedAnswer:
+        return said if isinstance(said, RefusedAnswer) else answer_of(self.sent, host_ns, raw, said)
+
+    def _said(self, body: bytes) -> Iterable[JsonAnswer | RefusedAnswer]:
+        if self._function is not None:
+            return _of_function(self._function, body)
+        if self.settings.format == "frame":
+            return [self.frames.decoded(body)]
+        if self.settings.format == "json":
+            return [_of_json(line) for line in body.splitlines() if line.strip()]
+        return [_of_packet(body)]
+
+
+def _of_packet(body: bytes) -> JsonAnswer | RefusedAnswer:
+    found = decode(body)
+    if isinstance(found, Refusal):
+        return RefusedAnswer(found.reason, found.detail.replace("an attitude of 64", "an answer of 68"), body)
+    if not isinstance(found, AnswerPacket):
+        return RefusedAnswer("format", f"a packet of another kind; send kind {protocol.KIND_ANSWER}", body)
+    w, x, y, z = found.q_icrs_to_cam
+    rx, ry, rz = found.rate_cam_rad_s
+    rate = (rx, ry, rz) if found.flags & protocol.ANSWER_RATE_VALID else None
+    mode = next((word for bit, word in MODES if found.flags & bit), "")
+    return JsonAnswer(found.t_ns, (w, x, y, z), rate, bool(found.flags & protocol.ANSWER_VALID), mode, found.stars)
+
+
+_json = msgspec.json.Decoder(JsonAnswer)
+
+
+def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
+    if len(line) > MAX_JSON_BYTES:
+        return RefusedAnswer("format", f"more than {MAX_JSON_BYTES} bytes of JSON", line[:MAX_FRAME_BYTES])
+    try:
+        return _json.decode(line)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        if b"NaN" in line or b"Infinity" in line:
+            return RefusedAnswer("nan", "a number is NaN or Infinity", line)
+        return RefusedAnswer("format", f'{error}; write {{"t_ns":..., "q":[w,x,y,z]}}', line)
+
+
+def _load(settings: AnswersSettings, folder: Path | None) -> Callable[[bytes], Any]:
+    try:
+        return user_function(settings.format, folder or Path(), settings.trust)
+    except UserCodeError as error:
+        said = f'[answers] format = "{settings.format}": {error}'
+        raise InputError(f"{one_line(said)}; name a module beside the bench file and its function") from error
+
+
+def _of_function(function: Callable[[bytes], Any], chunk: bytes) -> Iterator[JsonAnswer | RefusedAnswer]:
+    """The answers of a user's function: a dictionary each, as the JSON object."""
+    try:
+        for said in function(chunk) or ():
+            try:
+                yield msgspec.convert(said, JsonAnswer, strict=False, builtin_types=())
+            except msgspec.ValidationError as error:
+                yield RefusedAnswer("format", f"the function gave {error}", chunk)
+    except Exception as error:  # a user's code: its fault is told as any other bytes'
+        yield RefusedAnswer("python", one_line(f"{type(error).__name__}: {error}"), chunk)

@@ -1,0 +1,344 @@
+"""A tracker's answers judged as they come: when each looked, how far it is off, and the figures of the last minute; no I/O.
+
+**When.** A stamp on the tracker's own clock is followed as a sender's clock is (`SenderClock`), from arrivals alone. That tells
+times up to the shortest delay D from an exposure's middle to its answer. D is found from the motion: reading the lit attitude
+too late by delta turns a residual by omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the
+answers of the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and GUESSED_DELAY_S.
+
+**Laws.** Answers of finite numbers, however odd and in whatever order, never end the judging. No number that is not finite is
+stored. A fit that is not finite, that has too few answers near it, or whose delay is over MAX_DELAY_S is dropped, and the delay
+before it stays. A delay under which answers are no longer right is given up for the guess.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.process.scheduling import HOST_CLOCK, UnixOffset
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
+from hilstar.server.answers.answer import JUMP_NS, Answer, StampOrder
+from hilstar.server.answers.pairing import KEPT_NS, Lit, LitFrames, residual_arcsec
+
+if TYPE_CHECKING:
+    from hilstar.server.bench.config import BenchConfig
+
+Verdict = Literal["right", "wrong", "invalid", "unpaired", "unjudged"]
+Stamp = Literal["start", "middle", "end", "arrival"]
+TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the middle, in exposures
+WINDOW_S = 60.0
+MAX_IN_WINDOW = 4096  # at over 68 answers a second less than a minute
+GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
+FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
+MAX_ROUNDS = 8  # of the fit, which ends earlier where the same answers count as in the round before
+CUT_SIGMAS = 8.0
+MIN_NOISE_ARCSEC = 0.1  # least noise that the fit takes: answers without noise have errors of the pairing
+MAX_DELAY_S = KEPT_NS / NS_PER_S / 2  # under a longer one the frames of an exposure are soon forgotten
+SURE, MAX_EXCUSED_S = 3.0, 0.3  # sigmas of the time by which an answer may be off for its rate, and at most so long
+KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
+JUMPS = 3  # answers in a row that are later by JUMP_NS: the tracker's clock was set
+SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerRules:
+    """What the bench file says of answers' times, and from which angle on one is wrong. `latency_s` None: not known."""
+
+    exposure_s: float
+    stamp: Stamp = "middle"
+    clock: Literal["own", "unix", "host"] = "own"
+    wrong_arcsec: float = 3600.0
+    latency_s: float | None = None
+
+    @classmethod
+    def of(cls, config: "BenchConfig") -> Self:
+        """Those of a bench file; the defaults for one without `[answers]`."""
+        settings, exposure_s = config.answers, config.tracker.exposure_s
+        if settings is None:
+            return cls(exposure_s)
+        latency_s = None if settings.latency_ms is None else settings.latency_ms / 1e3
+        return cls(exposure_s, settings.stamp, settings.clock, settings.wrong_arcsec, latency_s)
+
+
+class Judged(NamedTuple):
+    """An answer, its exposure's middle (host time, ns, with its sigma, s), what was lit, and the residual (3,), arcsec, cam."""
+
+    answer: Answer
+    verdict: Verdict
+    middle_ns: int
+    sigma_s: float
+    lit: Lit | None = None
+    residual: FloatArray | None = None
+
+
+def unjudged(answer: Answer) -> Judged:
+    """An answer that is compared with nothing: its exposure is not known, and its arrival stands for it."""
+    return Judged(answer, "unjudged", answer.host_ns, 0.0)
+
+
+class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """A tracker's answers: counts of the run, the newest answer, and the last minute's figures; arcsec about x, y, z (cam).
+
+    `out_of_order` counts answers whose stamp is before that of one that came earlier, `unjudged` those that judging failed on.
+    `rms_arcsec` is about zero, `sigma3_arcsec` three standard deviations about the mean, both of right answers.
+    `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null: not known). `availability`
+    is right answers over those due while a sky was shown. `silent` says that no answer comes, "" while they do, and `trouble`
+    what is wrong with the tracker's line for as long as it lasts.
+    """
+
+    answers: int = 0
+    right: int = 0
+    wrong: int = 0
+    invalid: int = 0
+    unpaired: int = 0
+    unjudged: int = 0
+    out_of_order: int = 0
+    refused: dict[str, int] = {}
+    residual_arcsec: list[float] | None = None
+    verdict: str = ""
+    mode: str = ""
+    stars: int | None = None
+    rate_hz: float | None = None
+    availability: float | None = None
+    mean_arcsec: list[float] | None = None
+    rms_arcsec: list[float] | None = None
+    sigma3_arcsec: list[float] | None = None
+    latency_ms: float | None = None
+    latency_sigma_ms: float | None = None
+    age_s: float | None = None
+    silent: str = ""
+    trouble: str = ""
+
+
+class AnswerTimes:
+    """When the tracker looked: the middle of an answer's exposure on the host's clock."""
+
+    def __init__(self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset) -> None:
+        self._rules, self._unix_offset = rules, unix_offset
+        self._known, self._known_ns = UnixOffset(0, 0), -KNOWN_AGAIN_NS
+        self._clock = SenderClock()
+        self._late = 0
+        self.order = StampOrder()
+        self.guess_s = rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
+        self.fits = rules.latency_s is None and (rules.clock == "own" or rules.stamp == "arrival")
+        self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S if self.fits else 0.0
+
+    def shift(self, delay: "DelayFit") -> None:
+        """Take a delay that was found from the motion."""
+        self.delay_s += delay.shift_s
+        self.sigma_s = delay.sigma_s
+
+    def give_up(self) -> None:
+        """Go back to the guess: under the delay that was found, answers are not right."""
+        self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S
+
+    def middle(self, answer: Answer) -> tuple[int, float]:
+        """The middle of the exposure, host time, ns, and its sigma, s."""
+        rules = self._rules
+        if answer.t_ns is not None:
+            self.order.take(answer.t_ns)
+        if answer.t_ns is None or rules.stamp == "arrival":
+            return answer.host_ns - round(self.delay_s * NS_PER_S), self.sigma_s
+        t_ns = answer.t_ns + round(TO_MIDDLE[rules.stamp] * rules.exposure_s * NS_PER_S)
+        if rules.clock == "host":
+            return t_ns, 0.0
+        if rules.clock == "unix":
+            if answer.host_ns - self._known_ns >= KNOWN_AGAIN_NS:
+                self._known, self._known_ns = self._unix_offset(), answer.host_ns
+            return t_ns + self._known.offset_ns, self._known.error_ns / NS_PER_S
+        late_ns = self._clock.latency_ns(t_ns, answer.host_ns)
+        self._late = self._late + 1 if late_ns is not None and late_ns > JUMP_NS else 0
+        if self._late == JUMPS:
+            self._clock, self._late = SenderClock(), 0
+        self._clock.observe(t_ns, answer.host_ns)
+        late_ns = max(self._clock.latency_ns(t_ns, answer.host_ns) or 0.0, 0.0)
+        known_ms = self._clock.summary().uncertainty_ms
+        sigma_s = self.sigma_s + (0.0 if known_ms is None else known_ms / 1e3)
+        return answer.host_ns - round(late_ns + self.delay_s * NS_PER_S), sigma_s
+
+
+class DelayFit(NamedTuple):
+    """What the delay changes by, s, and one sigma of it, s."""
+
+    shift_s: float
+    sigma_s: float
+
+
+def fitted_delay(error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float) -> DelayFit | None:
+    """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they tell none.
+
+    `pull_s` is from the present delay to the guessed one, which is known to GUESSED_SIGMA_S. An axis has its own noise: a
+    tracker's roll is many times as noisy as its cross axes. Answers far from the others, by their axes' noise, do not count.
+    """
+    design = np.zeros((len(error_arcsec), 3, 4))
+    design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate_arcsec_s
+    precision = np.array([0.0, 0.0, 0.0, GUESSED_SIGMA_S**-2])
+    off = error_arcsec - np.median(error_arcsec, axis=0)
+    near_before = None
+    for _ in range(MAX_ROUNDS):
+        noise = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), MIN_NOISE_ARCSEC)
+        near = ((off / noise) ** 2).sum(axis=1) < CUT_SIGMAS**2
+        if near.sum() < MIN_FITTED:
+            return None
+        if near_before is not None and np.array_equal(near, near_before):
+            break
+        scaled = design[near] / noise[:, None] ** 2
+        normal = np.einsum("nij,nik->jk", scaled, design[near]) + np.diag(precision)
+        pulled = np.einsum("nij,ni->j", scaled, error_arcsec[near]) + precision * pull_s
+        try:
+            fitted = np.linalg.solve(normal, pulled)
+            variance = np.linalg.inv(normal)[3, 3]
+        except np.linalg.LinAlgError:
+            return None
+        off, near_before = error_arcsec - design @ fitted, near
+        if not (np.isfinite(off).all() and np.isfinite(variance) and variance >= 0):
+            return None
+    return DelayFit(float(fitted[3]), float(np.sqrt(variance)))
+
+
+VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
+# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s; residual; rate, arcsec/s.
+HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
+
+
+class AnswerJudge:
+    """Judges answers against the lit frames, and keeps the last minute's figures."""
+
+    def __init__(self, rules: AnswerRules, frames: LitFrames) -> None:
+        self.counts: Counter[Verdict] = Counter()
+        self.times = AnswerTimes(rules)
+        self._rules, self._frames = rules, frames
+        self._rows = np.zeros((MAX_IN_WINDOW, COLUMNS))
+        self._count = 0
+        self._fitted_ns = 0
+        self._newest: Judged | None = None
+        self._begun_ns: int | None = None
+
+    def judge(self, answer: Answer) -> Judged:
+        """Judge one answer."""
+        middle_ns, sigma_s = self.times.middle(answer)
+        verdict: Verdict = "invalid"
+        lit = residual = None
+        half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
+        if answer.valid and answer.q_icrs_to_cam is not None:
+            verdict = "unpaired"
+            lit = self._frames.over(middle_ns - half_ns, middle_ns + half_ns)
+            if lit is not None:
+                residual = residual_arcsec(answer.q_icrs_to_cam, lit.q)
+                verdict = self._verdict(residual, lit, sigma_s)
+        if verdict == "unjudged":
+            lit = residual = None
+        found = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
+        self._keep(found)
+        if self.times.fits and abs(answer.host_ns - self._fitted_ns) > FIT_EACH_NS:
+            self._fitted_ns = answer.host_ns
+            self._fit(answer.host_ns)
+        return found
+
+    def pass_over(self, answer: Answer) -> Judged:
+        """An answer that judging failed on: it is counted, and compared with nothing."""
+        found = unjudged(answer)
+        self._keep(found)
+        return found
+
+    def _verdict(self, residual: FloatArray, lit: Lit, sigma_s: float) -> Verdict:
+        """Whether a residual is an attitude of the sky that was lit, by a time known to `sigma_s`."""
+        off_arcsec = float(np.linalg.norm(residual))
+        rate_arcsec_s = ARCSEC_PER_RAD * float(np.linalg.norm(lit.rate_rad_s))
+        if not math.isfinite(off_arcsec) or not math.isfinite(rate_arcsec_s):
+            return "unjudged"
+        excused_s = min(SURE * sigma_s, MAX_EXCUSED_S)
+        bound_arcsec = self._rules.wrong_arcsec + excused_s * rate_arcsec_s
+        return "wrong" if off_arcsec > bound_arcsec else "right"
+
+    def _keep(self, found: Judged) -> None:
+        """Count an answer, and keep its row; without a comparison its error and rate are 0, which nothing reads."""
+        row = self._rows[self._count % MAX_IN_WINDOW]
+        row[:] = 0.0
+        row[:3] = found.answer.host_ns / NS_PER_S, VERDICTS.index(found.verdict), self._frames.dark_ns / NS_PER_S
+        if found.lit is not None and found.residual is not None:
+            row[ERROR], row[RATE] = found.residual, ARCSEC_PER_RAD * found.lit.rate_rad_s
+        self._count += 1
+        self.counts[found.verdict] += 1
+        self._newest = found
+
+    def _lately(self, now_ns: int) -> FloatArray:
+        at = self._count % MAX_IN_WINDOW
+        rows = self._rows[: self._count] if self._count < MAX_IN_WINDOW else np.roll(self._rows, -at, axis=0)
+        return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]
+
+    def _fit(self, now_ns: int) -> None:
+        """Find the delay, together with the bias, from the last minute's right answers."""
+        rows, times = self._lately(now_ns), self.times
+        right = rows[rows[:, VERDICT] == VERDICTS.index("right")]
+        if len(right) < MIN_FITTED:
+            wrong = rows[:, VERDICT] == VERDICTS.index("wrong")
+            if wrong.sum() >= MIN_FITTED:
+                before_s = times.delay_s
+                times.give_up()
+                self._turn_errors(times.delay_s - before_s)
+            return
+        found = fitted_delay(right[:, ERROR], right[:, RATE], times.guess_s - times.delay_s)
+        if found is None or times.delay_s + found.shift_s > max(MAX_DELAY_S, times.guess_s):
+            return
+        shift_s = max(found.shift_s, self._rules.exposure_s / 2 - times.delay_s)
+        times.shift(DelayFit(shift_s, found.sigma_s))
+        self._turn_errors(shift_s)
+
+    def _turn_errors(self, shift_s: float) -> None:
+        """The errors of the answers that are kept, under a delay that is longer by `shift_s`."""
+        self._rows[:, ERROR] -= self._rows[:, RATE] * shift_s
+
+    def figures(self, now_ns: int, refused: dict[str, int], trouble: str = "") -> TrackerFigures:
+        """The figures at a host time; `refused` counts bytes or messages that were no answer, by reason.
+
+        `trouble` is what is wrong with the tracker's line.
+        """
+        self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
+        rows, newest = self._lately(now_ns), self._newest
+        told: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
+        told["out_of_order"] = self.times.order.fallen
+        cycle_s = cycle_of(rows[:, HOST_S])
+        since_s = (now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)) / NS_PER_S
+        limit_s = FIRST_S if newest is None else max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
+        if newest is not None:
+            late_s = (newest.answer.host_ns - newest.middle_ns) / NS_PER_S
+            told |= {"mode": newest.answer.mode, "stars": newest.answer.star_count, "verdict": newest.verdict}
+            told |= {"latency_ms": round(1e3 * late_s, 3), "latency_sigma_ms": round(1e3 * newest.sigma_s, 3)}
+            told |= {
+                "residual_arcsec": None if newest.residual is None else _rounded(newest.residual),
+                "age_s": round(since_s, 3),
+            }
+        error = rows[rows[:, VERDICT] == 0][:, ERROR]
+        if len(error):
+            told |= {"mean_arcsec": _rounded(error.mean(axis=0)), "rms_arcsec": _rounded(np.sqrt((error**2).mean(axis=0)))}
+        if len(error) > 1:
+            told |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
+        if cycle_s is not None:  # arrivals jitter by less than half a cycle
+            dark_s = self._frames.dark_ns / NS_PER_S - rows[0, DARK_S]
+            due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
+            told |= {"rate_hz": round(1 / cycle_s, 3), "availability": round(min(len(error) / max(due, 1), 1.0), 4)}
+        words = "the tracker has not answered" + (" yet" if newest is None else f" for {since_s:.1f} s")
+        words += f" ({trouble})" if trouble else ""
+        return TrackerFigures(
+            answers=sum(self.counts.values()),
+            refused=refused,
+            silent=words if since_s > limit_s else "",
+            trouble=trouble,
+            **told,
+        )
+
+
+def cycle_of(at_s: FloatArray) -> float | None:
+    """The usual time between answers at rising times (n,), s; None for fewer than three."""
+    return max(float(np.median(np.diff(at_s))), 1e-4) if len(at_s) > 2 else None
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [round(value, 3) for value in values.tolist()]

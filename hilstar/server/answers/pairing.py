@@ -1,0 +1,122 @@
+"""An answer and what was lit while the tracker looked: the mean attitude over an exposure, frame by frame."""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, propagate, to_rotation_vector
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+
+KEPT_NS = 20 * NS_PER_S  # how long a frame is kept: an answer that comes later than that is not compared
+MAX_HELD_NS = NS_PER_S // 2  # a frame without a following one is taken to stay for so long
+MIN_LIT_SHARE = 0.5  # an exposure that was darker shows no commanded attitude
+MAX_STEP_RAD = np.radians(2.0)  # between two frames of an exposure: a larger step is a jump, and the exposure has two skies
+
+
+class LitFrame(NamedTuple):
+    """A frame: its light's begin on the host's and on the sender's clock, ns, and what it shows; `q` None shows no sky."""
+
+    number: int
+    host_ns: int
+    light_ns: int
+    q: FloatArray | None
+    rate_rad_s: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """What was lit over an exposure: the mean `q_icrs_to_cam`, the rate (3,), rad/s, cam, and its first and last frames.
+
+    `light_ns` is the exposure's middle on the sender's clock.
+    """
+
+    q: FloatArray
+    rate_rad_s: FloatArray
+    light_ns: int
+    first: int
+    last: int
+
+
+class LitFrames:
+    """The frames of the last seconds. One thread adds them, another asks.
+
+    A frame is lit until the next one. `centred`: frames stand for the time about their moment, as without a screen that holds
+    them; `hold_s` is how long a row of a screen stays lit, through the middle of which a frame drawn in motion passes.
+    """
+
+    def __init__(self, period_ns: float, hold_s: float = 0.0, *, centred: bool = True) -> None:
+        self.dark_ns = 0  # how long no sky was shown
+        self._frames: deque[LitFrame] = deque(maxlen=max(16, int(KEPT_NS / period_ns)))
+        self._hold_s, self._early_ns = hold_s, round(period_ns / 2) if centred else 0
+
+    def add(self, frame: LitFrame) -> None:
+        """Add the newest frame."""
+        if self._frames and self._frames[-1].q is None:
+            self.dark_ns += frame.host_ns - self._frames[-1].host_ns
+        self._frames.append(frame)
+
+    @property
+    def newest(self) -> LitFrame | None:
+        """The newest frame."""
+        return self._frames[-1] if self._frames else None
+
+    def over(self, start_ns: int, end_ns: int) -> Lit | None:
+        """What was lit from `start_ns` to `end_ns` of the host's clock; None where that was no one sky, or is forgotten."""
+        frames = list(self._frames)
+        first = len(frames) - 1
+        while first >= 0 and self._begin_ns(frames[first]) > start_ns:
+            first -= 1
+        if first < 0:
+            return None
+        last = first
+        while last + 1 < len(frames) and self._begin_ns(frames[last + 1]) < end_ns:
+            last += 1
+        kept, lit_ns, whole_ns = [], [], 0
+        for k in range(first, last + 1):
+            begin_ns = self._begin_ns(frames[k])
+            gone_ns = self._begin_ns(frames[k + 1]) if k + 1 < len(frames) else begin_ns + MAX_HELD_NS
+            overlap_ns = max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0) if end_ns > start_ns else 1
+            if frames[k].q is not None and overlap_ns:
+                kept.append(k)
+                lit_ns.append(overlap_ns)
+                whole_ns += overlap_ns
+        if not kept or whole_ns < MIN_LIT_SHARE * (end_ns - start_ns):
+            return None
+        return self._mean(frames, kept, np.array(lit_ns, dtype=np.float64), (start_ns + end_ns) // 2)
+
+    def _begin_ns(self, frame: LitFrame) -> int:
+        return frame.host_ns - (self._early_ns if frame.rate_rad_s is None else 0)
+
+    def _mean(self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int) -> Lit | None:
+        """The mean rotation of the frames `kept`, weighted by how long each was lit; None across a jump."""
+        # The rate needs two frames: of a short exposure a neighbour too.
+        near = kept if len(kept) > 1 else [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
+        near = [k for k in near if frames[k].q is not None]
+        q = np.array([self._shown(frames[k]) for k in near])
+        turned = to_rotation_vector(multiply(q, conjugate(q[:1])))
+        steps = np.linalg.norm(np.diff(turned, axis=0), axis=1)
+        if len(kept) > 1 and steps.max() > MAX_STEP_RAD:
+            return None
+        at_s = np.array([(frames[k].host_ns - middle_ns) / NS_PER_S for k in near])
+        spread_s = at_s - at_s.mean()
+        power = float(spread_s @ spread_s)
+        rate = -(spread_s @ turned) / power if power and (not len(steps) or steps.max() <= MAX_STEP_RAD) else np.zeros(3)
+        inside = [near.index(k) for k in kept]
+        mean = lit_ns @ turned[inside] / lit_ns.sum()
+        nearest = min((frames[k] for k in kept), key=lambda frame: abs(frame.host_ns - middle_ns))
+        light_ns = nearest.light_ns + middle_ns - nearest.host_ns
+        q_mean = normalise(multiply(from_rotation_vector(mean), q[0]))
+        return Lit(q_mean, rate, light_ns, frames[kept[0]].number, frames[kept[-1]].number)
+
+    def _shown(self, frame: LitFrame) -> FloatArray:
+        """The mean attitude of what a frame shows: of one drawn in motion that of the middle of its light."""
+        assert frame.q is not None
+        return frame.q if frame.rate_rad_s is None else propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
+
+
+def residual_arcsec(reported: FloatArray, lit: FloatArray) -> FloatArray:
+    """The rotation vector (3,) from a lit to a reported attitude, cam, as `hilstar assess` has it."""
+    return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(reported, conjugate(lit))))

@@ -1,0 +1,159 @@
+"""certificate.json: how sure a bench is, as `hilstar certify` states it and `serve`, `assess` and requirements read it."""
+
+import datetime
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.reading import NOT_JSON, read_bytes
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.glass import say_once
+
+KIND = "hilstar certificate 1"
+MAX_BYTES = 50_000_000
+ANEW = "certify the bench anew (hilstar certify --again)"
+ADVICE = "give the certificate.json that `hilstar certify BENCH.toml -o DIR` wrote"
+
+
+class Contribution(msgspec.Struct, frozen=True, kw_only=True):
+    """What an input adds to a figure: its standard uncertainty in the figure's unit, and its share of the variance."""
+
+    input: str
+    standard_uncertainty: float
+    share: float
+
+
+class ByTrials(msgspec.Struct, frozen=True, kw_only=True):
+    """The same figure by Supplement 1, and why its interval differs from that of first order; "" where it does not."""
+
+    standard_uncertainty: float
+    lower: float
+    upper: float
+    differs: str
+
+
+class CertifiedFigure(msgspec.Struct, frozen=True, kw_only=True):
+    """A figure with its 95 % interval. `region` is a third of the screen, a field or the screen; `star` a HIP number.
+
+    `conforms` is None without a limit, and `truth` is known of a virtual bench alone.
+    """
+
+    quantity: str
+    region: str
+    star: int | None
+    field: int | None
+    value: float
+    standard_uncertainty: float
+    k: float
+    lower: float
+    upper: float
+    unit: str
+    dof: float | None
+    limit: float | None
+    conforms: bool | None
+    truth: float | None
+    by_trials: ByTrials | None
+    contributions: list[Contribution]
+
+
+class InputRow(msgspec.Struct, frozen=True, kw_only=True):
+    """An input of the budget; `dof` is None where it is not limited."""
+
+    name: str
+    distribution: str
+    standard_uncertainty: float
+    unit: str
+    dof: float | None
+    source: str
+
+
+class Certificate(msgspec.Struct, frozen=True, kw_only=True):
+    """A whole certificate. Times are UTC; `files` has the SHA-256 of the bench file and of each file that it names."""
+
+    kind: str
+    number: str
+    made: str
+    valid_until: str
+    hilstar: str
+    bench: str
+    bench_sha256: str
+    files: dict[str, str]
+    monitor: dict[str, Any]
+    collimator: dict[str, Any]
+    read_by: str
+    who: str
+    where: str
+    ambient: str
+    traceability: str
+    instrument: dict[str, Any]
+    decision: str
+    conforms: bool | None
+    trials: int
+    two_digits_stand: bool
+    inputs: list[InputRow]
+    figures: list[CertifiedFigure]
+    not_assessed: list[str]
+    measurands: dict[str, str]
+    reference_sha256: str | None = None
+    replaces: str | None = None
+
+    def expanded(self, quantities: Iterable[str]) -> float | None:
+        """The largest |value| + half width of the interval of some quantities; None where it has none of them."""
+        found = [max(abs(each.lower), abs(each.upper)) for each in self.figures if each.quantity in set(quantities)]
+        return max(found) if found else None
+
+    @property
+    def attitude_arcsec(self) -> tuple[float, float] | None:
+        """How far the bench's own attitude may be off at 95 %, across the boresight and about it; None where not assessed."""
+        cross, roll = self.expanded(("attitude_x", "attitude_y")), self.expanded(("attitude_z",))
+        return None if cross is None or roll is None else (cross, roll)
+
+    @property
+    def line(self) -> str:
+        """The certificate for a person."""
+        return f"certificate {self.number} of {self.made[:10]}, valid until {self.valid_until}"
+
+
+def read_certificate(path: Path) -> Certificate:
+    """A certificate. Raises InputError for a file that is none."""
+    raw = read_bytes(path, ADVICE, MAX_BYTES)
+    try:
+        found = msgspec.json.decode(raw, type=Certificate)
+    except NOT_JSON as error:
+        raise InputError(f"{path}: is no certificate ({shortened(error)}); {ADVICE}") from error
+    if found.kind != KIND:
+        raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
+    return found
+
+
+def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Certificate | None:
+    """The certificate that a bench file names, None where it names none; a notice where it is not this bench's, or is over.
+
+    Raises InputError for a file that is none.
+    """
+    name = file.config.certify.certificate
+    if name is None:
+        return None
+    found = read_certificate((file.folder / name).resolve())
+    if found.bench_sha256 != file.sha256:
+        say_once(f"{found.line} is of another state of this bench file; {ANEW}", "[certify] certificate")
+    if found.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
+        say_once(f"{found.line} is over; {ANEW}", "[certify] certificate")
+    return found
+
+
+def off_by(found: Certificate) -> str:
+    """How far the bench's own attitude may be off, in words."""
+    if found.attitude_arcsec is None:
+        return "its own attitude was not assessed"
+    cross, roll = found.attitude_arcsec
+    return f"the bench itself is off by at most {cross:.3g} arcsec across and {roll:.3g} about the boresight (95 %)"
+
+
+def certificate_number(file: BenchFile) -> str:
+    """The number of a bench's certificate, "" without one. Raises InputError."""
+    found = bench_certificate(file)
+    return "" if found is None else found.number

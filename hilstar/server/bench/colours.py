@@ -1,0 +1,324 @@
+"""What a bench mixes its primaries for, star by star: with each channel's electrons, or the nearest spectrum of one channel.
+
+Three channels: the mixture has the star's electrons in each, or is the nearest in electrons (non-negative least squares).
+
+One channel has one number of electrons, and three primaries to make it of. The mixture is the one with the star's own mean
+wavelength of detected photons, so that lateral colour acts as in the sky; of those, the one whose cumulative spectrum of
+detected photons is nearest to the star's (Cramer's distance, which is finite for the lines of a laser too). Its sum is held.
+Of a lens whose lateral colour is known, that comes first: see `Lateral`.
+Both ask the same of a star: its electrons through some curves of wavelength, which the tables of its rates give.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.display.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
+from hilstar.optics.extended import shifted
+from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
+from hilstar.optics.layers.truth import with_columns
+from hilstar.optics.psf import Psf
+from hilstar.optics.sprites import Sprites, extended_by_share, shares_at, shares_of_sprites
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.electrons import Optics, all_channels
+from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
+from hilstar.sky.stars import BV_MAG, Stars
+
+STEP_NM = 0.25  # in the spectra of primaries
+KNOT_STEPS = 8
+MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
+LATERAL_WEIGHT = 1e3  # times that, of a lens's lateral colour against as much of the mean wavelength
+LEAST_PX, LEAST_PART = 1e-5, 1e-2  # lateral colour, and its first part, that counts
+ASIDE_STARS, ASIDE_COST = 500, 1e-3  # stars by colour, and a square px of all against one of those that are out of reach
+MOVED = 1 + len(PRIMARIES)  # the first column of what is wanted that is a lens's
+UNSEEN = 1e-6  # share of white
+TINY = 1e-30  # electrons per second: a primary that a star has nothing of is chosen with the others all the same
+# Within the gamut: of a star's electrons, of its mean wavelength, and of its place through a lens
+WITHIN, WITHIN_NM, WITHIN_PX = 1e-6, 0.1, 1e-4
+SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
+
+# The electrons (n,) of stars of V = 0, B-V (n,), V-I (n,) and types through some optics.
+RatesBy = Callable[[Optics], Callable[..., FloatArray]]
+
+
+@dataclass(frozen=True, slots=True)
+class Lateral:
+    """A lens's lateral colour: by how much wavelengths `nm` (L,) move light, px rms over the field, in parts `px` (L, k).
+
+    All stars together may be shown `aside` (k,) of their places, by a pattern over the field that is the same for all, as a
+    distortion is: then more of what parts them is within the primaries' reach. `by_primary` (3, k) is a primary's, and
+    `weight` that of a square px.
+    """
+
+    nm: FloatArray
+    px: FloatArray
+    by_primary: FloatArray
+    aside: FloatArray
+    weight: float
+
+    @classmethod
+    def of(cls, psf: GlassPsf, nm: FloatArray, density: FloatArray) -> "Lateral | None":
+        """That of a glass to the primaries' light; None where it moves none of it by LEAST_PX."""
+        moved = psf.moved_px - psf.moved_px.mean(axis=1, keepdims=True)
+        _, size, parts = np.linalg.svd(
+            moved.transpose(0, 2, 1).reshape(-1, moved.shape[1]) / np.sqrt(len(moved)), full_matrices=False
+        )
+        px = (parts.T * size)[:, size > max(LEAST_PX, LEAST_PART * size[0])]
+        by_primary = density @ NodeSpline(psf.wavelengths_nm)(nm) @ px
+        spread = float(np.square(by_primary - by_primary.mean(axis=0)).sum())
+        if spread < LEAST_PX**2:
+            return None
+        weight = LATERAL_WEIGHT * MEAN_WEIGHT * float(np.square(density @ nm - (density @ nm).mean()).sum()) / spread
+        return cls(psf.wavelengths_nm, px, by_primary, np.zeros(px.shape[1]), weight)
+
+    @property
+    def lifted(self) -> FloatArray:
+        """By how much the curves that are asked of stars lie over the lens's own, px (k,): none of them may be below 0."""
+        return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
+
+
+@dataclass(frozen=True, slots=True)
+class Colours:
+    """The primaries of a bench's monitor before its tracker.
+
+    `matrix` is that of a white of 1 electron per second, `of_white` (3,) each primary's share of that, and `by_primary`
+    (channels, 3) each channel's share of the electrons of a primary. `places_px` (3, 2) is where a primary's light lies within
+    a pixel of the image. `density` (3, n) are the spectra of the photons that the tracker detects of each, of
+    sum 1, at `nm` (n,).
+    """
+
+    matrix: ChannelMatrix
+    places_px: FloatArray
+    nm: FloatArray
+    density: FloatArray
+    _gram: FloatArray
+    _curves: tuple[Callable[..., FloatArray], ...]
+    _kinds: FloatArray | None
+    _scale: FloatArray
+    lateral: Lateral | None = None
+    _kept: list[Any] = field(default_factory=list)  # the last frame's extended light, and each primary's of it
+
+    @property
+    def of_white(self) -> FloatArray:
+        """Each primary's share of white (3,), in electrons of all channels."""
+        return np.asarray(self.matrix.e_per_s.sum(axis=0))
+
+    @property
+    def mean_nm(self) -> FloatArray:
+        """The mean wavelength (3,) of the photons that the tracker detects of each primary."""
+        return np.asarray(self.density @ self.nm)
+
+    @property
+    def by_primary(self) -> FloatArray:
+        """Each channel's share (channels, 3) of the electrons of a primary."""
+        return np.asarray(self.matrix.e_per_s / self.of_white)
+
+    @property
+    def mono(self) -> bool:
+        """Whether the tracker has one channel."""
+        return len(self.matrix.channels) == 1
+
+    def wanted(self, stars: Stars, which: IntArray | None = None) -> FloatArray:
+        """What the mixtures of stars are made for: shares of channels (n, channels), or means of a star's photons (n, 4 + k).
+
+        Those are wavelength, the cumulative spectra's products with the primaries', and where a lens moves them. Bodies count
+        by their B-V.
+        """
+        which = np.arange(len(stars)) if which is None else which
+        if stars.colours is not None:
+            return np.asarray(stars.colours[which])
+        row = stars.row[which]
+        listed, none = row >= 0, np.full(len(which), np.nan)
+        vi = np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none) if len(stars.catalog) else none
+        kind = None
+        if self._kinds is not None:
+            kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
+        return self._means(stars.bv_mag[which], vi, kind)
+
+    def _means(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
+        flux = [one(np.zeros(len(bv_mag)), bv_mag, vi_mag, kind) for one in self._curves]
+        means = np.stack(flux[1:], axis=1) / flux[0][:, None]
+        if self.lateral is not None:
+            means[:, MOVED:] -= self.lateral.lifted
+        return np.asarray(means)
+
+    def for_stars(self, catalog: Catalog) -> "Colours":
+        """The same with the place aside by which a catalogue's stars part by colour as their lens parts them."""
+        if self.lateral is None or not len(catalog):
+            return self
+        some = np.argsort(catalog.bv_mag)[:: math.ceil(len(catalog) / ASIDE_STARS)]
+        wanted = self._means(catalog.bv_mag[some], catalog.vi_mag[some], None if self._kinds is None else self._kinds[some])
+        from scipy.optimize import minimize  # 0.2 s of every command that needs none of it
+
+        lens, size_px = self.lateral, float(np.abs(self.lateral.px).max())
+
+        def left(aside: FloatArray) -> tuple[float, FloatArray]:  # the mean square of what is out of reach, and its gradient
+            tried = replace(lens, aside=aside * size_px)
+            rest = replace(self, lateral=tried).shares(wanted) @ lens.by_primary - wanted[:, MOVED:] - tried.aside
+            square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
+            return float(square), 2 * (ASIDE_COST * aside - rest.mean(axis=0) / size_px)
+
+        found = minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
+        return replace(self, lateral=replace(lens, aside=found))
+
+    def shares(self, wanted: FloatArray) -> FloatArray:
+        """The light of each primary (n, 3) for what is `wanted`, as shares of a star's electrons."""
+        if not self.mono:
+            return nearest_mixtures(self._gram, wanted @ self.by_primary)
+        away = self.mean_nm - self.mean_nm.mean()
+        gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
+        near = wanted[:, 1:MOVED] + MEAN_WEIGHT * (wanted[:, :1] - self.mean_nm.mean()) * away
+        if (lens := self.lateral) is not None:
+            gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
+            near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
+        found = nearest_mixtures(gram, near, whole=True)
+        return np.asarray(found / found.sum(axis=1, keepdims=True))  # to 1e-11
+
+    def on(self, stars: Stars) -> Stars:
+        """The stars with the light of each primary."""
+        primaries, by_bv = self._shares_of_all(stars)
+        return replace(stars, primaries=primaries, primaries_by_bv=by_bv)
+
+    def _shares_of_all(self, stars: Stars) -> tuple[FloatArray, FloatArray]:
+        """The light of each primary of every star, and of light of the colours BV_MAG."""
+        if stars.primaries is not None and stars.primaries_by_bv is not None:
+            return stars.primaries, stars.primaries_by_bv
+        by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
+        if by_bv is None:
+            by_bv = self._means(BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan))
+        return self.shares(self.wanted(stars)), self.shares(by_bv)
+
+    def drive(self, shares: FloatArray) -> FloatArray:
+        """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
+        return np.asarray((shares / self.of_white).max(axis=1))
+
+    def shown(self, shares: FloatArray) -> FloatArray:
+        """What mixtures (n, 3) have of what is `wanted`: shares of channels (n, channels), or the mean wavelength (n, 1)."""
+        return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
+
+    def off(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
+        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or the mean wavelength's nm.
+
+        Before a lens of known lateral colour, px rms over the field.
+        """
+        if (lens := self.lateral) is not None:
+            return np.asarray(np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1))
+        shown = self.shown(shares)
+        return np.asarray(np.abs(shown - wanted[:, : shown.shape[1]]).sum(axis=1))
+
+    def in_gamut(self, off: FloatArray) -> BoolArray:
+        """Whether stars that are so far `off` have their colour."""
+        return np.asarray(off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX))
+
+    def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
+        """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of the same colour.
+
+        The colour is blue's electrons over red's, or the mean wavelength.
+        """
+        found = [np.interp(warmth(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)]
+        return np.asarray(found[0] / found[1])
+
+    def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
+        """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
+        return shares_at(self._shares_of_all(stars)[0], stars, star)
+
+    def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
+        """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
+
+        `off_gamut` is the share of electrons in the wrong channel; of one channel the mean wavelengths wanted and shown stand
+        for it. Light that is no star's has NaN.
+        """
+        own = np.flatnonzero(star >= 0)
+        wanted, shares = self.wanted(stars, star[own]), self.shares_of(stars, star[own])
+        shown, off, rate = self.shown(shares), self.off(wanted, shares), truth["electrons_per_s"][own]
+        added = {"temperature_shown_k": truth["temperature_k"][own] * self.temperature_factor(wanted, shares)}
+        if self.mono:
+            added |= {"wavelength_nm": wanted[:, 0], "wavelength_shown_nm": shown[:, 0]}
+            added["electrons_shown_per_s"] = rate * shares.sum(axis=1)
+        else:
+            for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
+                added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
+            added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
+        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
+
+    def driven(self, sprites: Sprites, stars: Stars) -> Sprites:
+        """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
+        primaries, by_bv = self._shares_of_all(stars)
+        shares = shares_of_sprites(sprites, stars, primaries, by_bv)
+        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
+        if not sprites.extended:
+            return replace(sprites, primaries=light)
+        if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+            each = extended_by_share(sprites, stars, primaries, by_bv)
+            moved = zip(each, self.places_px.tolist(), strict=True)
+            self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved)]
+        return replace(sprites, primaries=light, lights=self._kept[1])
+
+
+def warmth(colour: FloatArray) -> FloatArray:
+    """A number that rises with temperature, of shares of channels (n, 3) or means (n, 1 or more)."""
+    if colour.shape[1] != len(PRIMARIES):
+        return -colour[:, 0]
+    tiny = np.finfo(np.float64).tiny
+    return np.asarray(np.log(np.maximum(colour[:, -1], tiny)) - np.log(np.maximum(colour[:, 0], tiny)))
+
+
+def mixed_for(
+    primaries: tuple[Curve, ...],
+    channels: dict[str, Optics],
+    places_px: npt.ArrayLike,
+    rates_by: RatesBy,
+    kinds: FloatArray | None = None,
+    psf: Psf | None = None,
+) -> Colours:
+    """The colours of a monitor's primaries before a tracker of these channels, and a lens with a `psf`.
+
+    `kinds` (catalogue, 2) are the types by which `rates_by` counts, if it does. Raises InputError where the tracker sees
+    nothing of a primary.
+    """
+    matrix = channel_matrix(primaries, channels, 1.0)
+    of_white = matrix.e_per_s.sum(axis=0)
+    unseen = [name for name, share in zip(PRIMARIES, of_white, strict=True) if share < UNSEEN]
+    if unseen:
+        raise InputError(
+            f'[render] colour = "star": the tracker sees nothing of the primary {", ".join(unseen)}; write colour = "white"'
+        )
+    optics = all_channels(list(channels.values()))
+    nm = np.arange(optics.range_nm[0], optics.range_nm[1] + STEP_NM, STEP_NM)
+    seen = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
+    density = np.array([one(nm) for one in primaries]) * seen
+    density /= density.sum(axis=1, keepdims=True)
+    places = np.asarray(places_px)
+    if len(channels) > 1:
+        by_primary = matrix.e_per_s / of_white
+        return Colours(matrix, places, nm, density, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
+    up_to = np.cumsum(density, axis=1)
+    gram = up_to @ up_to.T * STEP_NM
+    # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's product with it.
+    above = np.cumsum(up_to[:, ::-1], axis=1)[:, ::-1] * STEP_NM
+    knots = nm[::KNOT_STEPS]
+    plain = optics.quantum_efficiency
+    edge_nm = plain.wavelength_nm if len(plain.wavelength_nm) else np.array(optics.range_nm)
+    knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
+    lateral = Lateral.of(psf, nm, density) if isinstance(psf, GlassPsf) else None
+    weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
+    weights += [] if lateral is None else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
+    curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
+    return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral)
+
+
+def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
+    """The rising index of black bodies of SCALE_K."""
+    found = []
+    for optics in channels.values():
+        curves = optics.quantum_efficiency, optics.transmission
+        nm, weight = integration_nodes(*curves)
+        photons = blackbody_exitance_w_m2_m(nm, SCALE_K[:, None]) * nm * curves[0](nm) * curves[1](nm) * weight
+        found.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
+    return np.maximum.accumulate(warmth(np.stack(found, axis=1)))

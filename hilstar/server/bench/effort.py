@@ -1,0 +1,492 @@
+"""The cheapest sprites, paths and codes whose errors together are within a bench's tolerance.
+
+Each part of a frame is a list of candidates, with the worst error and the time of each. The errors
+of the parts add up, and all parts share one tolerance: the cheapest combination is taken whose sum
+is within it.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.display.balance import AS_USUAL, Seen
+from hilstar.display.phases import USUAL_PSF
+from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
+from hilstar.display.quantisers import BY_COST, QUANTISERS, Quantisation
+from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
+from hilstar.display.response import Response
+from hilstar.optics.glass.glass_psf import GlassPsf
+from hilstar.optics.psf import MAX_CUT, Psf
+from hilstar.server.bench.code_errors import CodeErrors, CodeStars, code_stars, worst_errors
+from hilstar.server.bench.config import RenderSettings
+from hilstar.server.bench.least_psf import MAG_PER_SHARE, Choice
+from hilstar.tracker.centroiders import FAMILY, Centroider
+
+# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of
+# stars meet is a code lower
+UNLIT = 0.25
+CUT_PHASES = 51
+# Of a frame's time by the table (MS_A_STAR, EXACT_MS_A_STAR): what a pixel of a sprite takes, and a
+# star on a path more than one at a point. 1000 stars of 100 px in place of 22 take 0.3 ms, on paths
+# 0.7 ms, where `round` takes 3.9 ms in all and `exact` 7.0 (llvmpipe, two busy cores, processor
+# time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
+PIXEL_MS, PATH_MS = 2e-6, 4e-4
+GLASS_MS_A_STAR = 0.01  # results/kinds_h200.csv: 27 ms more for 3615 stars
+# Stars that move less than these shares of the tolerance may be drawn as points.
+MOTION_SHARES = (0.05, 0.1, 0.25, 0.5)
+# Where no combination is within the tolerance, the other parts may add so much of it to the codes'
+# error.
+SLIGHT = 0.01
+IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
+CHEAP, BEST = BY_COST[0], BY_COST[-1]
+# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts
+# of a run then have the same codes. Other programs slow frames down, and nothing speeds them up:
+# the upper time is a whole refresh.
+SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
+NO_ERROR = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldCost:
+    """Milliseconds that a frame of an average field, turning at 1 deg/s, takes by `round` and by `exact`.
+
+    `where` says on which machine, `why` why `exact` takes long ("" where it does not).
+    """
+
+    cheap_ms: float
+    best_ms: float
+    where: str
+    why: str = ""
+
+    def in_time(self, limit_ms: float) -> bool:
+        """Whether `exact` is drawn within a limit, or `round` is not either."""
+        return self.best_ms <= limit_ms or self.cheap_ms > limit_ms
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """The light of a bench: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
+
+    `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees
+    the monitor, `centroider` what it finds stars by: None where the bench does not say, and then
+    all of them judge. `psf` is how stars are drawn, and `psf_choice` why so where the tolerance
+    decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
+    `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
+    `turning` is how far a star of a frame without paths is from its place, in units of its motion;
+    0 for a scene at rest.
+    """
+
+    response: Response
+    white_e_per_s: float
+    rates_e_per_s: FloatArray
+    sky_share: float = 0.0
+    refresh_hz: float = 60.0
+    seen: Seen = AS_USUAL
+    centroider: Centroider | None = None
+    psf: Psf = USUAL_PSF
+    psf_choice: Choice | None = None
+    exposure_frames: int = EXPOSURE_FRAMES
+    cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
+    measured: FieldCost | None = None
+    turning: float = 0.0
+
+    @property
+    def panel(self) -> Panel:
+        """The monitor, where the screen is darkest."""
+        return Panel(self.response, self.white_e_per_s)
+
+    @property
+    def judges(self) -> tuple[Centroider, ...]:
+        """The centroiders that judge where codes show a star."""
+        return FAMILY if self.centroider is None else (self.centroider,)
+
+    @property
+    def stars(self) -> float:
+        """How many stars an average field shows."""
+        lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
+        return self.sky_share * float(np.count_nonzero(lit))
+
+    def tabulated_cost(self, psf: Psf) -> FieldCost:
+        """The cost of codes by the quantisers' own figures: on two cores without a GPU."""
+        cheap, best = (self.cost(QUANTISERS[method], psf) for method in (CHEAP, BEST))
+        return FieldCost(
+            cheap.a_star_ms * self.stars,
+            best.a_star_ms * self.stars,
+            "on two cores without a GPU",
+            best.why,
+        )
+
+    @property
+    def refresh_ms(self) -> float:
+        """The time between two frames."""
+        return 1e3 / self.refresh_hz
+
+    def code_stars(self) -> CodeStars:
+        """The catalogue's stars for the worst errors of codes."""
+        peaks = self.rates_e_per_s * (self.psf.peak_share / self.white_e_per_s)
+        return code_stars(self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks)
+
+
+@dataclass(frozen=True, slots=True)
+class Sides:
+    """A candidate for sprites: their sides by rate (see `Target.sides`), with what their edges cut.
+
+    They cut light that is shown of stars up to `cut_to_mag` below full scale.
+    """
+
+    sides: SpriteSides
+    choice: Choice
+    cut_to_mag: float = math.inf
+
+    def beside(self, codes: CodeErrors) -> Choice:
+        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones rounded."""
+        flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
+        more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
+        more_px = place_px + self.choice.error_px - codes.place_px
+        if not math.isfinite(more_mag) or not math.isfinite(more_px):
+            return self.choice
+        return replace(self.choice, error_mag=max(more_mag, 0.0), error_px=max(more_px, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A candidate for paths: the smallest motion that is drawn as one."""
+
+    above_px: float
+    choice: Choice
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """A candidate of each part; the codes' errors are found when they are asked for."""
+
+    method: Quantisation
+    method_ms: float
+    sprites: Sides
+    motion: Motion
+
+    @property
+    def ms(self) -> float:
+        """The time of all parts together."""
+        return self.method_ms + self.sprites.choice.ms + self.motion.choice.ms
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion drawn.
+
+    `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked`
+    and `light` what the choice was made for. Errors are the worst of all choices together, of the
+    catalogue's stars at any phase; they are found when they are first asked for.
+    """
+
+    asked: RenderSettings
+    light: Light
+    taken: Combination
+    by_cost: bool = False
+
+    @property
+    def quantisation(self) -> Quantisation:
+        """The codes."""
+        return self.taken.method
+
+    @property
+    def sides(self) -> SpriteSides:
+        """The sides of sprites by rate."""
+        return self.taken.sprites.sides
+
+    @property
+    def motion_above_px(self) -> float:
+        """The smallest motion that is drawn as a path."""
+        return self.taken.motion.above_px
+
+    @cached_property
+    def _found(self) -> CodeErrors:
+        """The codes' worst errors if they are within the tolerance; else the first that are over it."""
+        return worst_errors(self.light.code_stars(), self.quantisation, self._tolerance)
+
+    @property
+    def _tolerance(self) -> tuple[float, float]:
+        return self.asked.tolerance_mag, self.asked.tolerance_px
+
+    @cached_property
+    def codes(self) -> CodeErrors:
+        """The worst errors of the codes."""
+        if self._found.within(self._tolerance):
+            return self._found
+        return worst_errors(self.light.code_stars(), self.quantisation)
+
+    @cached_property
+    def choices(self) -> tuple[Choice, ...]:
+        """The choice of each part."""
+        parts = [code_part(self), self.taken.sprites.beside(self.codes), self.taken.motion.choice]
+        if self.light.psf_choice is not None:
+            parts.append(psf_part(self.light, self.light.psf_choice))
+        return (*parts, depth_part(self))
+
+    @property
+    def error_mag(self) -> float:
+        """The worst error of a star's light."""
+        return sum(choice.error_mag for choice in self.choices)
+
+    @property
+    def error_px(self) -> float:
+        """The worst error of a star's place."""
+        return sum(choice.error_px for choice in self.choices)
+
+    @property
+    def within(self) -> bool:
+        """Whether both are within the tolerance; found sooner than how far they are over it."""
+        if not self._found.within(self._tolerance):
+            return False
+        return self.error_mag <= self.asked.tolerance_mag and self.error_px <= self.asked.tolerance_px
+
+
+def plan_effort(render: RenderSettings, light: Light) -> Effort:
+    """The cheapest combination within the tolerance; where none is, the most accurate one.
+
+    What the file fixes is the only candidate of its part.
+    """
+    auto = render.quantisation == "auto"
+    methods = _methods(render, light)
+    combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
+    best = [one for one in combinations if one.method == methods[-1]]
+    # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
+    tested = combinations if len(best) > 1 else [one for one in combinations if one.method != methods[-1]]
+    stars = light.code_stars() if tested else None
+    for one in tested:
+        if stars is not None and _is_within(render, light, stars, one):
+            return Effort(render, light, one, by_cost=auto and one.method != CHEAP)
+    taken = next(one for one in best if _is_slight(render, one))
+    return Effort(render, light, taken, by_cost=auto)
+
+
+def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
+    """The quantisations to choose among, from the cheapest on.
+
+    `auto` does not take `exact` where that would be late in fields of many stars and `round` would
+    not.
+    """
+    if render.quantisation != "auto":
+        return (render.quantisation,)
+    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
+    if exact_in_time(table, known, IN_TIME_SHARE * light.refresh_ms):
+        return BY_COST
+    return BY_COST[:1]
+
+
+def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
+    """What codes cost where they are drawn, measured or by the file; None where neither says so."""
+    if light.measured is None and render.codes_ms is not None:
+        return FieldCost(*render.codes_ms, "by [render] codes_ms")
+    return light.measured
+
+
+def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
+    """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit, and else by the table's."""
+    if measured is not None:
+        clear = {measured.in_time(limit_ms * factor) for factor in (SURELY_IN_TIME, 1.0, SURELY_LATE)}
+        if len(clear) == 1:
+            return clear.pop()
+    return table.in_time(limit_ms)
+
+
+def _combinations(render: RenderSettings, light: Light, methods: tuple[Quantisation, ...]) -> Iterator[Combination]:
+    motions = motion_candidates(render, light)
+    for method in methods:
+        method_ms = codes_ms(render, light, method)
+        sprites = side_candidates(render, light, method)
+        for sides in sprites:
+            for motion in motions:
+                yield Combination(method, method_ms, sides, motion)
+
+
+def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Combination) -> bool:
+    """Whether the errors of all parts together are within the tolerance."""
+    tolerance = render.tolerance_mag, render.tolerance_px
+    codes = worst_errors(stars, one.method, tolerance)
+    if not codes.within(tolerance):
+        return False
+    parts = [one.sprites.beside(codes), one.motion.choice]
+    if light.psf_choice is not None:
+        parts.append(light.psf_choice)
+    mag = codes.flux_mag + sum(part.error_mag for part in parts)
+    px = codes.place_px + sum(part.error_px for part in parts)
+    return mag <= tolerance[0] and px <= tolerance[1]
+
+
+def _is_slight(render: RenderSettings, one: Combination) -> bool:
+    """Whether sprites and paths add next to nothing to the codes' error, or as little as they can."""
+    sprites, motion = one.sprites.choice, one.motion
+    share = max(sprites.error_mag / render.tolerance_mag, sprites.error_px / render.tolerance_px)
+    is_whole = sprites.error_mag <= MAG_PER_SHARE * MAX_CUT
+    return (is_whole or share <= SLIGHT) and motion.above_px <= render.motion_above_px
+
+
+def _scale(render: RenderSettings, light: Light) -> float:
+    """How long a frame takes where it is drawn, by the table's time."""
+    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
+    return 1.0 if known is None or not table.cheap_ms else known.cheap_ms / table.cheap_ms
+
+
+def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
+    """The time of a frame of an average field that is not its sprites' pixels and paths."""
+    scale = _scale(render, light)
+    known = known_cost(render, light)
+    whole_ms = light.cost(QUANTISERS[method], light.psf).a_star_ms * light.stars * scale
+    if known is not None and method in BY_COST:
+        whole_ms = known.cheap_ms if method == CHEAP else known.best_ms
+    others_ms = scale * light.stars * (PIXEL_MS * light.psf.footprint_px**2 + PATH_MS)
+    return max(whole_ms - others_ms, 0.0)
+
+
+def code_part(effort: Effort) -> Choice:
+    """The choice of the codes."""
+    render, light, method = effort.asked, effort.light, effort.quantisation
+    errors = effort.codes
+    cost = known_cost(render, light) or light.tabulated_cost(light.psf)
+    ms = codes_ms(render, light, method)
+    saved_ms = max(codes_ms(render, light, BEST) - ms, 0.0)
+    notes = []
+    if errors.centroider is not None:
+        whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
+        notes.append(f"as `{errors.centroider}` finds stars{whom}")
+    if not math.isfinite(errors.flux_mag):
+        notes.append("the faintest stars of the catalogue show nothing")
+    if method == BEST or (render.quantisation == "auto" and len(_methods(render, light)) == 1):
+        notes.append(_price(cost, light))
+    return Choice("codes", method, errors.flux_mag, errors.place_px, ms, saved_ms, "; ".join(notes))
+
+
+def _price(cost: FieldCost, light: Light) -> str:
+    """What `exact` takes of a refresh."""
+    words = f"exact takes {cost.best_ms:.2g} ms of {light.refresh_ms:.3g} (round {cost.cheap_ms:.2g})"
+    words += f" for an average field at 1 deg/s {cost.where}"
+    return f"{words}, {cost.why}" if cost.why else words
+
+
+def side_candidates(render: RenderSettings, light: Light, method: Quantisation) -> list[Sides]:
+    """Sprites from the smallest to the whole footprint; the whole one alone at full effort."""
+    psf = light.psf
+    full = psf.footprint_px
+    sizes = list(range(full % 2 or 2, full, 2))
+    pixels_ms = PIXEL_MS * light.stars * _scale(render, light)
+    found = []
+    if render.effort == "auto" and not psf.by_place:
+        for size in sizes:
+            sides = _sides(light, method, sizes, size)
+            mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
+            chosen = f"{min(side.side_px for side in sides)} to {size} px a side, of {full}"
+            saved_ms = pixels_ms * (full**2 - mean_px)
+            choice = Choice(
+                "sprites",
+                chosen,
+                cut_mag(size, psf),
+                cut_px(size, psf),
+                pixels_ms * mean_px,
+                saved_ms,
+            )
+            found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
+    sides = _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
+    mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
+    smallest = min((side.side_px for side in sides), default=full)
+    chosen = f"{smallest} to {full} px a side" if smallest < full else f"{full} px a side"
+    saved_ms = pixels_ms * (full**2 - mean_px)
+    cut = MAG_PER_SHARE * MAX_CUT
+    found.append(Sides(sides, Choice("sprites", chosen, cut, 0.0, pixels_ms * mean_px, saved_ms)))
+    return found
+
+
+def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -> SpriteSides:
+    """The largest sprite, and the smaller ones of stars whose light beyond them lights no pixel."""
+    sides = [(math.inf, largest)]
+    unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
+    if unlit:
+        # Falling rates: a star under the last of them that it is under gets the smallest sprite.
+        sides += [(unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
+    return tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
+
+
+def _cut_to_mag(light: Light, method: Quantisation, size_px: int) -> float:
+    """The magnitude below full scale from which on what is beyond a sprite lights no pixel."""
+    unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
+    if not unlit:
+        return math.inf
+    rate = unlit / light.psf.outside_share(size_px)
+    return -2.5 * math.log10(rate * light.psf.peak_share / light.white_e_per_s)
+
+
+def _mean_area_px(sides: SpriteSides, rates_e_per_s: FloatArray, full: int) -> float:
+    area = np.full(len(rates_e_per_s), full**2)
+    for side in sides:
+        area[rates_e_per_s < side.below_e_per_s] = side.side_px**2
+    return float(area.mean()) if len(area) else float(full**2)
+
+
+def cut_mag(size_px: int, psf: Psf) -> float:
+    """The flux lost outside a square sprite at the worst phase, magnitudes."""
+    return MAG_PER_SHARE * psf.cut_share(size_px)
+
+
+def cut_px(size_px: int, psf: Psf) -> float:
+    """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes combined."""
+    worst, offsets = np.zeros(2), np.arange(size_px) - (size_px - 1) // 2
+    for fraction in np.linspace(0.0, 1.0, CUT_PHASES) - (0.5 if size_px % 2 else 0.0):
+        at = offsets - fraction
+        shares = psf.shares(at[None, :], at[:, None])
+        moments = np.array([(shares @ at).sum(), (at @ shares).sum()])
+        worst = np.maximum(worst, np.abs(moments / shares.sum()))
+    return math.hypot(*worst)
+
+
+def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
+    """From which motion on stars are paths: none at rest; else from the file's on, or from more."""
+    floor_px = render.motion_above_px
+    if not light.turning:
+        return [Motion(floor_px, Choice("paths", "none: nothing moves within a frame", *NO_ERROR))]
+    path_ms = PATH_MS * light.stars * _scale(render, light)
+    above_px = [floor_px]
+    if render.effort == "auto":
+        above_px += [share * render.tolerance_px for share in MOTION_SHARES if share * render.tolerance_px > floor_px]
+    found = []
+    for px in above_px:
+        # Only frames between the file's motion and this one are drawn sooner.
+        ms, saved_ms = (path_ms, 0.0) if px == floor_px else (0.0, path_ms)
+        note = "" if px == floor_px else "saves in frames that move less"
+        choice = Choice(
+            "paths",
+            f"from {px:g} px within a frame on",
+            0.0,
+            px * light.turning,
+            ms,
+            saved_ms,
+            note,
+        )
+        found.append(Motion(px, choice))
+    return found
+
+
+def psf_part(light: Light, choice: Choice) -> Choice:
+    """The choice of the PSF, with what a glass takes."""
+    glass_ms = GLASS_MS_A_STAR * light.stars
+    if isinstance(light.psf, GlassPsf):
+        return replace(choice, ms=glass_ms)
+    return replace(choice, saved_ms=glass_ms)
+
+
+def depth_part(effort: Effort) -> Choice:
+    """The stars that are drawn: all but those that light no pixel."""
+    light = effort.light
+    rates = light.rates_e_per_s
+    limit = QUANTISERS[effort.quantisation].faintest_e_per_s(light.panel, light.psf)
+    dark = rates < limit
+    if not dark.any():
+        return Choice("depth", "all stars of the catalogue", *NO_ERROR)
+    share = float(rates[dark].sum() / rates.sum())
+    saved_ms = light.sky_share * float(dark.sum()) * light.cost(QUANTISERS[effort.quantisation], light.psf).a_star_ms
+    note = f"{int(dark.sum())} of {len(dark)} stars light no pixel, {share:.2%} of all light"
+    return Choice("depth", f"from {limit:.3g} electrons/s on", *NO_ERROR, 0.0, saved_ms, note)

@@ -1,0 +1,97 @@
+"""The choices of a bench's effort, for a person (a table) and for a program ("effort" of --json)."""
+
+import json
+import math
+from typing import Any
+
+from hilstar.server.bench.effort import Effort
+from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.least_psf import Choice
+from hilstar.server.bench.would_do import Remedy, would_do
+
+HEAD = ("part", "choice", "error", "of the tolerance", "saves")
+
+
+def effort_lines(bench: Bench) -> list[str]:
+    """A table of the choices and their sum, notes, and what would do where that is over the tolerance."""
+    effort = bench.effort
+    rows = [HEAD]
+    for choice in effort.choices:
+        rows.append((choice.part, choice.choice, *_errors(effort, choice), _saved(choice)))
+    saved_ms = sum(choice.saved_ms for choice in effort.choices)
+    together = Choice("together", "", effort.error_mag, effort.error_px, 0.0, saved_ms)
+    rows.append((together.part, _verdict(effort), *_errors(effort, together), _saved(together)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD))]
+    lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines += [f"{choice.part}: {choice.note}" for choice in effort.choices if choice.note]
+    for remedy in would_do(bench):
+        head = "would do" if remedy.within else "would not do alone"
+        lines.append(f"{head}: {_remedy_text(remedy)}")
+    return lines
+
+
+def _verdict(effort: Effort) -> str:
+    render = effort.asked
+    within = "within" if effort.within else "OVER"
+    return f"{within} {render.tolerance_mag:g} mag, {render.tolerance_px:g} px"
+
+
+def _errors(effort: Effort, choice: Choice) -> tuple[str, str]:
+    """The errors of a choice, and the larger of their shares of the tolerance."""
+    render = effort.asked
+    share = max(choice.error_mag / render.tolerance_mag, choice.error_px / render.tolerance_px)
+    text = f"{choice.error_mag:.4f} mag, {choice.error_px:.4f} px"
+    if not math.isfinite(share):
+        return "a star shows nothing", "over"
+    return text, f"{share:.0%}"
+
+
+def _saved(choice: Choice) -> str:
+    return f"{choice.saved_ms:.2f} ms" if choice.saved_ms else "-"
+
+
+def _remedy_text(remedy: Remedy) -> str:
+    value = list(remedy.value) if isinstance(remedy.value, tuple) else remedy.value
+    shown = json.dumps(value)  # JSON and TOML write these alike
+    if not math.isfinite(remedy.error_mag + remedy.error_px):
+        return f"{remedy.key} = {shown} (a star shows nothing)"
+    return f"{remedy.key} = {shown} ({remedy.error_mag:.4f} mag, {remedy.error_px:.4f} px)"
+
+
+def effort_keys(bench: Bench) -> dict[str, Any]:
+    """The object "effort" of --json. An error is null where a star shows nothing."""
+    effort = bench.effort
+    return {
+        "within": effort.within,
+        "quantisation": effort.quantisation,
+        "error_mag": _number(effort.error_mag),
+        "error_px": _number(effort.error_px),
+        "tolerance_mag": effort.asked.tolerance_mag,
+        "tolerance_px": effort.asked.tolerance_px,
+        "choices": [_choice_keys(choice) for choice in effort.choices],
+        "would_do": [_remedy_keys(remedy) for remedy in would_do(bench)],
+    }
+
+
+def _choice_keys(choice: Choice) -> dict[str, Any]:
+    return {
+        "part": choice.part,
+        "choice": choice.choice,
+        "error_mag": _number(choice.error_mag),
+        "error_px": _number(choice.error_px),
+        "ms": round(choice.ms, 4),
+    }
+
+
+def _remedy_keys(remedy: Remedy) -> dict[str, Any]:
+    return {
+        "key": remedy.key,
+        "value": remedy.value,
+        "error_mag": _number(remedy.error_mag),
+        "error_px": _number(remedy.error_px),
+        "within": remedy.within,
+    }
+
+
+def _number(error: float) -> float | None:
+    return error if math.isfinite(error) else None

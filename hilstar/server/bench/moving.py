@@ -1,0 +1,129 @@
+"""The moving part of a bench's sky, from its file: bodies, satellites, the observer, and bodies wider than a point."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.reading import read_text
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.optics.camera import Camera
+from hilstar.optics.layers.bodies import POINT_PX
+from hilstar.server.bench.config import GEOCENTRE, SOURCE, BenchConfig
+from hilstar.server.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
+from hilstar.server.bench.site import Ground
+from hilstar.sky.bodies.disc import EARTH
+from hilstar.sky.bodies.kernel import Kernel
+from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
+from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
+from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbit, Orbit, TleOrbit
+from hilstar.sky.electrons import Optics, Photometry
+from hilstar.sky.stars import total_and_colours
+
+log = logging.getLogger(__name__)
+
+MAX_ORBIT_BYTES = 20_000_000  # states for each minute of a year
+MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
+MAX_TLE_AGE_DAYS = 7.0
+MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # wider bodies are given in degrees, and without a count of pixels
+
+
+def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) -> MovingSky:
+    """The bodies and satellites of a bench file that has a date, and its observer.
+
+    Raises InputError for an orbit, a list or a date that cannot be used, MachineError where the extra is not installed.
+    """
+    utc_ns = epoch_utc_ns(config)
+    if utc_ns is None:
+        raise AssertionError("a file with an observer has a date")
+    # A source's own dates count from 1970, and its stars are those of its day.
+    start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
+    unix = config.sky.epoch_utc == UNIX
+    if unix:
+        start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is right to a millisecond
+    orbit = config.spacecraft.orbit or GEOCENTRE
+    observer: Orbit = Geocentre()
+    if config.site is not None:
+        observer = Ground(config.site)
+    elif orbit not in {GEOCENTRE, SOURCE}:
+        observer = orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
+    sky, shown = config.sky, config.sky.bodies
+    asked = (("Sun", shown.sun), (EARTH, shown.earth), ("Moon", shown.moon), *((planet, shown.planets) for planet in PLANETS))
+    names = tuple(name for name, wanted in asked if wanted)
+    photometry = Photometry(sky.zero_point, sky.passband_weighting)
+    lit = (*names, "Sun")  # and whatever sunlight falls on
+    rates, colours = total_and_colours(
+        np.stack([bodies_electrons_per_s(lit, sky.brightness, optics, photometry) for optics in channels], axis=1)
+    )
+    shares = (None, None) if colours is None else (colours[:-1], colours[-1])
+    bodies = BodyLight(names, bodies_bv_mag(names), rates[:-1], *shares)
+    moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
+    if shown.satellites is not None:
+        from hilstar.sky.bodies.passes import Satellites
+        from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
+
+        path, v0_e_per_s, rows = folder / shown.satellites, float(rates[-1]), {}
+        found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns)
+        if shown.satellite_magnitudes is not None:
+            table = folder / shown.satellite_magnitudes
+            rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
+        brightness = brightness_of(found, rows, shown.satellite_standard_mag, v0_e_per_s)
+        satellites = moving.satellites = Satellites(found, brightness, v0_e_per_s, observer, utc_ns)
+        satellites.listed = sum(one.number in rows for one in found)
+        satellites.file = str(path)
+        satellites.place(utc_ns + start_ns)
+    return moving
+
+
+def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
+    """The orbit in a file, which is an OEM that covers that UTC, or elements: with a warning where they are of another week.
+
+    The UTC may be the beginning of the `day` of what is shown.
+
+    Raises InputError, and MachineError without SGP4 for elements.
+    """
+    text = read_text(path, f"{TLE_ADVICE}, or a CCSDS OEM", MAX_ORBIT_BYTES)
+    if text.lstrip().startswith(VERSION_KEY):
+        return OemOrbit(text, str(path), utc_ns, day)
+    orbit = TleOrbit(text, str(path))
+    age_days = orbit.age_days(utc_ns)
+    if abs(age_days) > MAX_TLE_AGE_DAYS:
+        # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6 arcsec a day.
+        log.warning(
+            "%s: its elements are %.0f days from [sky] epoch_utc; a low orbit is then off by %.0f km or more",
+            path,
+            abs(age_days),
+            abs(age_days),
+        )
+    return orbit
+
+
+def observer_lines(config: BenchConfig) -> list[str]:
+    """A line where it is the source of the attitudes that says from where the sky is seen."""
+    if not from_source(config):
+        return []
+    where = "the sky is seen from the Earth's centre, without the Earth"
+    return [f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is, {where}']
+
+
+def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = None) -> list[str]:
+    """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest first."""
+    found = {} if moving is None else moving.diameters_arcsec(t_ns)
+    px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
+    widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
+    lines = []
+    for px, name, arcsec in widths:
+        if px > POINT_PX:
+            angle = f"{arcsec:.1f} arcsec" if arcsec < MAX_ARCSEC else f"{arcsec / 3600:.1f} deg"
+            pixels = f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"
+            lines.append(f"{name}: {angle} wide, {pixels} of the screen; drawn as a disc")
+    return lines
+
+
+def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
+    """One line about a bench's satellites at a moment; none without satellites."""
+    if sky is None or sky.satellites is None:
+        return []
+    placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
+    return [f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"]

@@ -1,0 +1,172 @@
+"""Keeps the process of the page and of SCPI alive beside a run: starts it again, publishes the run's state, takes its orders.
+
+One thread does this ten times a second; the frame loop takes no part in it.
+"""
+
+import contextlib
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+
+from hilstar.basics.errors import one_line
+from hilstar.basics.notices import Notice, Notices
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff
+from hilstar.server.console.listener import PageListener
+from hilstar.server.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup, SharedMemory
+
+TICK_S = 0.1
+FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
+STEADY_S = 10.0  # a process that lived this long is restarted at once
+END_WAITS_S = 1.0
+MAX_ORDERS = 8  # at once
+MAX_ORDER_BYTES = 8_000
+OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
+PAGE = (sys.executable, "-P", "-m", "hilstar.server.console.server")
+
+
+class Listeners(NamedTuple):
+    """Where the page is served, and where SCPI is; None where it is not."""
+
+    page: PageListener | None
+    scpi: PageListener | None = None
+
+
+Do = Callable[[Order], OrderAnswer]  # on a thread of its own
+
+
+@dataclass(slots=True)
+class _Page:
+    process: "subprocess.Popen[bytes]"
+    channel: socket.socket
+    begun_s: float
+
+
+class PageProcess(Closing):
+    """The page of a run or session while this is open: `now` is its state, and `notices` are its events."""
+
+    def __init__(
+        self, setup: Setup, memory: SharedMemory, listeners: Listeners, now: Callable[[], RunState], notices: Notices, do: Do
+    ) -> None:
+        self._memory, self._now, self._notices, self._do = memory, now, notices, do
+        self._listener_fds = [-1 if each is None else each.socket.fileno() for each in listeners]
+        self._setup_fd = os.memfd_create("hilstar-console-setup")
+        with os.fdopen(os.dup(self._setup_fd), "wb") as file:
+            file.write(msgspec.msgpack.encode(setup))
+        self._events: deque[Notice] = deque(maxlen=1000)
+        notices.listen(self._events.append)
+        self._stop = threading.Event()
+        self._page: _Page | None = None
+        self._again = BackOff(FIRST_WAIT_S, MAX_WAIT_S, HOST_CLOCK)
+        self._workers = ThreadPoolExecutor(MAX_ORDERS, thread_name_prefix="hilstar-order")
+        self._thread = threading.Thread(target=self._run, name="hilstar-console", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the page's process."""
+        self._stop.set()
+        self._thread.join()
+        self._workers.shutdown(wait=False, cancel_futures=True)
+        os.close(self._setup_fd)
+
+    @property
+    def pid(self) -> int | None:
+        """The process ID of the page's process, None while there is none."""
+        return None if self._page is None else self._page.process.pid
+
+    def _run(self) -> None:
+        next_s = 0.0
+        while not self._stop.is_set():
+            now_s = time.monotonic()
+            if now_s >= next_s:
+                next_s = now_s + TICK_S
+                self._tick(now_s)
+            self._listen(max(next_s - time.monotonic(), 0.0))
+        page, self._page = self._page, None
+        if page is None:
+            return
+        page.channel.close()  # which tells it to end
+        try:
+            page.process.wait(END_WAITS_S)
+        except subprocess.TimeoutExpired:
+            page.process.kill()
+            page.process.wait()
+
+    def _tick(self, now_s: float) -> None:
+        try:
+            self._memory.states.put(msgspec.json.encode(self._now()))
+            ahead_s = time.time() - time.monotonic_ns() * 1e-9
+            while self._events:
+                notice = self._events.popleft()
+                event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
+                self._memory.events.put(msgspec.json.encode(event))
+        except Exception as error:  # such as a container that changed while it was read: the next tick reads it again
+            self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
+        page = self._page
+        if page is None:
+            if self._again.over:
+                self._start_page(now_s)
+        elif (code := page.process.poll()) is not None:
+            page.channel.close()
+            self._page = None
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
+
+    def _start_page(self, now_s: float) -> None:
+        channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        environment = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
+        given = (self._setup_fd, self._memory.fd, its_end.fileno(), *self._listener_fds)
+        try:
+            process = subprocess.Popen(
+                [*PAGE, *map(str, given)],
+                pass_fds=[fd for fd in given if fd >= 0],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env=environment | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},
+            )
+        except OSError as error:
+            channel.close()
+            self._lose(f"the operator's page cannot be started ({error.strerror})")
+            return
+        finally:
+            its_end.close()
+        channel.setblocking(False)
+        self._page = _Page(process, channel, now_s)
+
+    def _lose(self, what: str, *, anew: bool = False) -> None:
+        self._notices.tell("console-lost", f"{what}; it is started again")
+        self._again.put_off(anew=anew)
+
+    def _listen(self, seconds: float) -> None:
+        page = self._page
+        if page is None:
+            self._stop.wait(seconds)
+            return
+        ready, _, _ = select.select([page.channel], [], [], seconds)
+        if not ready:
+            return
+        with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):
+            data = page.channel.recv(MAX_ORDER_BYTES)
+            if data:
+                order = msgspec.json.decode(data, type=Order)
+                self._workers.submit(self._do, order).add_done_callback(self._answer)
+            else:  # the page has ended, which the next tick reports
+                self._stop.wait(seconds)
+
+    def _answer(self, done: Future[OrderAnswer]) -> None:
+        page = self._page
+        if page is None or done.cancelled() or done.exception() is not None:
+            return
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            page.channel.send(msgspec.json.encode(done.result()))

@@ -1,0 +1,509 @@
+"""What a run or a first-light session publishes to its page: frames, pictures, its state; and what operators order."""
+
+import contextlib
+import pickle
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.attitude.clock.sender_clock import KNOWN_MODES
+from hilstar.basics.errors import HilstarError, did_you_mean, one_line, printable
+from hilstar.basics.notices import Notice, Notices
+from hilstar.basics.rotation import to_radec_roll_deg
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.version import __version__
+from hilstar.optics.sprites import brightest
+from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.frame import Bench
+from hilstar.server.console import messages, protocol
+from hilstar.server.console.listener import PageListener
+from hilstar.server.console.overlay import OverlayScene, colour_notes, overlay_of
+from hilstar.server.console.page_process import Listeners, PageProcess
+from hilstar.server.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.server.pointing import POINTING
+from hilstar.server.record.ledger_records import MAX_CENTROIDS
+
+if TYPE_CHECKING:
+    from hilstar.server.bench.bench_file import BenchFile
+    from hilstar.server.bench.scenario import FaultSchedule
+    from hilstar.server.live_answers import LiveAnswers
+    from hilstar.server.pacer import Shown
+    from hilstar.server.record.ledger import Ledger, LedgerSwitch
+    from hilstar.server.screen.screen import Screen
+    from hilstar.server.serve import Running
+
+MIN_PICTURE_NS = NS_PER_S // 10
+
+
+class FramePublisher:
+    """Writes each frame's numbers, and now and then its picture, into shared memory.
+
+    The frame loop's own thread does it, in microseconds: without a lock and without a call that waits. A picture is copied
+    at most ten times a second, and only while somebody looks at one.
+    """
+
+    def __init__(self, memory: messages.SharedMemory) -> None:
+        self.shown: Shown | None = None
+        self.count = 0  # frames so far
+        self.running: Running | None = None
+        self._memory = memory
+        self._picture_due_ns = 0
+
+    def follow(self, running: "Running") -> None:
+        """Follow a run, whose counters go on changing."""
+        self.running = running
+        if running.answers is not None:
+            running.answers.heard = self._hear
+
+    def _hear(self, answers: "LiveAnswers") -> None:
+        """Publish a new answer of the tracker. Called by the thread that takes answers."""
+        newest = answers.newest
+        lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
+        stars = () if newest is None else newest.answer.centroids[:MAX_CENTROIDS]
+        places = [(round(star.x_px, 2), round(star.y_px, 2)) for star in stars]
+        self._memory.answers.put(msgspec.json.encode(messages.NewAnswer(answers.figures, lit, places)))
+
+    def see(self, shown: "Shown") -> None:
+        """Publish a frame. Called by the frame loop."""
+        self.shown = shown
+        self.count += 1
+        running, attitude = self.running, shown.attitude
+        if running is None:
+            return
+        tally, packets = running.loop.tally, running.packets
+        flags = (
+            messages.STALE * shown.stale
+            | messages.MISSING * shown.missing
+            | messages.BLANK * (attitude is None)
+            | messages.HAS_AGE * (attitude is not None)
+        )
+        self._memory.frames.put(
+            messages.FRAME.pack(
+                shown.number,
+                shown.draw_ns,
+                shown.swap_ns,
+                shown.predicted_swap_ns or shown.swap_ns,
+                0 if attitude is None else max(min(attitude.age_ns, 2**62), -(2**62)),
+                shown.missed_before,
+                tally.frames,
+                tally.missed_frames,
+                tally.stale_frames,
+                tally.given_up_frames,
+                packets.received,
+                packets.refused,
+                flags,
+            )
+        )
+        want = self._memory.want
+        if want.each_ns and self._picture_due_ns <= shown.swap_ns < want.until_ns:
+            self._picture_due_ns = shown.swap_ns + max(want.each_ns, MIN_PICTURE_NS)
+            with contextlib.suppress(ValueError):  # levels of another size than the bench's: no picture, and the run goes on
+                self._copy(shown)
+
+    def _copy(self, shown: "Shown") -> None:
+        drawn, sprites = shown.drawn.levels, shown.drawn.sprites
+        levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
+        height, width = levels.shape
+        places: list[np.ndarray] = []
+        if sprites is not None:
+            kept = brightest(sprites.data["electrons_per_s"], messages.MAX_SPRITES)
+            places = [part if kept is None else part[kept] for part in (sprites.star, sprites.x_px, sprites.y_px)]
+        count = len(places[0]) if places else 0
+        q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
+        head = messages.PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q)
+        self._memory.put_picture(head, levels, places)
+
+
+MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
+# Lasting events that keep the ledger from being written, as `run.record.ledger` names them.
+LEDGER_TROUBLES = {
+    "ledger-failed": "cannot be written",
+    "ledger-lost": "a file was deleted, truncated or overwritten",
+    "ledger-stalled": "the disk accepts nothing",
+    "ledger-thin": "the disk is full: frames are not recorded",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PageParts:
+    """The parts of a run; `make_ledger` begins a ledger at a path, `answers` are the tracker's."""
+
+    bench: Bench
+    notices: Notices
+    ledger: "LedgerSwitch"
+    make_ledger: "Callable[[Path], Ledger]"
+    screen: "Screen | None" = None
+    faults: "FaultSchedule | None" = None
+    answers: "LiveAnswers | None" = None
+
+
+class WatchedRun:
+    """The state of a run, read from its parts beside the frame loop."""
+
+    def __init__(self, feed: FramePublisher, parts: PageParts) -> None:
+        self._feed, self._parts, self._notices = feed, parts, parts.notices
+
+    def now(self) -> messages.RunState:
+        """The run's current state, read beside the frame loop."""
+        running, shown = self._feed.running, self._feed.shown
+        if running is None:
+            return messages.RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
+        tally, aids, packets = running.loop.tally, running.loop.pacer.operator.aids, running.packets
+        screen, faults, newest = self._parts.screen, self._parts.faults, protocol.NewestFrame()
+        if shown is not None:
+            newest = protocol.NewestFrame(
+                number=shown.number,
+                missing=shown.missing,
+                stale=shown.stale,
+                blank=shown.attitude is None,
+                stars=shown.drawn.star_count,
+                clipped=list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
+            )
+        return messages.RunState(
+            host_ns=time.monotonic_ns(),
+            alive_ns=running.loop.watch.alive_ns,
+            frame=newest,
+            attitude=_attitude(shown),
+            clock=_clock(running),
+            counts=protocol.RunCounts(
+                frames=tally.frames,
+                missed=tally.missed_frames,
+                stale=tally.stale_frames,
+                given_up=tally.given_up_frames,
+                received=packets.received,
+                accepted=packets.received - packets.refused,
+                lost=packets.lost,
+                refused={reason: count for reason, count in packets.refused_by.items() if count},
+            ),
+            operator=aids.states(),
+            operator_text=aids.text,
+            overlay=aids.overlay,
+            patch_share=aids.patch_share,
+            hidden="" if shown is None else shown.on_screen.hidden,
+            display_lost="" if screen is None else screen.window.gone or "",
+            gamma=self._notices.lasting.get(GAMMA, ""),
+            forced="" if screen is None else printable("; ".join(screen.forced)),
+            ledger=self._ledger(),
+            faults=[] if faults is None else faults.on(),
+            pointing=self._notices.lasting.get(POINTING, ""),
+            wrong_sky=[protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()],
+            wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
+            tracker=None if running.answers is None else running.answers.figures,
+        )
+
+    def _wrong_sky_s(self, first_swap_ns: int | None) -> float:
+        wrong_sky = self._notices.wrong_sky
+        if first_swap_ns is None or not wrong_sky.any:
+            return 0.0
+        return wrong_sky.total(first_swap_ns, time.monotonic_ns()).seconds
+
+    def _ledger(self) -> protocol.LedgerState | None:
+        ledger = self._parts.ledger.current
+        if ledger is None:
+            return None
+        troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active]
+        return protocol.LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
+
+
+def _attitude(shown: "Shown | None") -> protocol.ShownAttitude | None:
+    attitude = None if shown is None else shown.attitude
+    if attitude is None:
+        return None
+    w, x, y, z = attitude.q_icrs_to_cam.tolist()
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
+    rate = attitude.rate_cam_rad_s
+    return protocol.ShownAttitude(
+        q=(w, x, y, z),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        roll_deg=roll_deg,
+        rate_deg_s=None if rate is None else np.degrees(rate).tolist(),
+        age_ms=attitude.age_ns / NS_PER_MS,
+    )
+
+
+def _clock(running: "Running") -> protocol.ShownClock | None:
+    clock = None if running.clock is None else running.clock()
+    if clock is None or clock.mode == "none":
+        return None
+    return protocol.ShownClock(
+        offset_ms=clock.offset_ms,
+        sigma_ms=clock.uncertainty_ms,
+        drift_ppm=clock.drift_ppm,
+        synchronised=clock.mode in KNOWN_MODES,
+        mode=clock.mode,
+    )
+
+
+LOOP_WAITS_S = 2.0
+POLL_S = 0.004
+MAX_MARK_CHARACTERS = 200
+MAX_WHO_CHARACTERS = 60
+
+
+Done = tuple[int, str]  # what became of an order: an HTTP status and a line
+
+
+class OrderHandler:
+    """Checks an operator's order, has it done by the frame loop or beside it, and records it.
+
+    Each call runs on its own thread and returns once the frame loop, or the disk, has taken the order.
+    """
+
+    def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
+        self._requests, self._feed, self._faults = requests, feed, parts.faults
+        self._ledger, self._notices, self._make_ledger = parts.ledger, parts.notices, parts.make_ledger
+        self._ledger_lock = threading.Lock()
+
+    def do(self, order: messages.Order) -> messages.OrderAnswer:
+        """Carry out an order; the answer says what went wrong."""
+        who = one_line(order.who)[:MAX_WHO_CHARACTERS]
+        doers = {"ledger": self._switch_ledger, "mark": self._mark, "fault": self._fault} | dict.fromkeys(
+            protocol.SWITCHES, self._switch
+        )
+        try:
+            status, line = doers[order.name](order, who)
+        except HilstarError as error:
+            status, line = 409, one_line(str(error))
+        return messages.OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
+
+    def _switch(self, order: messages.Order, who: str) -> Done:
+        if order.name == "patch" and order.on and order.level not in PATCHES:
+            return 400, f"no such patch; write a level of {', '.join(map(str, PATCHES))}"
+        request = SwitchRequest(order.name, order.on, who, order.level)
+        self._requests.append(request)
+        if self._waits_for(lambda: request.done):
+            return 200, request.text
+        request.called_off = True
+        return 504, f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
+
+    def _waits_for(self, holds: Callable[[], bool]) -> bool:
+        end_s = time.monotonic() + LOOP_WAITS_S
+        while not holds():
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(POLL_S)
+        return True
+
+    def _switch_ledger(self, order: messages.Order, who: str) -> Done:
+        with self._ledger_lock:
+            if order.on:
+                path = self._free_path()
+                was_on = self._ledger.on
+                ledger = self._ledger.begin(lambda: self._make_ledger(path))
+                if not was_on:
+                    self._notices.tell("operator", f"ledger on, by {who}: {ledger.path}", who)
+                return 200, f"ledger on: {ledger.path}"
+            ledger_now = self._ledger.current
+            if ledger_now is None:
+                return 200, "ledger off"
+            self._notices.tell("operator", f"ledger off, by {who}: {ledger_now.path}", who)
+            self._ledger.end()
+            if ledger_now.failure is not None:
+                return 500, f"{ledger_now.path}: {ledger_now.failure}"
+            return 200, f"ledger off: {ledger_now.path} is whole"
+
+    def _free_path(self) -> Path:
+        folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
+        now = datetime.now(UTC)
+        for k in range(100):
+            path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")
+            if not path.exists():
+                return path
+        return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
+
+    def _mark(self, order: messages.Order, who: str) -> Done:
+        text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]
+        if not text:
+            return 400, 'a mark needs its text: {"text": "..."}'
+        self._notices.tell("mark", f"mark, by {who}: {text}", who)
+        return 200, "mark written" if self._ledger.on else "mark told; no ledger is being written"
+
+    def _fault(self, order: messages.Order, who: str) -> Done:
+        faults = self._faults
+        if faults is None or not faults.names():
+            return 409, "this run has no faults to start: give it some with --scenario"
+        if order.fault not in faults.names():
+            meant, known = did_you_mean(order.fault, faults.names()), ", ".join(faults.names())
+            return 404, f"no fault of that name; {meant}write one of {known}"
+        before = self._feed.count
+        act = faults.start if order.on else faults.stop
+        act(order.fault, who)
+        if self._waits_for(lambda: self._feed.count > before + 1):
+            return 200, f"fault {order.fault} {'on' if order.on else 'off'}"
+        return 504, f"asked for, but no frame was drawn within {LOOP_WAITS_S:g} s"
+
+
+@dataclass(frozen=True, slots=True)
+class RunDescription:
+    """What the page says of a run: command, source of attitudes, pace of frames; and the UDP port by which SCPI steers it."""
+
+    command: str
+    kind: str
+    endpoint: str
+    pace: messages.Pace = "clock"
+    steer_port: int = 0
+
+
+def setup_for(
+    listeners: Listeners, control: bool, description: RunDescription, file: "BenchFile", picture_bytes: int
+) -> messages.Setup:
+    """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
+    monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
+    hello = protocol.Hello(
+        version=__version__,
+        command=f"hilstar {description.command}",
+        bench=printable(file.path.name),
+        started_utc=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        resolution_px=monitor.resolution_px,
+        white_level=2**monitor.bits - 1,
+        bits=monitor.bits,
+        refresh_hz=monitor.refresh_hz,
+        control=control,
+    )
+    return messages.Setup(
+        hello=hello,
+        source=protocol.AttitudeSource(description.kind, printable(description.endpoint)),
+        hosts=[] if page is None else page.hosts,
+        names=[] if page is None else [name.lower() for name in page.names],
+        any_address=page is not None and page.any_address,
+        port=0 if page is None else page.port,
+        token="" if page is None else page.token,
+        picture_bytes=picture_bytes,
+        pace=description.pace,
+        scpi=None
+        if scpi is None
+        else messages.ScpiSetup(scpi.token, description.kind, description.steer_port, file.config.attitude.max_rate_deg_s),
+    )
+
+
+MAX_NAMES = 5000  # the brightest stars without a HIP number
+
+
+def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
+    """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids already."""
+    stars, overlay = bench.shown_stars, overlay_of(bench)
+    unnamed = np.flatnonzero(stars.hip == 0)
+    unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
+    return OverlayScene(
+        marks=overlay.marks,
+        hip=stars.hip.copy(),
+        v_mag=stars.v_mag.astype(np.float32),
+        names={star: name for star, name in zip(unnamed.tolist(), stars.names(unnamed), strict=True) if name},
+        sky=overlay.sky(),
+        aids=aid_levels_of(bench),
+        aids_in_levels=aids_in_levels,
+        colours=colour_notes(bench),
+    )
+
+
+@contextmanager
+def opened_page(
+    listeners: Listeners, control: bool, description: RunDescription, parts: PageParts
+) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
+    """The page and the SCPI of a run while this is open: the publisher of its frames, and the queue of its requests."""
+    width, height = parts.bench.config.monitor.resolution_px
+    picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
+    memory = messages.SharedMemory.make(picture_bytes)
+    feed, requests = FramePublisher(memory), SwitchRequests()
+    bench, orders = parts.bench, OrderHandler(requests, feed, parts)
+    setup = setup_for(listeners, control, description, bench.file, picture_bytes)
+    setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
+    setup.hello.certificate = certificate_number(bench.file)
+    setup.hello.answers = parts.answers is not None
+    setup.hello.faults = [] if parts.faults is None else parts.faults.names()
+    if listeners.page is not None:
+        setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
+    with PageProcess(setup, memory, listeners, WatchedRun(feed, parts).now, parts.notices, orders.do):
+        yield feed, requests
+
+
+CODE_BYTES = 2
+FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
+
+
+class _SessionNotices(Notices):
+    """Events of a session: the terminal has its lines already."""
+
+    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
+        self._hand_on(Notice.now(kind, " ".join(detail.split()), who))
+
+
+class ShownPattern(Protocol):
+    """Codes (h, w) or (h, w, 3) that a session shows on the monitor, and their name."""
+
+    @property
+    def name(self) -> str:
+        """The pattern's name."""
+
+    @property
+    def codes(self) -> npt.NDArray[np.uint16]:
+        """What the monitor shows."""
+
+
+class SessionPublisher:
+    """Publishes a first-light session: the session's thread writes pictures, the page's keeper reads the state."""
+
+    def __init__(self, memory: messages.SharedMemory) -> None:
+        self._memory, self.notices = memory, _SessionNotices()
+        self._failed: dict[str, str] = {}
+        self._patterns = 0
+
+    def show(self, pattern: ShownPattern) -> None:
+        """Publish the pattern now shown; of a coloured one the brightest channel."""
+        codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
+        height, width = codes.shape
+        # A step may have found that the monitor is larger than the bench file said.
+        if messages.PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
+            return
+        self._patterns += 1
+        head = messages.PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0)
+        self._memory.put_picture(head, codes)
+        self.notices.tell("pattern", f"shows {pattern.name}")
+
+    def say(self, line: str) -> None:
+        """Publish a line of the session: a step begins or ends."""
+        step, _, words = line.partition(" ")
+        if step == FORCED or words.strip().startswith(FAILED):
+            self._failed[step] = f"{step} {words.strip()}"
+        else:
+            self._failed.pop(step, None)
+        self.notices.tell("step", line)
+
+    def now(self) -> messages.RunState:
+        """The session's current state."""
+        now_ns = time.monotonic_ns()
+        failed, shown = list(self._failed.values()), protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
+        return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
+
+    def do(self, order: messages.Order) -> messages.OrderAnswer:
+        """Record a mark; a session takes no other order."""
+        if order.name != "mark" or not order.text.strip():
+            line = "a session of first light takes marks with a text, and no other order"
+            return messages.OrderAnswer(id=order.id, status=409, line=line)
+        self.notices.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
+        return messages.OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
+
+
+@contextmanager
+def session_page(listener: PageListener, control: bool, file: "BenchFile") -> Iterator[SessionPublisher]:
+    """The page of a session while this is open."""
+    monitor = file.config.monitor
+    width, height = monitor.resolution_px
+    picture_bytes = width * height * CODE_BYTES
+    memory = messages.SharedMemory.make(picture_bytes)
+    feed = SessionPublisher(memory)
+    listeners = Listeners(listener)
+    setup = setup_for(listeners, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
+    setup.hello.session = True
+    with PageProcess(setup, memory, listeners, feed.now, feed.notices, feed.do):
+        yield feed

@@ -1,0 +1,216 @@
+"""The live status of a run on the terminal: a few lines that stay in place, or one plain line every ten seconds elsewhere.
+
+The frame loop only leaves its newest frame here; a thread of the status words it, so that no terminal delays a frame.
+"""
+
+import logging
+import math
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from hilstar.basics.errors import printable
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hilstar.server.answers.judge import TrackerFigures
+    from hilstar.server.pacer import Shown
+    from hilstar.server.record.ledger import LedgerSwitch
+    from hilstar.server.serve import Running
+
+LIVE_EACH_S = 0.5
+PLAIN_EACH_S = 10.0
+STANDS_STILL_NS = NS_PER_S  # without a frame for so long
+ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class RunSource:
+    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there will be, and what is wrong
+    with the screen that --force shows it on."""
+
+    attitudes: str
+    renderer: str
+    refresh_hz: float
+    frames: float = math.inf
+    forced: str = ""
+
+
+class StatusLine(NamedTuple):
+    """One line of the status: what of, what it says, and whether that is as it should be."""
+
+    label: str
+    text: str
+    well: bool = True
+
+
+class RunStatus:
+    """What a run is doing, from the newest frame that `see` was given."""
+
+    def __init__(self, source: RunSource, ledger: "LedgerSwitch | None" = None) -> None:
+        self._source = source
+        self._ledger = ledger
+        self._begun_ns = time.monotonic_ns()
+        self._shown: Shown | None = None
+        self._running: Running | None = None
+        self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
+
+    def follow(self, running: "Running") -> None:
+        """Take the run, which goes on counting."""
+        self._running = running
+
+    def see(self, shown: "Shown") -> None:
+        """Take the newest frame; costs the frame loop one assignment."""
+        self._shown = shown
+
+    def begun(self) -> bool:
+        """Whether a frame has been shown, or is waited for."""
+        return self._running is not None and self._running.loop.watch.alive_ns > 0
+
+    def alive(self) -> bool:
+        """Whether the frame loop moves: its last step is not longer ago than ALIVE_NS, or a few frames where those are slow."""
+        running = self._running
+        limit_ns = max(ALIVE_NS, ALIVE_PERIODS / self._source.refresh_hz * NS_PER_S)
+        return running is not None and time.monotonic_ns() - running.loop.watch.alive_ns < limit_ns
+
+    def line(self) -> str:
+        """The run in one line that is quickly read."""
+        shown, running = self._shown, self._running
+        if shown is None or running is None:
+            return "no frame yet"
+        attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
+        told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
+        wrong = "".join(f"{one.text}; " for one in running.loop.notices.wrong_sky.now())
+        return f"{wrong}attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
+
+    def lines(self, now_ns: int) -> list[StatusLine]:
+        """The status at a host time; rates are since it was last asked for."""
+        shown, running = self._shown, self._running
+        if shown is None or running is None:
+            return [StatusLine("frames", "none yet"), *self._about()]
+        tally, packets = running.loop.tally, running.packets
+        then_ns, frames, received = self._before
+        self._before = (now_ns, tally.frames, packets.received)
+        seconds = max(now_ns - then_ns, 1) / NS_PER_S
+        total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
+        text = f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s), {tally.missed_frames} missed"
+        frames_line = StatusLine("frames", f"{text}, {tally.stale_frames} stale", not tally.missed_frames)
+        still_ns = now_ns - shown.swap_ns
+        if still_ns > STANDS_STILL_NS:
+            frames_line = StatusLine("frames", f"{frames_line.text}; none for {still_ns / NS_PER_S:.1f} s", False)
+        refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
+        told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
+        refused = ", ".join([refused] * bool(refused) + [f"{packets.lost} lost"] * bool(packets.lost))
+        return [
+            *(StatusLine("sky", f"WRONG: {one.text}", False) for one in running.loop.notices.wrong_sky.now()),
+            _attitude_line(shown),
+            frames_line,
+            StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
+            *([] if running.answers is None else [_tracker_line(running.answers.figures)]),
+            *self._about(),
+        ]
+
+    def _about(self) -> Iterator[StatusLine]:
+        ledger = None if self._ledger is None else self._ledger.current
+        if ledger is not None:
+            failed = f"; failed: {ledger.failure}" if ledger.failure else ""
+            text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
+            yield StatusLine("ledger", text, ledger.failure is None)
+        if self._source.forced:
+            yield StatusLine("forced", printable(self._source.forced), False)
+        yield StatusLine("source", self._source.attitudes)
+        yield StatusLine("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
+
+
+def _attitude_line(shown: "Shown") -> StatusLine:
+    attitude = shown.attitude
+    if attitude is None:
+        return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
+    from hilstar.basics.rotation import to_radec_roll_deg, turn_text  # with NumPy 0.1 s, which Tab and --help do not need
+
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
+    text = f"RA {turn_text(ra_deg)}, Dec {dec_deg:.4f}, roll {turn_text(roll_deg)} deg"
+    rate = attitude.rate_cam_rad_s
+    if rate is not None:
+        text += f", {math.degrees(math.hypot(*rate)):.4g} deg/s"
+    text += f", {attitude.age_ns / NS_PER_MS:.0f} ms old"
+    return StatusLine("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
+
+
+def _tracker_line(found: "TrackerFigures") -> StatusLine:
+    def three(values: list[float] | None) -> str:
+        return "-" if values is None else ", ".join(f"{value:.1f}" for value in values)
+
+    late = "-" if found.latency_ms is None else f"{found.latency_ms:.0f} ms"
+    share = "-" if found.availability is None else f"{100 * found.availability:.1f} %"
+    text = f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share} available, {late} late"
+    text += f", {found.mode}" if found.mode else ""
+    text += f"; {found.wrong} of {found.answers} answers wrong" if found.wrong else f"; {found.answers} answers"
+    text += f", {found.out_of_order} out of order" if found.out_of_order else ""
+    text += f", {found.unjudged} not judged" if found.unjudged else ""
+    text += f"; {found.trouble}" if found.trouble else ""
+    well = not found.silent and not found.trouble and found.verdict != "wrong"
+    return StatusLine("tracker", found.silent or text, well)
+
+
+@contextmanager
+def on_terminal(status: RunStatus) -> Iterator[None]:
+    """Keep the status on stderr while the run lasts: in place on a terminal, else a line every PLAIN_EACH_S."""
+    stop = threading.Event()
+    live = sys.stderr is not None and sys.stderr.isatty()
+    if live:
+        import rich.live  # noqa: F401 - takes 0.1 s, which is not to cost a frame
+    thread = threading.Thread(target=_live if live else _plain, args=(status, stop), name="hilstar-status", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _plain(status: RunStatus, stop: threading.Event) -> None:
+    begun_s = time.monotonic()
+    while not stop.wait(PLAIN_EACH_S):
+        said = "; ".join(f"{line.label} {line.text}" for line in status.lines(time.monotonic_ns()))
+        print(f"hilstar: {time.monotonic() - begun_s:.0f} s: {said}", file=sys.stderr)
+
+
+def _live(status: RunStatus, stop: threading.Event) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, _logs_above():
+        while not stop.is_set():
+            live.update(_table(status.lines(time.monotonic_ns())), refresh=True)
+            stop.wait(LIVE_EACH_S)
+
+
+def _table(lines: list[StatusLine]) -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for line in lines:
+        mark = Text("ok", style="green") if line.well else Text("!!", style="bold red")
+        table.add_row(mark, Text(line.label, style="bold"), Text(line.text, overflow="ellipsis", no_wrap=True))
+    return table
+
+
+@contextmanager
+def _logs_above() -> Iterator[None]:
+    """What is logged goes through the stream that the live lines have put in stderr's place, and so above them."""
+    handlers = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
+    before = [handler.setStream(sys.stderr) for handler in handlers]
+    try:
+        yield
+    finally:
+        for handler, stream in zip(handlers, before, strict=True):
+            if stream is not None:
+                handler.setStream(stream)

@@ -1,0 +1,178 @@
+"""The page's process. `console.page_process` starts it with five file descriptors: setup, shared memory, channel, and the
+listeners of the page and of SCPI, of which one may be missing (-1).
+
+It ends with the run, when the other end of the channel is closed for whatever reason.
+"""
+
+import asyncio
+import contextlib
+import ctypes
+import itertools
+import logging
+import os
+import pickle
+import signal
+import socket
+import sys
+import time
+from collections.abc import Coroutine, Iterator
+from typing import Any
+
+import msgspec
+import uvicorn
+
+from hilstar.basics.errors import one_line
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.console.messages import Order, OrderAnswer, PictureRequest, Setup, SharedMemory
+from hilstar.server.console.overlay import OverlayScene
+from hilstar.server.console.protocol import PageText
+from hilstar.server.console.server.app import ORDERED_S, Page
+from hilstar.server.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
+from hilstar.server.console.server.reader import TICK_S, PicturePacker, RunReader
+from hilstar.server.console.server.scpi import ScpiServer
+
+PR_SET_PDEATHSIG = 1
+NICE = 5  # frames go first
+MAX_ORDERS = 8
+MAX_ANSWER_BYTES = 8_000
+MAX_HEAD_BYTES = 16_000
+MAX_MESSAGE_BYTES = 4_000
+PICTURE_POLL_S = 0.02
+GOING_AWAY = 1001
+
+
+class Server(uvicorn.Server):
+    """uvicorn's server without its signal handlers: this process ends by itself."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave signals as they are."""
+        yield
+
+
+class OrderChannel:
+    """Sends orders to the run and receives its answers."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        channel.setblocking(False)
+        self._channel = channel
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
+
+    async def give(self, order: Order) -> OrderAnswer:
+        """Send an order and wait for its answer."""
+        if len(self._waiting) >= MAX_ORDERS:
+            return OrderAnswer(id=0, status=503, line="too many orders at once; try again")
+        order.id = next(self._numbers)
+        answer: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
+        self._waiting[order.id] = answer
+        try:
+            async with asyncio.timeout(ORDERED_S):
+                await asyncio.get_running_loop().sock_sendall(self._channel, msgspec.json.encode(order))
+                return await answer
+        except TimeoutError:
+            return OrderAnswer(id=0, status=504, line=f"no answer of the run within {ORDERED_S:g} s")
+        finally:
+            self._waiting.pop(order.id, None)
+
+    async def listen(self) -> None:
+        """Receive answers until the run closes its end."""
+        while True:
+            try:
+                data = await asyncio.get_running_loop().sock_recv(self._channel, MAX_ANSWER_BYTES)
+            except OSError:
+                return
+            if not data:
+                return
+            answer = msgspec.json.decode(data, type=OrderAnswer)
+            future = self._waiting.get(answer.id)
+            if future is not None and not future.done():
+                future.set_result(answer)
+
+
+async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> None:
+    """Read the shared memory and tell all pages, ten times a second."""
+    loop = asyncio.get_running_loop()
+    due_s = loop.time()
+    while True:
+        for event in reader.look():
+            pages.tell(PageText(event=event))
+        pages.tell(PageText(state=reader.state(), point=reader.points[-1]))
+        hz = pages.picture_hz
+        memory.want = PictureRequest(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S) if hz else PictureRequest()
+        due_s = max(due_s + TICK_S, loop.time())
+        await asyncio.sleep(due_s - loop.time())
+
+
+async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None:
+    """Pack each new picture once, on another thread, and offer it to all pages."""
+    last = 0
+    while True:
+        await asyncio.sleep(PICTURE_POLL_S)
+        answer = reader.new_answer()
+        if answer is not None:
+            pages.tell(PageText(answer=answer))
+        if pages.picture_hz:
+            packed = await asyncio.to_thread(room.newest, last, reader.seen, reader.answer)
+            if packed is not None:
+                last = packed.number
+                pages.show(packed)
+
+
+async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int) -> None:
+    """Serve until the run has ended."""
+    scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
+    reader, pages = RunReader(memory, setup), OpenPages()
+    page = Page(setup, reader, pages, None if scene is None else scene.sky, channel.give)
+    config = uvicorn.Config(
+        page.app(),
+        http=BoundedHttp,
+        ws=ReadingWebSocket,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PONG_S,
+        lifespan="off",
+        loop="asyncio",
+        access_log=False,
+        log_config=None,
+        server_header=False,
+        proxy_headers=False,
+        timeout_keep_alive=5,
+        h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+        ws_max_size=MAX_MESSAGE_BYTES,
+        ws_per_message_deflate=False,
+    )
+    works: list[Coroutine[Any, Any, None]] = [tick(reader, memory, pages)]
+    if page_fd >= 0:
+        works += [Server(config).serve([socket.socket(fileno=page_fd)]), show(PicturePacker(memory, scene), reader, pages)]
+    if setup.scpi is not None:
+        works.append(ScpiServer(setup.scpi, reader, memory, channel.give).serve(socket.socket(fileno=scpi_fd)))
+    tasks = [asyncio.create_task(work) for work in works]
+    ended = asyncio.create_task(channel.listen())
+    done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
+    if ended not in done:
+        done.pop().result()  # what went wrong
+    await pages.close_all(GOING_AWAY)
+
+
+def main() -> None:
+    """Set the process up, and serve."""
+    setup_fd, board_fd, wire_fd, page_fd, scpi_fd = map(int, sys.argv[1:])
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # even where this process hangs
+    for number in (signal.SIGINT, signal.SIGHUP):  # a terminal sends them to all; the run ends this process
+        signal.signal(number, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        os.nice(NICE)
+    logging.disable(logging.CRITICAL)  # the run says what there is to say
+    setup = msgspec.msgpack.decode(os.pread(setup_fd, os.fstat(setup_fd).st_size, 0), type=Setup)
+    memory = SharedMemory(board_fd, setup.picture_bytes)
+    code = 0
+    try:
+        asyncio.run(run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd))
+    except Exception as error:  # whatever it is: the run starts the page again
+        print(one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"), file=sys.stderr, flush=True)
+        code = 1
+    os._exit(code)  # without waiting for threads
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,393 @@
+"""The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in docs/console-server.md."""
+
+import asyncio
+import contextlib
+import hmac
+import ipaddress
+import time
+import urllib.parse
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from prometheus_client import CollectorRegistry
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.registry import Collector
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from hilstar.basics.palette import palette_css
+from hilstar.basics.wrong_sky import ENDS
+from hilstar.server.answers.judge import VERDICTS, TrackerFigures
+from hilstar.server.console.messages import Order, OrderAnswer, RunState, Setup
+from hilstar.server.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
+from hilstar.server.console.server.connections import OpenPage, OpenPages
+from hilstar.server.console.server.reader import RunReader
+
+LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'{sockets}; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class Refused(Exception):
+    """A refused request: HTTP status and a line."""
+
+    def __init__(self, status: int, line: str) -> None:
+        super().__init__(line)
+        self.status, self.line = status, line
+
+
+class Guard:
+    """Judges requests by their headers (lower-case names).
+
+    A page of another site can make a browser send requests here. By a name that it points at this machine (DNS rebinding) it
+    can even read the answers. So the name in `Host` has to be one of this page's, and an `Origin` that of the page itself.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self._hosts = set(setup.hosts)
+        self._names = {name for name in setup.names if ":" in name} | {
+            f"{name}{port}" for name in setup.names if ":" not in name for port in ("", ":443", ":80", f":{setup.port}")
+        }
+        self._any_address, self._port, self._token = setup.any_address, setup.port, setup.token
+
+    def check_host(self, host: str) -> None:
+        """Raises Refused (421) for a name that is not the page's."""
+        host = host.lower()
+        if host not in self._names and not self._is_own(host):
+            raise Refused(421, "this page is not served under that name; open it as hilstar printed it, or give --console-name")
+
+    def _is_own(self, host: str) -> bool:
+        name, port = _split(host)
+        if name in LOOPBACK and (port.isdecimal() or not port):  # by any port: that of a tunnel, such as ssh -L
+            return True
+        if port not in {"", str(self._port)} or (not port and self._port != 80):
+            return False
+        if name in self._hosts:
+            return True
+        with contextlib.suppress(ValueError):
+            return self._any_address and bool(ipaddress.ip_address(name.strip("[]")))
+        return False
+
+    def check_origin(self, headers: Mapping[str, str]) -> None:
+        """Raises Refused (403) for a request that another site's page made."""
+        origin, host = headers.get("origin"), headers.get("host", "").lower()
+        if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
+            raise Refused(403, "another site's page may not ask here")
+        if headers.get("sec-fetch-site", "none") in {"cross-site", "same-site"} and headers.get("sec-fetch-mode") != "navigate":
+            raise Refused(403, "another site's page may not ask here")
+
+    def check_token(self, headers: Mapping[str, str], protocols: Iterable[str] = ()) -> None:
+        """Raises Refused (401) without the token, in a header or as a WebSocket's subprotocol; compared in constant time."""
+        if not self._token:
+            return
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        tokens = [given.strip()] if scheme.lower() == "bearer" else []
+        tokens += [name.removeprefix(TOKEN_PROTOCOL) for name in protocols if name.startswith(TOKEN_PROTOCOL)]
+        wanted = self._token.encode()
+        matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]  # each, whichever was right
+        if True not in matches:
+            raise Refused(
+                401, "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer"
+            )
+
+
+def _split(host: str) -> tuple[str, str]:
+    if host.startswith("["):
+        name, _, rest = host.partition("]")
+        return name + "]", rest[1:] if rest.startswith(":") else ("x" if rest else "")
+    name, colon, port = host.partition(":")
+    return name, port if port or not colon else "x"
+
+
+class RunCollector(Collector):
+    """Makes a run's metrics on request."""
+
+    def __init__(self, reader: RunReader) -> None:
+        self._reader = reader
+        self.clients = 0
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+
+    def text(self) -> bytes:
+        """The answer of `GET /metrics`."""
+        return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
+
+    def collect(self) -> Iterator[Metric]:
+        """The metrics with their current values."""
+        hello, seen, health = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0), self._reader.health
+        info = {key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")}
+        yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
+        counts, clock, ledger, pacing = seen.counts, seen.clock, seen.ledger, self._reader.pacing
+        age_ms = None if seen.attitude is None else seen.attitude.age_ms
+        for name, words, count in (
+            ("frames", "Frames shown.", counts.frames),
+            ("frames_missed", "Refresh periods without a frame of their own.", counts.missed),
+            ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
+            ("frames_given_up", "Frames given up because their moment had passed.", counts.given_up),
+            ("packets_received", "Attitude packets received.", counts.received),
+            ("packets_lost", "Attitude packets that never came, by gaps of their sequence.", counts.lost),
+            ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", seen.wrong_sky_s),
+        ):
+            yield CounterMetricFamily(f"hilstar_{name}", words, value=count)
+        refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
+        for reason, count in counts.refused.items():
+            refused.add_metric([reason], count)
+        yield refused
+        wrong = GaugeMetricFamily("hilstar_wrong_sky", "1 while the sky shown is wrong, by kind.", labels=["kind"])
+        lasting = {condition.kind for condition in seen.wrong_sky}
+        for kind in ENDS:
+            wrong.add_metric([kind], float(kind in lasting))
+        yield wrong
+        tracker = seen.tracker
+        if tracker is not None:
+            yield from tracker_metrics(tracker)
+        gauges: list[tuple[str, str, float | None, float]] = [  # in units of the last; None is left out
+            ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
+            ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
+            ("attitude_missing", "1 until an attitude has come.", seen.frame.missing, 1),
+            ("attitude_stale", "1 while the attitude is stale.", seen.frame.stale, 1),
+            ("attitude_age_seconds", "Age of the attitude of the newest frame.", age_ms, 1e-3),
+            ("clock_offset_seconds", "Host time minus the sender's.", None if clock is None else clock.offset_ms, 1e-3),
+            ("clock_uncertainty_seconds", "Of the offset.", None if clock is None else clock.sigma_ms, 1e-3),
+            ("clock_drift_ratio", "How much faster the sender's clock runs.", None if clock is None else clock.drift_ppm, 1e-6),
+            ("stars", "Stars in the newest frame.", seen.frame.stars, 1),
+            ("stars_clipped", "Those brighter than the monitor's white.", len(seen.frame.clipped), 1),
+            ("display_lost", "1 where the display has gone.", bool(seen.display_lost), 1),
+            ("operator_override", "1 while an operator changes the sky.", bool(seen.operator_text), 1),
+            ("ledger_bytes", "Size of the ledger.", None if ledger is None else ledger.bytes, 1),
+            ("ledger_failing", "1 while it cannot be written.", None if ledger is None else bool(ledger.failing), 1),
+            ("frame_interval_sd_seconds", "Standard deviation of it.", None if pacing is None else pacing.sd_ms, 1e-3),
+            ("console_clients", "Pages that are open.", self.clients, 1),
+        ]
+        for name, words, value, unit in gauges:
+            if value is not None:
+                yield GaugeMetricFamily(f"hilstar_{name}", words, value=float(value * unit))
+        if pacing is not None:
+            words = "Between frames, over the last minute."
+            intervals = GaugeMetricFamily("hilstar_frame_interval_seconds", words, labels=["quantile"])
+            for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
+                intervals.add_metric([quantile], interval_ms * 1e-3)
+            yield intervals
+
+
+def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
+    """The metrics of a tracker's answers; residuals over the last minute."""
+    answers = CounterMetricFamily("hilstar_tracker_answers", "Answers of the tracker, by verdict.", labels=["verdict"])
+    for verdict in VERDICTS:
+        answers.add_metric([verdict], getattr(found, verdict))
+    yield answers
+    refused = CounterMetricFamily("hilstar_tracker_refused", "What was no answer, by reason.", labels=["reason"])
+    for reason, count in found.refused.items():
+        refused.add_metric([reason], count)
+    yield refused
+    words = "Answers whose stamp is before an earlier answer's."
+    yield CounterMetricFamily("hilstar_tracker_out_of_order", words, value=found.out_of_order)
+    for name, words, values in (
+        ("residual", "Of the newest answer.", found.residual_arcsec),
+        ("residual_rms", "Of the last minute's right answers.", found.rms_arcsec),
+        ("residual_sigma3", "Three standard deviations of them.", found.sigma3_arcsec),
+    ):
+        if values is not None:
+            gauge = GaugeMetricFamily(f"hilstar_tracker_{name}_arcsec", words, labels=["axis"])
+            for axis, value in zip("xyz", values, strict=True):
+                gauge.add_metric([axis], value)
+            yield gauge
+    for name, words, figure, unit in (
+        ("availability_ratio", "Right answers of the last minute over those due.", found.availability, 1),
+        ("latency_seconds", "From the exposure's middle to the answer.", found.latency_ms, 1e-3),
+        ("answer_age_seconds", "Since the newest answer.", found.age_s, 1),
+        ("silent", "1 while the tracker does not answer.", bool(found.silent), 1),
+        ("trouble", "1 while something is wrong with the tracker's line.", bool(found.trouble), 1),
+    ):
+        if figure is not None:
+            yield GaugeMetricFamily(f"hilstar_tracker_{name}", words, value=float(figure * unit))
+
+
+PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
+TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+MAX_BODY_BYTES = 4_000
+MAX_DRAINED_BYTES = 64_000_000  # a body that is too long is read this far, so that its sender comes to read why
+BODY_S = 5.0
+STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
+ORDERED_S = 30.0  # a ledger on a slow disk
+
+Give = Callable[[Order], Awaitable[OrderAnswer]]
+
+
+class Page:
+    """The application's handlers, one per address."""
+
+    def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give) -> None:
+        self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
+        self.guard, self.metrics = Guard(setup), RunCollector(reader)
+        self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
+        self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
+        self._files["palette.css"] = palette_css().encode()
+
+    def app(self) -> ASGIApp:
+        """The application, with its guard before it."""
+        routes = [
+            Route("/", self._index),
+            Route("/static/{name}", self._static),
+            Route("/health", self._health),
+            Route("/metrics", self._metrics),
+            Route("/state", self._state),
+            Route("/sky", self._sky_map),
+            Route("/control/{name}", self._control, methods=["POST"]),
+            WebSocketRoute("/live", self._live),
+        ]
+        return Guarded(Starlette(routes=routes, exception_handlers={Refused: _refused}), self.guard)
+
+    async def _index(self, _: Request) -> Response:
+        return Response(self._files["index.html"], media_type="text/html")
+
+    async def _static(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        data = self._files.get(name)
+        if data is None or name.endswith(".html"):
+            return _refusal(404, "no such file")
+        return Response(data, media_type=TYPES[Path(name).suffix])
+
+    async def _health(self, _: Request) -> Response:
+        found = self.reader.health_now()
+        return Response(msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json")
+
+    async def _metrics(self, _: Request) -> Response:
+        self.metrics.clients = len(self.pages)
+        return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+    async def _state(self, _: Request) -> Response:
+        return Response(PageText(hello=self.setup.hello, state=self.reader.state()).json(), media_type="application/json")
+
+    async def _sky_map(self, _: Request) -> Response:
+        return Response(self._sky, media_type="application/json")
+
+    async def _control(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in CONTROLS:
+            return _refusal(404, f"no control of that name; there are {', '.join(CONTROLS)}")
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if kind != "application/json":
+            return _refusal(415, "send JSON, with Content-Type: application/json")
+        data = await _body(request)
+        if not self.setup.hello.control:
+            return _refusal(403, "read-only: start hilstar with --control to act from here")
+        try:
+            body = msgspec.json.decode(data or b"{}", type=OrderBody)
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            return _refusal(400, f"not the JSON of a control: {error}")
+        # The operator's name as the page gives it, with the address unless that is this machine.
+        who = urllib.parse.unquote(request.headers.get("x-operator", "")[:400], errors="replace").strip()
+        address = request.client.host if request.client else ""
+        who = (who or "somebody at the page") + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
+        order = Order(id=0, name=name, who=who, on=body.on, level=body.level, text=body.text, fault=body.name)
+        answer = await self.give(order)
+        done_ns = time.monotonic_ns()
+        with contextlib.suppress(TimeoutError):  # the next request is to see what the order changed
+            async with asyncio.timeout(STATE_S):
+                while self.reader.seen is not None and self.reader.seen.host_ns <= done_ns:
+                    await asyncio.sleep(0.02)
+        key = "line" if answer.status < 400 else "error"
+        return JSONResponse({key: answer.line}, answer.status)
+
+    async def _live(self, socket: WebSocket) -> None:
+        self.pages.make_room()
+        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in socket.scope["subprotocols"] else None)
+        client = OpenPage(socket)
+        client.tell(PageText(hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)).json())
+        for event in list(self.reader.events)[-90:]:
+            client.tell(PageText(event=event).json())
+        await self.pages.follow(client)
+
+
+async def _body(request: Request) -> bytes:
+    if int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES and "expect" in request.headers:
+        raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
+    data, seen = b"", 0
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                seen += len(chunk)
+                if seen <= MAX_BODY_BYTES:
+                    data += chunk
+                elif seen > MAX_DRAINED_BYTES:
+                    break
+    except TimeoutError:
+        raise Refused(408 if seen <= MAX_BODY_BYTES else 413, "the body did not come in time") from None
+    except ClientDisconnect:
+        raise Refused(400, "the body did not come") from None
+    if seen > MAX_BODY_BYTES:
+        raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
+    return data
+
+
+def _refused(_: Request, error: Exception) -> Response:
+    return _refusal(error.status, error.line) if isinstance(error, Refused) else _refusal(500, "")
+
+
+def _refusal(status: int, line: str) -> JSONResponse:
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {"Connection": "close"} if status in {408, 413} else None
+    return JSONResponse({"error": line}, status, headers)
+
+
+class Guarded:
+    """The application behind its guard: every request is checked first, and every answer has the same headers."""
+
+    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+        self._app, self._guard = app, guard
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        host = ""
+        try:
+            self._guard.check_host(headers.get("host", ""))
+            host = headers["host"]
+            self._guard.check_origin(headers)
+            # The page itself has no secret; it brings the token that its address has.
+            if scope["type"] == "websocket" or not (scope["path"] == "/" or scope["path"].startswith("/static/")):
+                self._guard.check_token(headers, scope.get("subprotocols", ()))
+            await self._app(scope, receive, _with_headers(send, host))
+        except Refused as refused:
+            answer, send = _refusal(refused.status, refused.line), _with_headers(send, host)
+            if scope["type"] == "websocket":
+                await WebSocket(scope, receive, send).send_denial_response(answer)
+            else:
+                with contextlib.suppress(RuntimeError):
+                    await answer(scope, receive, send)
+
+
+def _with_headers(send: Send, host: str) -> Send:
+    """Add the headers of every answer; `host` is the name in an allowed request, "" in a refused one."""
+    sockets = f" ws://{host} wss://{host}" if host else ""
+    headers = HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
+    extra = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers.items()]
+
+    async def sending(message: Any) -> None:
+        if message["type"] in {"http.response.start", "websocket.http.response.start"}:
+            message = message | {"headers": [*message.get("headers", ()), *extra]}
+        await send(message)
+
+    return sending

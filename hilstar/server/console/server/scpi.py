@@ -1,0 +1,519 @@
+"""SCPI over TCP, in the page's process: a test stand asks the run, gives it orders, and may steer the sky.
+
+Commands go where the page's go: the run's state is read from shared memory, orders are those of an operator. With `[attitude]
+source = "scpi"` an attitude packet goes to the run's own UDP port on loopback SENT_HZ times a second, as any sender's does. No
+frame waits for any of it. Every connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
+
+A controller is a connection that gave the token, or acted where none is needed; any other is a stranger. Whatever strangers do,
+attitudes go out in time: a connection has few commands a turn, all strangers together have one turn in STRANGERS_S, and a
+stranger takes the place of strangers alone (`Turns`, `Peers`).
+"""
+
+import asyncio
+import contextlib
+import hmac
+import math
+import socket
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from hilstar.attitude.wire.packet import Refusal, checked_sample, encode
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import propagate
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.version import __version__
+from hilstar.server.console import scpi
+from hilstar.server.console.messages import FRAME, HAS_AGE, FrameNumbers, Order, OrderAnswer, RunState, ScpiSetup, SharedMemory
+from hilstar.server.console.scpi import (
+    NOT_A_NUMBER,
+    OPERATION_COMPLETE,
+    Headers,
+    InstrumentStatus,
+    LineBuffer,
+    NotScpi,
+    ScpiError,
+    Unit,
+)
+from hilstar.server.console.server.reader import TICK_S, RunReader
+
+SENT_HZ = 50.0
+SETTLES_NS = 2 * NS_PER_S  # an attitude that is not shown by then is given up (-365)
+MARGIN_NS = NS_PER_MS  # between a state's time and what it was read from
+POLL_S = 0.01
+ALIVE_NS = NS_PER_S  # the run writes its state ten times a second
+MAX_CONTROLLERS, MAX_STRANGERS = 16, 16
+# Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms to the others.
+UNITS_A_TURN, TURN_S = 8, 0.001
+# Strangers have 800 a second together, 3 % of a core.
+STRANGER_UNITS_A_TURN, STRANGERS_S = 4, 0.005
+MAX_READ_BYTES = 4096
+MAX_UNSENT_BYTES = 65_536
+UNREAD_S = 10.0
+MAX_WRONG_TOKENS = 5
+WRONG_TOKEN_S = 0.5
+ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}  # by an order's HTTP status; else -310
+UNLOCKED = {"*IDN?", "*CLS", "SYSTem:AUTHenticate", "SYSTem:ERRor[:NEXT]?", "SYSTem:ERRor:COUNt?", "SYSTem:VERSion?"}
+
+# Bits of the operation and the questionable status; SCPI-1999 leaves bits 8 to 12 and 9 to 12 to a device.
+SKY_SHOWN, LEDGER_ON, FAULT_ON, OPERATOR_ON = 1 << 8, 1 << 9, 1 << 10, 1 << 11
+NO_ATTITUDE, LEDGER_FAILS, FRAMES_MISSED, NOT_WELL = 1 << 9, 1 << 10, 1 << 11, 1 << 12
+
+Give = Callable[[Order], Awaitable[OrderAnswer]]
+
+
+class SkySource:
+    """The attitude that SCPI steers: held, or turning at a rate from the moment that it was set; sent to a UDP port."""
+
+    def __init__(self, port: int, max_rate_deg_s: float) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.connect(("127.0.0.1", port))
+        self._max_rate_deg_s = max_rate_deg_s
+        self._q: FloatArray | None = None
+        self._rate_rad_s: FloatArray = np.zeros(3)
+        self._sequence = 0
+        self.set_ns = 0  # host time of the newest setting
+
+    def attitude(self, q: tuple[float, ...]) -> None:
+        """Show this attitude from now on, q_icrs_to_cam (4,); the rate stays. Raises ScpiError."""
+        sample = checked_sample(0, q, None)
+        if isinstance(sample, Refusal):
+            raise ScpiError(-222, sample.detail)
+        self._q, self.set_ns = sample.q_icrs_to_cam, time.monotonic_ns()
+        self.send(jumps=True)
+
+    def rate(self, rate_deg_s: tuple[float, ...]) -> None:
+        """Turn at this rate from now on, deg/s, cam (3,). Raises ScpiError."""
+        if math.hypot(*rate_deg_s) > self._max_rate_deg_s:
+            raise ScpiError(-222, f"faster than [attitude] max_rate_deg_s = {self._max_rate_deg_s:g}")
+        now_ns = time.monotonic_ns()
+        if self._q is not None:
+            self._q = self._at(self._q, now_ns)
+        self._rate_rad_s, self.set_ns = np.radians(rate_deg_s), now_ns
+        self.send()
+
+    def _at(self, q: FloatArray, t_ns: int) -> FloatArray:
+        return propagate(q, self._rate_rad_s, (t_ns - self.set_ns) / NS_PER_S)
+
+    def send(self, jumps: bool = False) -> None:
+        """Send the attitude of now; nothing before there is one."""
+        if self._q is None:
+            return
+        t_ns = self.set_ns if jumps else time.monotonic_ns()
+        sample = checked_sample(t_ns, tuple(self._at(self._q, t_ns)), tuple(self._rate_rad_s), self._sequence, jumps)
+        assert not isinstance(sample, Refusal)
+        self._sequence += 1
+        with contextlib.suppress(OSError):  # the run is ending
+            self._socket.send(encode(sample))
+
+    async def run(self) -> None:
+        """Send for ever."""
+        while True:
+            self.send()
+            await asyncio.sleep(1 / SENT_HZ)
+
+
+class Settled(NamedTuple):
+    """A setting of the sky that was shown, by its host time, and when that was found; ns."""
+
+    set_ns: int
+    seen_ns: int
+
+
+class Turns:
+    """Whose commands are next. Attitudes are sent between any two turns."""
+
+    def __init__(self) -> None:
+        self._strangers = asyncio.Lock()  # whose waiters are in order of arrival
+        self._next_s = 0.0
+
+    async def await_turn(self, stranger: bool) -> int:
+        """Wait for a turn; how many lines, commands and queries it has."""
+        if not stranger:
+            await asyncio.sleep(TURN_S)
+            return UNITS_A_TURN
+        clock_s = asyncio.get_running_loop().time
+        async with self._strangers:
+            await asyncio.sleep(self._next_s - clock_s())
+            self._next_s = clock_s() + STRANGERS_S
+        return STRANGER_UNITS_A_TURN
+
+
+class Peers:
+    """The connections that are open, controllers and strangers apart, in each the one that was silent longest first."""
+
+    def __init__(self) -> None:
+        self.controllers: dict[Connection, asyncio.StreamWriter] = {}
+        self.strangers: dict[Connection, asyncio.StreamWriter] = {}
+
+    def enter(self, client: "Connection", outgoing: asyncio.StreamWriter) -> None:
+        """Let a stranger in. Where there are too many, one of the address that has most of them gives way."""
+        if len(self.strangers) >= MAX_STRANGERS:
+            ((crowded, _),) = Counter(each.address for each in self.strangers).most_common(1)
+            first = next(each for each in self.strangers if each.address == crowded)
+            self.strangers.pop(first).transport.abort()
+        self.strangers[client] = outgoing
+
+    def heard(self, client: "Connection") -> None:
+        """Something came from this one."""
+        for peers in (self.controllers, self.strangers):
+            if client in peers:
+                peers[client] = peers.pop(client)
+
+    def promote(self, client: "Connection") -> None:
+        """A stranger is a controller from now on. Where there are too many, the one that was silent longest gives way."""
+        outgoing = self.strangers.pop(client, None)
+        if outgoing is None:
+            return
+        if len(self.controllers) >= MAX_CONTROLLERS:
+            self.controllers.pop(next(iter(self.controllers))).transport.abort()
+        self.controllers[client] = outgoing
+
+    def leave(self, client: "Connection") -> None:
+        """A connection has ended."""
+        self.controllers.pop(client, None)
+        self.strangers.pop(client, None)
+
+
+class ScpiServer:
+    """What all connections share: the run, its orders, and the sky where SCPI steers it."""
+
+    def __init__(self, setup: ScpiSetup, reader: RunReader, memory: SharedMemory, give: Give) -> None:
+        self.setup, self.reader, self.give = setup, reader, give
+        self.sky = SkySource(setup.steer_port, setup.max_rate_deg_s) if setup.steer_port else None
+        self._memory = memory
+        self.peers, self.turns = Peers(), Turns()
+        self._missed = 0
+        self._settled = Settled(0, 0)
+
+    async def serve(self, listener: socket.socket) -> None:
+        """Serve for ever."""
+        server = await asyncio.start_server(self._client, sock=listener, limit=MAX_READ_BYTES)
+        async with server, asyncio.TaskGroup() as tasks:
+            if self.sky is not None:
+                tasks.create_task(self.sky.run())
+            while True:
+                await asyncio.sleep(TICK_S)
+                self._look()
+
+    def _look(self) -> None:
+        self.pending()  # what is shown while nobody waits counts, too
+        for client in (*self.peers.controllers, *self.peers.strangers):
+            client.look()
+        self._missed = 0 if self.reader.seen is None else self.reader.seen.counts.missed
+
+    def conditions(self) -> tuple[int, int]:
+        """The conditions of the operation and the questionable status."""
+        seen = self.reader.seen
+        if seen is None:
+            return 0, NO_ATTITUDE | NOT_WELL
+        operation = SKY_SHOWN * (not seen.frame.blank) | LEDGER_ON * (seen.ledger is not None)
+        operation |= FAULT_ON * bool(seen.faults) | OPERATOR_ON * bool(seen.operator_text)
+        failing = seen.ledger is not None and bool(seen.ledger.failing)
+        questionable = NO_ATTITUDE * (seen.frame.missing or seen.frame.stale) | LEDGER_FAILS * failing
+        questionable |= FRAMES_MISSED * (seen.counts.missed > self._missed)
+        return operation, questionable | NOT_WELL * (not self.reader.health.ok)
+
+    def pending(self) -> bool:
+        """Whether the newest setting of the sky is not shown yet, or not in the run's state; for SETTLES_NS at most."""
+        sky, seen = self.sky, self.reader.seen
+        now_ns = time.monotonic_ns()
+        if sky is None or now_ns - sky.set_ns > SETTLES_NS:
+            return False
+        if self._settled.set_ns != sky.set_ns:
+            found = self._memory.frames.last()
+            if found is None or seen is None:
+                return True
+            frame = FrameNumbers._make(FRAME.unpack(found[1]))
+            follows = frame.flags & HAS_AGE and not seen.operator.get("pause")  # a covered or paused sky is not of now
+            if (frame.swap_ns - frame.age_ns if follows else frame.draw_ns) < sky.set_ns:
+                return True
+            self._settled = Settled(sky.set_ns, now_ns + MARGIN_NS)
+        return seen is None or seen.host_ns <= self._settled.seen_ns
+
+    async def settled(self) -> None:
+        """Wait until the sky is as it was set. Raises ScpiError (-365) where that takes over SETTLES_S."""
+        if not self.pending():
+            return
+        while self.pending():
+            await asyncio.sleep(POLL_S)
+        if self.sky is not None and self._settled.set_ns != self.sky.set_ns:
+            raise ScpiError(-365, f"the attitude was not shown within {SETTLES_NS / NS_PER_S:g} s")
+
+    async def _client(self, incoming: asyncio.StreamReader, outgoing: asyncio.StreamWriter) -> None:
+        """Serve one connection until it ends, says what no SCPI says, or does not read."""
+        peer = outgoing.get_extra_info("peername")
+        client = Connection(self, "" if not peer else str(peer[0]))
+        connected = outgoing.get_extra_info("socket")
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        outgoing.transport.set_write_buffer_limits(MAX_UNSENT_BYTES)
+        self.peers.enter(client, outgoing)
+        lines = LineBuffer()
+        try:
+            while data := await incoming.read(MAX_READ_BYTES):
+                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)  # else a write after a write waits for 40 ms
+                self.peers.heard(client)
+                await client.turn()
+                for line in lines.feed(data):
+                    answer = await client.answer(line)
+                    if client.wrong_tokens >= MAX_WRONG_TOKENS or outgoing.is_closing():  # it gave way to another
+                        return
+                    if answer:
+                        outgoing.write(answer.encode("ascii", "replace") + b"\n")
+                        async with asyncio.timeout(UNREAD_S):
+                            await outgoing.drain()
+        except NotScpi:
+            outgoing.transport.abort()  # a browser, as a rule, that another site's page made ask here: it gets no answer
+        except (OSError, TimeoutError):
+            outgoing.transport.abort()  # it has gone, or does not read
+        finally:
+            self.peers.leave(client)
+            outgoing.close()
+
+
+class Connection:
+    """One controller's instrument: each command by its pattern in COMMANDS."""
+
+    def __init__(self, server: ScpiServer, address: str) -> None:
+        self.status = InstrumentStatus()
+        self.unlocked = not server.setup.token
+        self.is_controller = False
+        self.wrong_tokens = 0
+        self.address = address
+        self._units_left = 0
+        self._server, self._reader = server, server.reader
+        self._who = "SCPI" + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
+        self._answers: list[str] = []
+
+    async def turn(self) -> None:
+        """Wait until this connection may go on, before each line, command and query."""
+        if not self._units_left:
+            self._units_left = await self._server.turns.await_turn(not self.is_controller)
+        self._units_left -= 1
+
+    def _acts(self) -> None:
+        """This connection has shown that it may act, and does."""
+        self.is_controller = True
+        self._server.peers.promote(self)
+
+    def look(self) -> None:
+        """Take the run's conditions as they are now."""
+        operation, questionable = self._server.conditions()
+        self.status.operation.see(operation)
+        self.status.questionable.see(questionable)
+        if self.status.completes and not self._server.pending():
+            self.status.completes = False
+            self.status.standard.event |= OPERATION_COMPLETE
+
+    async def answer(self, line: str | None) -> str:
+        """Do what a line says; its answers, "" for none. None is a line that was too long."""
+        self._answers = []
+        await self.turn()
+        try:
+            if line is None:
+                raise ScpiError(-363, f"a line has at most {scpi.MAX_LINE_BYTES} bytes")
+            for unit in HEADERS.units(line):
+                await self.turn()
+                await self._do(unit)
+        except ScpiError as error:  # bad syntax: the rest of the line has no meaning
+            self.status.add(error)
+        return ";".join(self._answers)
+
+    async def _do(self, unit: Unit) -> None:
+        try:
+            if not self.unlocked and unit.pattern not in UNLOCKED:
+                raise ScpiError(-203, 'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was given')
+            if unit.pattern not in UNLOCKED:
+                self._acts()
+            if unit.pattern in BARE:
+                scpi.count(unit, 0)
+            self.look()
+            query = QUERIES.get(unit.pattern)
+            found = await COMMANDS[unit.pattern](self, unit) if query is None else query(self)
+            if found is not None:
+                self._answers.append(found)
+        except ScpiError as error:
+            self.status.add(error)
+
+    async def _order(self, order: Order) -> None:
+        answer = await self._server.give(order)
+        if answer.status >= 400:
+            raise ScpiError(ORDER_ERRORS.get(answer.status, -310), answer.line)
+        done_ns = time.monotonic_ns()
+        for _ in range(round(2 * TICK_S / POLL_S) + 1):  # the next query is to see what the order changed
+            if self._reader.seen is not None and self._reader.seen.host_ns > done_ns:
+                break
+            await asyncio.sleep(POLL_S)
+
+    async def reset(self, unit: Unit) -> None:
+        """`*RST`: the sky uncovered and without faults, standing still; the attitude and the ledger stay."""
+        self.status.completes = False
+        seen = self._reader.seen
+        for name in () if seen is None else [name for name, on in seen.operator.items() if on]:
+            await self._order(Order(id=0, name=name, who=self._who, on=False))
+        for name in [] if seen is None else seen.faults:
+            with contextlib.suppress(ScpiError):  # one of the faults' stream is not this run's to end
+                await self._order(Order(id=0, name="fault", who=self._who, on=False, fault=name))
+        if self._server.sky is not None:
+            self._server.sky.rate((0.0, 0.0, 0.0))
+
+    async def complete_later(self, unit: Unit) -> None:
+        """`*OPC`."""
+        self.status.completes = True
+        self.look()
+
+    async def complete(self, unit: Unit) -> str:
+        """`*OPC?`."""
+        await self.wait(unit)
+        return "1"
+
+    async def wait(self, unit: Unit) -> None:
+        """`*WAI`; what does not settle is an error, and waited for no longer."""
+        try:
+            await self._server.settled()
+        except ScpiError as error:
+            self.status.add(error)
+
+    async def authenticate(self, unit: Unit) -> None:
+        """`SYST:AUTH "TOKEN"`; compared in constant time, a wrong one slowly."""
+        (given,) = scpi.count(unit, 1)
+        if given.kind != "string":
+            raise ScpiError(-104, 'write SYST:AUTH "TOKEN"')
+        token = self._server.setup.token
+        if token and not hmac.compare_digest(given.text.encode(), token.encode()):
+            self.wrong_tokens += 1
+            await asyncio.sleep(WRONG_TOKEN_S)
+            raise ScpiError(-203, "that is not the token")
+        self.unlocked = True
+        self._acts()
+
+    async def switch(self, unit: Unit) -> None:
+        """`SKY:BLAN ON` (no light) and `LEDG:STAT ON`: the switches of the page."""
+        (on,) = scpi.count(unit, 1)
+        name = "blank" if unit.pattern.startswith("SKY") else "ledger"
+        await self._order(Order(id=0, name=name, who=self._who, on=scpi.boolean(on)))
+
+    async def fault(self, unit: Unit) -> None:
+        """`SKY:FAUL "NAME"[,ON|OFF]`: one of the scenario's."""
+        name, *on = scpi.count(unit, 1, 2)
+        if name.kind != "string":
+            raise ScpiError(-104, 'write SKY:FAUL "NAME",ON')
+        wanted = scpi.boolean(on[0]) if on else True
+        await self._order(Order(id=0, name="fault", who=self._who, on=wanted, fault=name.text))
+
+    def _steered(self) -> SkySource:
+        if self._server.sky is None:
+            raise ScpiError(-221, f"the attitude comes by {self._server.setup.source}; write [attitude] source = 'scpi'")
+        return self._server.sky
+
+    async def set_attitude(self, unit: Unit) -> None:
+        """`SKY:ATT w,x,y,z`: q_icrs_to_cam, from now on."""
+        sky, given = self._steered(), scpi.count(unit, 4)
+        sky.attitude(tuple(map(scpi.number, given)))
+
+    async def set_rate(self, unit: Unit) -> None:
+        """`SKY:RATE x,y,z`: deg/s about the camera's axes, from now on."""
+        sky, given = self._steered(), scpi.count(unit, 3)
+        sky.rate(tuple(scpi.number(each, "DEG/S") for each in given))
+
+    async def attitude(self, unit: Unit) -> str:
+        """`SKY:ATT?` and `SKY:RATE?`: of the newest frame, once what was set is shown; deg/s."""
+        await self.wait(unit)
+        shown = self.seen.attitude
+        if unit.pattern == "SKY:RATE?":
+            return _numbers(None if shown is None else shown.rate_deg_s, 3)
+        return _numbers(None if shown is None else shown.q, 4)
+
+    @property
+    def seen(self) -> RunState:
+        """The run's newest state."""
+        return self._reader.seen or RunState(host_ns=0)
+
+    def status_byte(self) -> str:
+        """`*STB?`; a message waits where this line has answered before."""
+        return str(self.status.byte(bool(self._answers)))
+
+    def self_test(self) -> str:
+        """`*TST?`: 0 while the run answers and its frame loop moves."""
+        seen = self.seen
+        alive = time.monotonic_ns() - seen.host_ns < ALIVE_NS and seen.host_ns - seen.alive_ns < ALIVE_NS
+        return str(int(not alive))
+
+    def faults(self) -> str:
+        """`SKY:FAUL?`: the names of those that are on."""
+        return ",".join('"' + name.replace('"', '""') + '"' for name in self.seen.faults) or '""'
+
+    def residual(self) -> str:
+        """`TRAC:RES?`: of the tracker's newest answer, arcsec about x, y, z."""
+        figures = self.seen.tracker
+        return _numbers(None if figures is None else figures.residual_arcsec, 3)
+
+
+def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str:
+    return ",".join([NOT_A_NUMBER] * places if values is None else [f"{value:.12E}" for value in values])
+
+
+def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Command":
+    async def command(connection: Connection, unit: Unit) -> None:
+        what(connection.status, scpi.integer(scpi.count(unit, 1)[0], maximum))
+
+    return command
+
+
+def _bare(what: Callable[[InstrumentStatus], None]) -> "Command":
+    async def command(connection: Connection, unit: Unit) -> None:
+        what(connection.status)
+
+    return command
+
+
+Command = Callable[[Connection, Unit], Awaitable[str | None]]
+# Queries that answer at once. None of any kind has parameters.
+QUERIES: dict[str, Callable[[Connection], str]] = {
+    "*IDN?": lambda at: f"hilstar,star display,0,{__version__}",
+    "*ESE?": lambda at: str(at.status.standard.enable),
+    "*ESR?": lambda at: str(at.status.standard.read()),
+    "*SRE?": lambda at: str(at.status.service_enable),
+    "*STB?": Connection.status_byte,
+    "*TST?": Connection.self_test,
+    "SYSTem:ERRor[:NEXT]?": lambda at: at.status.next_error(),
+    "SYSTem:ERRor:COUNt?": lambda at: str(len(at.status.errors)),
+    "SYSTem:VERSion?": lambda at: "1999.0",
+    "STATus:OPERation[:EVENt]?": lambda at: str(at.status.operation.read()),
+    "STATus:OPERation:CONDition?": lambda at: str(at.status.operation.condition),
+    "STATus:OPERation:ENABle?": lambda at: str(at.status.operation.enable),
+    "STATus:QUEStionable[:EVENt]?": lambda at: str(at.status.questionable.read()),
+    "STATus:QUEStionable:CONDition?": lambda at: str(at.status.questionable.condition),
+    "STATus:QUEStionable:ENABle?": lambda at: str(at.status.questionable.enable),
+    "SKY:BLANk?": lambda at: str(int(bool(at.seen.operator.get("blank")))),
+    "SKY:FAULt?": Connection.faults,
+    "LEDGer:STATe?": lambda at: str(int(at.seen.ledger is not None)),
+    "TRACker:RESidual?": Connection.residual,
+    "FRAMe:MISSed?": lambda at: str(at.seen.counts.missed),
+}
+COMMANDS: dict[str, Command] = {
+    "*CLS": _bare(InstrumentStatus.clear),
+    "*RST": Connection.reset,
+    "*OPC": Connection.complete_later,
+    "*OPC?": Connection.complete,
+    "*WAI": Connection.wait,
+    "*ESE": _setting(lambda status, mask: setattr(status.standard, "enable", mask), 255),
+    "*SRE": _setting(lambda status, mask: setattr(status, "service_enable", mask & ~scpi.MASTER), 255),
+    "SYSTem:AUTHenticate": Connection.authenticate,
+    "STATus:PRESet": _bare(InstrumentStatus.preset),
+    "STATus:OPERation:ENABle": _setting(lambda status, mask: setattr(status.operation, "enable", mask), 0x7FFF),
+    "STATus:QUEStionable:ENABle": _setting(lambda status, mask: setattr(status.questionable, "enable", mask), 0x7FFF),
+    "SKY:BLANk": Connection.switch,
+    "SKY:ATTitude": Connection.set_attitude,
+    "SKY:ATTitude?": Connection.attitude,
+    "SKY:RATE": Connection.set_rate,
+    "SKY:RATE?": Connection.attitude,
+    "SKY:FAULt": Connection.fault,
+    "LEDGer:STATe": Connection.switch,
+}
+BARE = {*QUERIES, "*CLS", "*RST", "*OPC", "*OPC?", "*WAI", "STATus:PRESet", "SKY:ATTitude?", "SKY:RATE?"}
+HEADERS = Headers([*QUERIES, *COMMANDS])

@@ -1,0 +1,167 @@
+"""What the commands print: lines, one JSON object, a summary, a progress bar, a refusal."""
+
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import msgspec
+import typer
+from msgspec import UNSET
+
+from hilstar.basics.errors import one_line
+
+if TYPE_CHECKING:
+    from hilstar.attitude.clock.sender_clock import ClockSummary
+    from hilstar.attitude.wire.packet import Reason
+    from hilstar.basics.running_statistics import Percentiles
+    from hilstar.server.summary import PacketSummary, RunSummary
+
+INSTEAD: "dict[Reason, str]" = {
+    "format": "send packets of 64 bytes, version 1, little-endian, or JSON with t_ns and q",
+    "crc": "end each packet with the CRC-32 of zlib over the 60 bytes before it, and look at the cable",
+    "nan": "send finite numbers",
+    "norm": "send unit quaternions, scalar first, not angles",
+    "rate": "send rates in rad/s, or write a larger [attitude] max_rate_deg_s",
+    "time": "let t_ns rise from packet to packet",
+    "source": "stop one of the two senders",
+}
+CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
+
+
+def say(line: str) -> None:
+    """A line for the person at the terminal."""
+    typer.echo(line, err=True)
+
+
+def print_json(value: Any) -> None:
+    """The one JSON object of --json; NumPy's numbers come out as plain ones."""
+    try:
+        typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
+    except UnicodeEncodeError:  # a file's name that is not UTF-8; Python's own writes its bytes as escapes
+        typer.echo(json.dumps(msgspec.to_builtins(value, enc_hook=_plain)))
+
+
+def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
+    """What a command found: an object (a dictionary, dataclass or struct) for a program, or lines for a person."""
+    if as_json:
+        print_json(found)
+    else:
+        for line in lines:
+            typer.echo(line)
+
+
+def _plain(value: Any) -> Any:
+    import numpy as np  # 0.1 s, which Tab and --help do not need
+
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def report(summary: "RunSummary", as_json: bool) -> None:
+    """The summary of a run, for a program or a person."""
+    if as_json:
+        print_json(summary)
+        return
+
+    def figure(value: float | None, digits: int = 2) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    def spread(times: "Percentiles") -> str:
+        return " / ".join(figure(value) for value in (times.p50, times.p99, times.max))
+
+    packets, stars, clipped = summary.packets, summary.stars_drawn, summary.clipped
+    refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
+    flooded = summary.link["flooded"] if summary.link else 0
+    turned_away = (f" ({refused})" if refused else "") + (f"; {flooded} more passed over unread" if flooded else "")
+    lost = f", {packets.lost} lost" if packets.lost else ""
+    lines = {
+        "frames": f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
+        f", {summary.missed_frames} missed, {summary.stale_frames} stale",
+        "frame time": f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready",
+        "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
+        "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
+        + "".join(f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]),
+        "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
+    }
+    if summary.clock:
+        from hilstar.attitude.clock.sender_clock import KNOWN_MODES  # brings NumPy, which Tab and --help do not need
+
+        absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
+        if summary.receive_latency_ms:
+            lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
+        lines["sender's clock"] = clock_line(summary.clock)
+    if summary.sync:
+        lines["pulses"] = summary.sync.line()
+    for name, line in [*lines.items(), *_last_lines(summary)]:
+        typer.echo(f"{name:20}{line}")
+
+
+def _last_lines(summary: "RunSummary") -> Iterator[tuple[str, str]]:
+    """What was wrong with the sky for a time, the renderer, and at the end the verdict."""
+    for name, what in (
+        ("operator", "changed by an operator's keys"),
+        ("hidden", "not fully visible"),
+        ("gamma", "under another program's gamma ramp"),
+    ):
+        lasted = (summary.screen or {}).get(name, {"frames": 0})
+        if lasted["frames"]:
+            yield name, f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
+    for condition in summary.wrong_sky.conditions:
+        yield condition.kind, f"{condition.seconds:.1f} s: {condition.text}"
+    yield "renderer", summary.gl_renderer
+    if summary.verdict:
+        yield "verdict", summary.verdict.line
+
+
+def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "") -> str:
+    """Why a run had no attitude, and what to change; `trouble` is what its link knows of the other side."""
+    if not packets.received:
+        advice = trouble.removeprefix(f"{endpoint}: ") or "start the sender, and check its address"
+        return f"no attitude came from {endpoint}; {advice}"
+    reasons = [(count, reason) for reason, count in packets.refused_by.items() if count]
+    shown = INSTEAD if packets.shown is UNSET else {**INSTEAD, **packets.shown}
+    told = "; ".join(f"{count} for {reason}: {shown[reason]}" for count, reason in sorted(reasons, reverse=True))
+    return f"all {packets.refused} packets from {endpoint} were refused, {told}"
+
+
+def clock_line(clock: "ClockSummary") -> str:
+    """How the sender's clock stands to this machine's."""
+    if clock.mode == "none":
+        return "no attitude has arrived"
+    if clock.mode == "shared":
+        return "shared with the sender"
+    if clock.mode == "unix":
+        return f"Unix time, kept to {clock.uncertainty_ms or 0.0:.3f} ms by this machine's kernel, and the sender's own error"
+    if clock.uncertainty_ms is None:
+        return f"{CLOCK_WORDS[clock.mode]}: heard too briefly to state an uncertainty"
+    known = f"drift {clock.drift_ppm:.1f} ppm, uncertainty {clock.uncertainty_ms:.3f} ms"
+    if clock.mode == "one-way":
+        known += ", excluding the minimum transport delay"
+    jumps = f", jumps: {clock.jumps}" if clock.jumps else ""
+    return f"{CLOCK_WORDS[clock.mode]}: {known}{jumps}"
+
+
+@contextmanager
+def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal's stderr, nothing elsewhere."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
+        task = bar.add_task(what, total=None if math.isinf(total) else total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def fail(line: str, code: int) -> NoReturn:
+    """One line on stderr, and out."""
+    print("hilstar: " + one_line(line), file=sys.stderr)
+    sys.exit(code)

@@ -1,0 +1,610 @@
+"""The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that survives a kill.
+
+A separate thread writes a complete chunk with its CRC five times a second, so that no disk delays a frame. In a flood the first
+messages are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
+last. A disk that fails is tried again and never ends the display. Where somebody deletes, truncates or overwrites the file, an
+event says so and the ledger continues in another file, because the rest of the first could not be read.
+"""
+
+import contextlib
+import itertools
+import json
+import math
+import os
+import resource
+import threading
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, Self
+
+import msgspec
+
+from hilstar.attitude.logs.mcap_log import (
+    ATTITUDE_TOPIC_OF_RUN,
+    RUN_METADATA,
+    JsonTopic,
+    McapWriter,
+    attitude_message,
+    log_time_ns,
+    part_path,
+    refused_message,
+)
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.basics.errors import InputError, cannot_write, printable
+from hilstar.basics.files import NewFile
+from hilstar.basics.notices import Notice, Notices
+from hilstar.basics.process.closing import Closing
+from hilstar.basics.process.interrupts import caught, stop_on_signal
+from hilstar.basics.units import NS_PER_S
+from hilstar.basics.wrong_sky import BEGINS, ENDS
+from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.frame import Bench
+from hilstar.server.record.ledger_records import (
+    LOST,
+    MAX_RAW_BYTES,
+    RECORDS,
+    AnswerRecord,
+    CountRecord,
+    EventRecord,
+    FaultRecord,
+    FrameRecord,
+    ProcessRecord,
+    raw_convention,
+    schema_of,
+)
+
+Kind = Literal["packet", "frame", "event", "fault", "answer"]
+MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
+FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
+# Approximate size of a JSON message and its objects; a packet's raw bytes are added.
+ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "answer": 4000}
+
+
+@dataclass(frozen=True, slots=True)
+class QueueEntry:
+    """A message to be written: its host time, a sequence number, its JSON once the writer asks for it, and a packet's bytes."""
+
+    kind: Kind
+    time_ns: int
+    sequence: int
+    encoded: Callable[[], bytes]
+    raw_bytes: int = 0
+
+    @property
+    def size_bytes(self) -> int:
+        """Approximate size in memory."""
+        return ENTRY_BYTES[self.kind] + self.raw_bytes
+
+
+class LedgerQueue:
+    """Entries in order of arrival, bounded by bytes. Never blocks; drops frames first when it is full."""
+
+    def __init__(self) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._entries: list[QueueEntry] = []
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def put(self, entry: QueueEntry) -> bool:
+        """Queue an entry; where it is full, count the entry and return False."""
+        room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
+        with self._lock:
+            if self._bytes + entry.size_bytes > room:
+                self.dropped[entry.kind] += 1
+                return False
+            self._entries.append(entry)
+            self._bytes += entry.size_bytes
+            return True
+
+    def take(self) -> list[QueueEntry]:
+        """Take all entries."""
+        with self._lock:
+            taken, self._entries, self._bytes = self._entries, [], 0
+        return taken
+
+
+Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only counted
+
+
+class Allowance:
+    """A token bucket: `burst` messages at once, then `per_s` each second, are recorded in full."""
+
+    def __init__(self, burst: float, per_s: float) -> None:
+        self._burst, self._per_s = burst, per_s
+        self._left, self._last_ns = burst, 0
+
+    def take(self, now_ns: int) -> bool:
+        """Whether one more message is recorded in full."""
+        passed_s = max(0, now_ns - self._last_ns) / NS_PER_S if self._last_ns else 0.0
+        self._last_ns = now_ns
+        self._left = min(self._burst, self._left + passed_s * self._per_s)
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class FloodFilter:
+    """In a flood, passes the first messages of each kind and reason and counts the others."""
+
+    # Refused packets tell little after the first ones; no sender means to send more than 2000 good ones a second.
+    ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
+
+    def __init__(self) -> None:
+        self._allowances: dict[tuple[Kind, str], Allowance] = {}
+        self._counts: Counter[tuple[Counted, str]] = Counter()
+        self._lock = threading.Lock()
+
+    def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
+        """Whether a message that arrives now is recorded in full; it is counted if not."""
+        with self._lock:
+            allowance = self._allowances.get((kind, reason))
+            if allowance is None:
+                rule = "event" if kind == "event" else "accepted" if reason == "accepted" else "refused"
+                allowance = self._allowances[kind, reason] = Allowance(*self.ALLOWED[rule])
+            kept = allowance.take(now_ns)
+            if not kept:
+                self._counts[kind, reason] += 1
+        return kept
+
+    def count(self, kind: Counted, reason: str, number: int = 1) -> None:
+        """Count messages that are not recorded for other reasons."""
+        with self._lock:
+            self._counts[kind, reason] += number
+
+    def counted(self) -> Counter[tuple[Counted, str]]:
+        """The counts since the last call, by kind and reason."""
+        with self._lock:
+            counts, self._counts = self._counts, Counter()
+        return counts
+
+
+class ProcessProbe:
+    """Measures this process's memory and CPU time. Opens /proc once, because later no descriptor may be free."""
+
+    def __init__(self) -> None:
+        self._fd: int | None = None
+        with contextlib.suppress(OSError):
+            self._fd = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+
+    def record(self) -> ProcessRecord | None:
+        """The current figures; None if the system has none."""
+        if self._fd is None:
+            return None
+        try:
+            pages = int(os.pread(self._fd, 128, 0).split()[1])
+        except (OSError, ValueError, IndexError):
+            return None
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        size = os.sysconf("SC_PAGE_SIZE")
+        return ProcessRecord(host_ns=time.monotonic_ns(), resident_bytes=pages * size, cpu_s=used.ru_utime + used.ru_stime)
+
+    def close(self) -> None:
+        """Close its file."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+
+NO_ROOM = "no room"  # the reason given for lost messages
+FLUSH_S = 0.2
+EACH_S = 1.0  # how often counts, the process and the disk are looked at
+MAX_CHUNK_BYTES = 1_000_000
+MAX_DETAIL_CHARACTERS = 200
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
+MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
+STALLED_S = 5.0  # since the writer's last pass
+LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
+FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for packets, the smaller of the two
+
+
+@dataclass(frozen=True, slots=True)
+class SplitLimits:
+    """The size or age at which a ledger continues in another file."""
+
+    bytes: float = math.inf
+    seconds: float = math.inf
+
+
+NO_SPLIT = SplitLimits()
+
+
+class Ledger(Closing):
+    """Writes a run's MCAP file. Raises InputError if it cannot be created."""
+
+    def __init__(
+        self, path: Path, bench: Bench, notices: Notices | None = None, overwrite: bool = False, split: SplitLimits = NO_SPLIT
+    ) -> None:
+        self.path = self._asked = path
+        self.failure: str | None = None
+        self._notices = Notices() if notices is None else notices
+        self._overwrite, self._split = overwrite, split
+        self._head = {
+            "bench_sha256": bench.file.sha256,
+            "bench_file": printable(str(bench.file.path)),
+            "bench_text": bench.file.text,
+            "calibration": bench.calibration.name,
+            "calibration_sha256": bench.calibration.sha256,
+            "certificate": certificate_number(bench.file),
+            "gl_renderer": bench.renderer.gl_renderer,
+            "gl_version": bench.renderer.gl_version,
+            "render_path": bench.renderer.path,
+            "quantisation": bench.renderer.target.quantisation,
+            "codes_ms": json.dumps(bench.config.render.codes_ms),
+            "raw_convention": raw_convention(bench.config),
+            "output": json.dumps(bench.output),
+            "monotonic_ns": str(time.monotonic_ns()),
+            "unix_ns": str(time.time_ns()),
+            "run_id": uuid.uuid4().hex,
+        }
+        self._queue, self._filter = LedgerQueue(), FloodFilter()
+        self._lost = self._counted = self._part = 0
+        self._thin = self._moved = False
+        self._renewed_s, self._rest_s = -math.inf, EACH_S
+        self.standing: Callable[[], list[FaultRecord | EventRecord]] = list  # records that a file begun during a run repeats
+        self._file, self._writer = self._begin(path, overwrite)
+        self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
+        self._begun_s = self._alive_s = time.monotonic()
+        self._each_s, self._probe, self._closing = 0.0, ProcessProbe(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
+        self._thread.start()
+
+    def _begin(self, path: Path, overwrite: bool) -> tuple[NewFile, McapWriter]:
+        file = NewFile(path, overwrite)
+        try:
+            writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
+            file.commit()
+            file.note()
+        except OSError as error:
+            file.discard()
+            raise cannot_write(path, error, "choose another place for the ledger") from error
+        return file, writer
+
+    @property
+    def size_bytes(self) -> int:
+        """The size of its newest file."""
+        try:
+            return os.fstat(self._file.fd).st_size
+        except OSError:  # between two files
+            return 0
+
+    # Called by the run, from any thread
+
+    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+        """Record a packet; see `attitude.receiver.Watch`."""
+        raw = raw[:MAX_RAW_BYTES]
+        if sample is not None and refusal is None:
+            reason, sequence, encoded = "accepted", sample.sequence, partial(attitude_message, sample, host_ns, raw)
+        else:
+            refusal, sequence = refusal or Refusal("format", ""), 0 if sample is None else sample.sequence
+            reason, detail = refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS]
+            encoded = partial(refused_message, reason, detail, host_ns, raw)
+        if self._filter.keeps("packet", reason, host_ns):
+            self._queue.put(QueueEntry("packet", host_ns, sequence, encoded, len(raw)))
+
+    def frame(self, record: FrameRecord) -> None:
+        """Record a frame."""
+        self._queue.put(QueueEntry("frame", record.swap_ns, record.frame, partial(msgspec.json.encode, record)))
+        if time.monotonic() - self._alive_s > STALLED_S:
+            self._notices.begin(
+                "ledger-stalled", f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on"
+            )
+
+    def notice(self, notice: Notice) -> None:
+        """Record an event of the run."""
+        if self._filter.keeps("event", notice.kind, notice.host_ns):
+            record = event_record(notice)
+            self._queue.put(QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record)))
+
+    def stands(self, record: EventRecord) -> None:
+        """Record an event from before this ledger."""
+        self._queue.put(QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record)))
+
+    def fault(self, record: FaultRecord) -> None:
+        """Record the beginning or the end of a fault; a replay needs each."""
+        self._queue.put(QueueEntry("fault", record.host_ns, record.number, partial(msgspec.json.encode, record)))
+
+    def answer(self, record: AnswerRecord) -> None:
+        """Record an answer of the tracker."""
+        if self._filter.keeps("answer", "accepted", record.host_ns):
+            self._queue.put(QueueEntry("answer", record.host_ns, 0, partial(msgspec.json.encode, record)))
+
+    def pulse(self, what: str) -> None:
+        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        self._filter.count("pulse", what)
+
+    def lost(self, number: int) -> None:
+        """Count packets that a gap of their `sequence` shows."""
+        self._filter.count("lost", LOST, number)
+
+    # The writer's thread
+
+    def _run(self) -> None:
+        while not self._closing.wait(FLUSH_S):
+            self._turn(last=False)
+        self._turn(last=True)
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _turn(self, last: bool) -> None:
+        try:
+            harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
+            if harm is None:
+                self._look_at_place()
+            elif last or time.monotonic() - self._renewed_s > self._rest_s:
+                self._renew(harm, last)
+            for entry in self._queue.take():
+                if entry.kind == "frame" and self._thin:
+                    self._lose("frame", 1)
+                else:
+                    self._add(entry.kind, entry.time_ns, entry.encoded(), entry.sequence)
+            now_s = time.monotonic()
+            if last or now_s - self._each_s >= EACH_S:
+                self._each_s = now_s
+                self._each_second()
+            self._flush()
+            self._file.note()
+            if last:
+                self._writer.finish()
+            elif self._writer.size_bytes >= self._split.bytes or now_s - self._begun_s >= self._split.seconds:
+                self._go_on_in_another()
+        except Exception as error:  # no error ends the ledger or the run
+            self._failed(error)
+            if last:
+                self._lose("packet", self._writer.drop())
+        self._alive_s = time.monotonic()
+        self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again")
+
+    def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
+        self._writer.add(key, log_time_ns(time_ns), data, sequence)
+        if self._writer.pending_bytes > MAX_CHUNK_BYTES:
+            self._flush()
+
+    def _each_second(self) -> None:
+        now_ns = time.monotonic_ns()
+        dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
+        for kind, number in dropped.items():
+            self._lose(kind, number)
+        for (kind, reason), number in self._filter.counted().items():
+            self._counted += 0 if reason == NO_ROOM or kind in {"pulse", "lost"} else number
+            record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
+            self._add("count", now_ns, msgspec.json.encode(record))
+        process = self._probe.record()
+        if process is not None:
+            self._add("process", now_ns, msgspec.json.encode(process))
+        self._look_at_disk()
+
+    def _renew(self, harm: str, last: bool) -> None:
+        if self._renewed_s > 0:  # repeated damage must not fill the disk with files
+            self._rest_s = min(2 * self._rest_s, MAX_REST_S)
+        self._renewed_s = time.monotonic()
+        before, lost, part = part_path(self.path, self._part), self._writer.written, self._part
+        self.failure = f"{before} was {harm} while it was written"
+        self._part = 0
+        names = (self._asked.with_name(f"{self._asked.stem}.next{k}{self._asked.suffix}") for k in itertools.count(1))
+        path = next(name for name in names if not os.path.lexists(name))
+        try:
+            file, writer = self._begin(path, overwrite=False)
+        except InputError as error:
+            self._part = part
+            self._lost += lost if last else 0
+            self._say_lost(f"{self.failure}, and no other can be begun: {error}; the display goes on")
+            return
+        self._say_lost(f"{self.failure}: {lost} messages in it may be lost; the ledger goes on in {path}")
+        self._lost += lost
+        writer.take_over(self._writer)
+        old, self._file, self._writer, self.path = self._file, file, writer, path
+        self._begun_s, self._moved = time.monotonic(), False
+        for record in self.standing():
+            kind, number = ("fault", record.number) if isinstance(record, FaultRecord) else ("event", 0)
+            self._add(kind, record.host_ns, msgspec.json.encode(record), number)
+        old.close()
+
+    def _say_lost(self, line: str) -> None:
+        if "ledger-lost" in self._notices.active:
+            self._notices.tell("ledger-lost", line)
+        else:
+            self._notices.begin("ledger-lost", line)
+
+    def _look_at_place(self) -> None:
+        if self._moved:
+            return
+        place = part_path(self.path, self._part)
+        try:
+            self._moved = not os.path.samestat(place.stat(), os.fstat(self._file.fd))
+        except FileNotFoundError:
+            self._moved = True
+        if self._moved:
+            self._notices.tell("ledger-moved", f"{place}: was moved while it is written; the ledger goes on where it is now")
+
+    def _lose(self, kind: Kind | str, number: int) -> None:
+        self._lost += number
+        self._filter.count(kind if kind in {"frame", "packet", "answer"} else "event", NO_ROOM, number)
+
+    def _look_at_disk(self) -> None:
+        disk = os.fstatvfs(self._file.fd)
+        free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+        if not total:
+            return
+        left = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, is free"
+        if free < LOW_SHARE * total:
+            self._notices.begin("disk-low", left)
+        elif free > WELL_SHARE * total:
+            self._notices.end("disk-low", "disk-well", left)
+        self._thin = free < min(FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE * total)
+        if self._thin:
+            self._notices.begin("ledger-thin", f"{left}: frames are no longer recorded, packets still are")
+        else:
+            self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
+
+    def _flush(self) -> None:
+        try:
+            self._writer.flush()
+        except OSError:
+            self._lose("frame", self._writer.drop("frame"))
+            try:
+                self._writer.flush()
+            except OSError as error:
+                self._failed(error)
+                if self._writer.pending_bytes > MAX_CHUNK_BYTES:
+                    self._lose("packet", self._writer.drop())
+                return
+        self._notices.end("ledger-failed", "ledger-back", f"{self.path}: the ledger can be written again")
+
+    def _failed(self, error: Exception) -> None:
+        self.failure = str(getattr(error, "strerror", None) or f"{type(error).__name__} {error}".strip())
+        self._notices.begin("ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on")
+
+    def _go_on_in_another(self) -> None:
+        self._part += 1
+        try:
+            file, writer = self._begin(part_path(self.path, self._part), self._overwrite)
+        except InputError as error:
+            self._part -= 1
+            self._begun_s = time.monotonic()  # so that it is not tried at each pass
+            self._notices.tell("ledger-split-failed", f"{error}; the ledger stays in its present file")
+            return
+        try:
+            self._writer.finish()
+            self._file.close()
+        finally:
+            self._file, self._writer, self._begun_s = file, writer, time.monotonic()
+
+    # The end
+
+    def close(self) -> None:
+        """Write what is queued and the end of the file; a disk that does not accept it in time has failed."""
+        self._closing.set()
+        patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
+        self._thread.join(patience_s)
+        if self._thread.is_alive():  # it still owns the file, so nothing more can be done
+            self._failed(TimeoutError(f"the disk did not take its last messages within {patience_s:g} s"))
+            return
+        self._probe.close()
+
+    def summary(self) -> dict[str, str | int | None]:
+        """Its path, what went wrong, how many messages were lost, and how many of a flood were only counted."""
+        lost = self._lost + sum(self._queue.dropped.values())
+        told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
+        if self._counted:
+            told["only_counted"] = self._counted
+        if self._part:
+            told["files"] = self._part + 1
+        return told
+
+
+TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
+    key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
+    for key, (topic, record) in RECORDS.items()
+}
+
+
+def event_record(notice: Notice) -> EventRecord:
+    """The ledger's record of an event."""
+    return EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who, since_ns=notice.since_ns)
+
+
+class LedgerSwitch:
+    """Passes a run's records to the current ledger, which can be begun and ended during the run; drops them without one.
+
+    Frames and packets come from any thread and never wait. `begin` and `end` are for one thread, which may wait for a disk.
+    """
+
+    def __init__(self, ledger: Ledger | None = None) -> None:
+        self.current = self.last = ledger  # `last` is the newest one
+        self._ending = threading.Lock()  # the end of a run waits for an end that an operator asked for
+        self._scenario: list[FaultRecord] = []
+        self._faults_on: dict[int, FaultRecord] = {}
+        self._wrong_sky: dict[str, EventRecord] = {}
+        if ledger is not None:
+            ledger.standing = self._standing
+
+    @property
+    def on(self) -> bool:
+        """Whether there is a ledger now."""
+        return self.current is not None
+
+    @property
+    def failure(self) -> str | None:
+        """Why the newest ledger could not be written, else None."""
+        return None if self.last is None else self.last.failure
+
+    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+        """Record a packet; see `attitude.receiver.Watch`."""
+        if (ledger := self.current) is not None:
+            ledger.packet(host_ns, raw, sample, refusal)
+
+    def frame(self, record: FrameRecord) -> None:
+        """Record a frame."""
+        if (ledger := self.current) is not None:
+            ledger.frame(record)
+
+    def notice(self, notice: Notice) -> None:
+        """Record an event of the run; a ledger that begins later repeats the conditions of a wrong sky that hold."""
+        if notice.kind in ENDS:
+            self._wrong_sky[notice.kind] = event_record(notice)
+        elif notice.kind in BEGINS:
+            self._wrong_sky.pop(BEGINS[notice.kind], None)
+        if (ledger := self.current) is not None:
+            ledger.notice(notice)
+
+    def answer(self, record: AnswerRecord) -> None:
+        """Record an answer of the tracker."""
+        if (ledger := self.current) is not None:
+            ledger.answer(record)
+
+    def lost(self, number: int) -> None:
+        """Count packets that a gap of their `sequence` shows."""
+        if (ledger := self.current) is not None:
+            ledger.lost(number)
+
+    def pulse(self, what: str) -> None:
+        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        if (ledger := self.current) is not None:
+            ledger.pulse(what)
+
+    def fault(self, record: FaultRecord) -> None:
+        """Record a fault's event; a ledger that begins later repeats the scenario and the faults that are on."""
+        if record.event == "scenario":
+            self._scenario.append(record)
+        elif record.event == "start":
+            self._faults_on[record.number] = record
+        else:
+            self._faults_on.pop(record.number, None)
+        if (ledger := self.current) is not None:
+            ledger.fault(record)
+
+    def begin(self, make: Callable[[], Ledger]) -> Ledger:
+        """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot be made."""
+        if (ledger := self.current) is None:
+            ledger = make()
+            ledger.standing = self._standing
+            for record in self._standing():
+                if isinstance(record, FaultRecord):
+                    ledger.fault(record)
+                else:
+                    ledger.stands(record)
+            self.last = self.current = ledger
+        return ledger
+
+    def _standing(self) -> list[FaultRecord | EventRecord]:
+        return [*self._scenario, *list(self._faults_on.values()), *list(self._wrong_sky.values())]
+
+    def end(self) -> Ledger | None:
+        """End the ledger and wait until it is complete on the disk; the ended ledger."""
+        with self._ending, stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+            ledger, self.current = self.current, None
+            if ledger is not None:
+                ledger.close()
+        return ledger
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()

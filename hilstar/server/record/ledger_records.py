@@ -1,0 +1,449 @@
+"""What a ledger holds, and how it is read: its head, its records in their order, and the frames to be drawn again.
+
+There is a record for each frame, each event, each second of the process, and for what was only counted.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.logs.mcap_log import (
+    ATTITUDE_TOPIC,
+    RUN_METADATA,
+    Topics,
+    read_chunks,
+    read_messages,
+    read_metadata,
+)
+from hilstar.attitude.wire.packet import MAX_PLACE_KM, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError, cannot_read, printable
+from hilstar.basics.reading import NOT_JSON, parse_toml
+from hilstar.basics.units import MAX_SPEED_KM_S
+from hilstar.server.answers.judge import Judged
+from hilstar.server.bench.config import BenchConfig
+from hilstar.server.bench.config.attitude import PACKET_SOURCES
+from hilstar.server.bench.frame import Bench
+from hilstar.server.pacer import Shown
+
+FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
+ANSWER_TOPIC = "/answer"
+# What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
+PULSES = ("sent", "skipped", "lost")
+LOST = "sequence"  # why packets count as lost
+MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
+MAX_CENTROIDS = 200  # kept of an answer
+HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
+AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
+Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+
+
+class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
+    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
+
+    `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn along which stars are drawn
+    as paths, null for points. `velocity_km_s` (ICRS, for aberration) and `place_km` (about the Earth) are the observer's where
+    the source gives them, else null. `capped` counts stars with coarser paths. `missed_before` counts the refresh periods just
+    before it without a frame, `missed` those of the run. `marker` is the photodiode square. `operator` names the operator's
+    switches ("blank, grid"; under a blank or a patch `q` is null), `hidden` says why the window was not seen; "" for neither.
+    """
+
+    frame: Count
+    t_ns: AnyNs
+    light_ns: AnyNs
+    draw_ns: HostNs
+    predicted_swap_ns: HostNs | None = None
+    swap_ns: HostNs
+    timestamp_source: str = "headless"
+    q: tuple[float, float, float, float] | None = None
+    rate: tuple[float, float, float] | None = None
+    velocity_km_s: tuple[float, float, float] | None = None
+    place_km: tuple[float, float, float] | None = None
+    attitude_sequence: int | None = None
+    attitude_t_ns: AnyNs | None = None
+    receive_ns: HostNs | None = None
+    age_ns: AnyNs | None = None
+    prediction_ns: AnyNs = 0
+    stale: bool = False
+    stars_drawn: Count = 0
+    clipped: Count = 0
+    below_step: Count = 0
+    capped: Count = 0
+    missed_before: Count = 0
+    missed: Count = 0
+    marker: Marker | None = None
+    operator: str = ""
+    hidden: str = ""
+    faults: tuple[Count, ...] = ()
+    fault_since_ns: tuple[AnyNs, ...] = ()
+
+
+_KINDS: dict[Any, str] = {float: "number", float | None: "number", str: "string", bool: "boolean"} | dict.fromkeys(
+    (int, int | None, HostNs, HostNs | None, AnyNs, AnyNs | None, Count, Count | None, Marker | None), "integer"
+)
+
+
+def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
+    """The JSON schema of a record, of plain types only (see `attitude.logs.mcap_log.ATTITUDE_SCHEMA`)."""
+    array = {"type": "array", "items": {"type": "number"}}
+    fields = {f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array for f in msgspec.structs.fields(record)}
+    if "centroids" in fields:
+        fields["centroids"] = {"type": "array", "items": {"type": "array"}}
+    return msgspec.json.encode({"title": title, "type": "object", "properties": fields})
+
+
+class ProcessRecord(msgspec.Struct, kw_only=True):
+    """The process's memory and CPU time at a moment of host time, ns."""
+
+    host_ns: HostNs
+    resident_bytes: Count
+    cpu_s: float
+
+
+class EventRecord(msgspec.Struct, kw_only=True):
+    """An event of a run (see `hilstar.basics.notices`): host time, ns, its kind, its text, and the person that it comes from.
+
+    `since_ns` is when that began of which it tells, where this was earlier.
+    """
+
+    host_ns: HostNs
+    kind: str
+    detail: str
+    who: str = ""
+    since_ns: AnyNs | None = None
+
+
+class FaultRecord(msgspec.Struct, kw_only=True):
+    """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time, and `t_ns` of the run.
+
+    `number` counts the starts of a run, `who` is "file", "stream" or a person. `table` is the fault as JSON, with the
+    keys of a scenario; `seed` that of its randomness, `folder` where its files are, and `file_sha256` that of its map.
+    """
+
+    host_ns: HostNs
+    event: str
+    number: Count
+    name: str
+    kind: str
+    who: str
+    t_ns: AnyNs
+    table: str
+    seed: int = 0
+    folder: str = ""
+    file_sha256: str = ""
+
+
+class AnswerRecord(msgspec.Struct, kw_only=True):
+    """An answer of the tracker: its bytes (`raw`, hexadecimal), what they say, and what was lit while it looked.
+
+    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then. `t_ns` is the tracker's
+    stamp on its own clock, `light_ns` the exposure's middle on the sender's clock. `centroids` are [x_px, y_px, dn, hip].
+    `verdict` is "right", "wrong" (see `[answers] wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no one sky was
+    lit) or "unjudged" (compared with nothing; `middle_ns` is then `host_ns`).
+
+    `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the rotation vector from
+    it to `q`, cam.
+    """
+
+    host_ns: HostNs
+    raw: str
+    t_ns: AnyNs | None = None
+    q: tuple[float, float, float, float] | None = None
+    rate: tuple[float, float, float] | None = None
+    valid: bool = True
+    mode: str = ""
+    stars: Count | None = None
+    rms_arcsec: float | None = None
+    centroids: tuple[tuple[float, float, float | None, int | None], ...] = ()
+    verdict: str = "unpaired"
+    middle_ns: AnyNs = 0
+    light_ns: AnyNs | None = None
+    q_lit: tuple[float, float, float, float] | None = None
+    residual_arcsec: tuple[float, float, float] | None = None
+    first_frame: Count | None = None
+    last_frame: Count | None = None
+
+
+class CountRecord(msgspec.Struct, kw_only=True):
+    """What was only counted, second by second (host time, ns): refused packets by reason, a flood, or pulses.
+
+    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost"; `reason` that of a refusal, "accepted" of other packets
+    and answers, the kind of an event, of a pulse one of PULSES, and LOST of packets that a gap of their `sequence` shows.
+    """
+
+    host_ns: HostNs
+    kind: str
+    reason: str
+    count: Count
+
+
+class PacketForm(msgspec.Struct, gc=False):
+    """What a report reads of a packet."""
+
+    accepted: bool = True
+    reason: str | None = None
+    receive_ns: AnyNs | None = None
+
+
+RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord | FaultRecord | AnswerRecord
+
+
+# The topic and the record of each kind that a ledger is given, beside packets.
+RECORDS: dict[str, tuple[str, type[msgspec.Struct]]] = {
+    "frame": (FRAME_TOPIC, FrameRecord),
+    "event": (EVENT_TOPIC, EventRecord),
+    "process": (PROCESS_TOPIC, ProcessRecord),
+    "count": (COUNT_TOPIC, CountRecord),
+    "fault": (FAULT_TOPIC, FaultRecord),
+    "answer": (ANSWER_TOPIC, AnswerRecord),
+}
+_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {topic: msgspec.json.Decoder(record) for topic, record in RECORDS.values()}
+_DECODERS[ATTITUDE_TOPIC] = msgspec.json.Decoder(PacketForm)
+
+
+def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
+    """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the run's missed frames
+    so far, and `below_step` the stars in view that are too faint for the monitor.
+    """
+    attitude, drawn = shown.attitude, shown.drawn
+    names = ("t_ns", "draw_ns", "predicted_swap_ns", "swap_ns", "timestamp_source", "stale", "missed_before", "marker")
+    record = FrameRecord(
+        frame=shown.number,
+        light_ns=light_ns,
+        stars_drawn=drawn.star_count,
+        clipped=len(drawn.clipped_hip),
+        below_step=below_step,
+        capped=drawn.capped,
+        missed=missed,
+        operator=shown.on_screen.operator,
+        hidden=shown.on_screen.hidden,
+        **{name: getattr(shown, name) for name in names},
+    )
+    if shown.faults:
+        record.faults = tuple(one.number for one in shown.faults)
+        record.fault_since_ns = tuple(one.since_ns for one in shown.faults)
+    record.rate = _numbers(drawn.rate_cam_rad_s)
+    if attitude is not None:
+        record.q = _numbers(attitude.q_icrs_to_cam)
+        record.velocity_km_s, record.place_km = _numbers(attitude.velocity_km_s), _numbers(attitude.place_km)
+        record.attitude_sequence = attitude.sequence
+        record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
+        record.receive_ns = attitude.received_ns
+        record.age_ns = _within_64_bits(attitude.age_ns)
+        record.prediction_ns = attitude.prediction_ns
+    return record
+
+
+def answer_record(judged: Judged) -> AnswerRecord:
+    """The ledger's record of an answer of the tracker."""
+    answer, lit = judged.answer, judged.lit
+    record = AnswerRecord(
+        host_ns=answer.host_ns,
+        raw=answer.raw[:MAX_RAW_BYTES].hex(),
+        t_ns=None if answer.t_ns is None else _within_64_bits(answer.t_ns),
+        q=_numbers(answer.q_icrs_to_cam),
+        rate=_numbers(answer.rate_cam_rad_s),
+        valid=answer.valid,
+        mode=printable(answer.mode)[:MAX_REASON_CHARACTERS],
+        stars=answer.star_count,
+        rms_arcsec=answer.rms_arcsec,
+        centroids=tuple((star.x_px, star.y_px, star.dn, star.hip) for star in answer.centroids[:MAX_CENTROIDS]),
+        verdict=judged.verdict,
+        middle_ns=_within_64_bits(judged.middle_ns),
+    )
+    if lit is not None:
+        record.light_ns, record.q_lit = _within_64_bits(lit.light_ns), _numbers(lit.q)
+        record.residual_arcsec = _numbers(judged.residual)
+        record.first_frame, record.last_frame = lit.first, lit.last
+    return record
+
+
+def _numbers(values: FloatArray | None) -> Any:
+    return None if values is None else tuple(values.tolist())
+
+
+def below_step(bench: Bench, shown: Shown) -> int:
+    """How many stars in view of a frame are too faint for the monitor."""
+    return 0 if shown.attitude is None else bench.count_faint(shown.attitude.q_icrs_to_cam)
+
+
+def _within_64_bits(value_ns: int) -> int:
+    return min(max(value_ns, -(2**63)), 2**63 - 1)
+
+
+NO_FRAMES = "has no frames; give the ledger of serve or replay --ledger"
+MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
+
+
+def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:
+    """The frames of a ledger as they were written, none if the file is no ledger. Raises InputError for damage."""
+    return _records(path, FRAME_TOPIC, tell)
+
+
+def fault_records(path: Path) -> Iterator[FaultRecord]:
+    """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing of a missing end."""
+    return _records(path, FAULT_TOPIC)
+
+
+def event_records(path: Path) -> Iterator[EventRecord]:
+    """The events of a run in its ledger. Raises InputError for damage; says nothing of a missing end."""
+    return _records(path, EVENT_TOPIC)
+
+
+def answer_records(path: Path) -> Iterator[AnswerRecord]:
+    """The tracker's answers in a ledger, none if the run had none. Raises InputError for damage."""
+    return _records(path, ANSWER_TOPIC)
+
+
+def _records(path: Path, topic: str, tell: bool = False) -> Iterator[Any]:
+    for number, data in enumerate(read_messages(path, topic, tell=tell), start=1):
+        try:
+            record = _DECODERS[topic].decode(data)
+        except NOT_JSON as error:
+            raise _not_ours(path, f"{number} of {topic}", error) from error
+        yield record
+
+
+def _not_ours(path: Path, which: str, error: Exception) -> InputError:
+    return InputError(f"{path}: message {which} is not one of hilstar's ({error})")
+
+
+def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[FrameRecord]:
+    """The frames of a ledger, to be drawn again. Raises InputError for damage, and for what the wire would refuse."""
+    for number, record in enumerate(frame_records(path), start=1):
+        wrong = wrong_in_frame(record, max_rate_rad_s)
+        if wrong:
+            raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: {wrong}")
+        yield record
+
+
+def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str:
+    """What the wire would refuse of a frame; "" where it can be drawn again."""
+    if record.q is not None:
+        sample = checked_sample(record.t_ns, record.q, record.rate)
+        refusal = sample if isinstance(sample, Refusal) else rate_refusal(sample, max_rate_rad_s)
+        if refusal is not None:
+            return refusal.detail
+    if math.hypot(*(record.velocity_km_s or ())) > MAX_SPEED_KM_S:
+        return f"a velocity over {MAX_SPEED_KM_S:g} km/s"
+    if record.place_km is not None and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM:
+        return f"a place beyond {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km"
+    return ""
+
+
+def run_records(path: Path) -> Iterator[RunRecord]:
+    """The records of a ledger, in order. Raises InputError for a file that is no ledger or is damaged."""
+    for block in run_blocks(path, 1):
+        yield from block
+
+
+def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
+    """The records of a ledger, in order, `size` at once. Raises InputError as `run_records`."""
+    block: list[RunRecord] = []
+    last: Topics = {}
+    try:
+        for topics, messages in read_chunks(path):
+            if topics is not last:
+                last, decode = topics, {k: _DECODERS[topic].decode for k, topic in topics.items() if topic in _DECODERS}
+            block += [decode[channel](data) for channel, data in messages if channel in decode]
+            while len(block) >= size:
+                yield _checked(block[:size])
+                block = block[size:]
+        yield _checked(block)
+    except OSError as error:
+        raise cannot_read(path, error, "give the ledger of a run") from error
+    except (*NOT_JSON, ArithmeticError) as error:
+        raise _first_fault(path, error) from error
+
+
+def attitudes_of(records: Sequence[Any]) -> FloatArray:
+    """The attitudes (n, 4) of the frames that have one."""
+    q = [record.q for record in records if type(record) is FrameRecord and record.q is not None]
+    return np.fromiter(chain.from_iterable(q), np.float64, 4 * len(q)).reshape(-1, 4)
+
+
+def _checked(records: list[RunRecord]) -> list[RunRecord]:
+    # `checked_sample` has the same rule, and costs ten times as much.
+    with np.errstate(over="ignore"):
+        if (np.abs(np.linalg.norm(attitudes_of(records), axis=1) - 1.0) > NORM_TOLERANCE).any():
+            raise ArithmeticError("a quaternion's norm is not 1")
+    return records
+
+
+def _first_fault(path: Path, error: Exception) -> InputError:
+    every = ((topics[channel], data) for topics, messages in read_chunks(path, tell=False) for channel, data in messages)
+    for number, (topic, data) in enumerate(every, start=1):
+        which = f"{number}, of {topic}"
+        try:
+            record = _DECODERS[topic].decode(data) if topic in _DECODERS else None
+        except NOT_JSON as wrong:
+            return _not_ours(path, f"{which},", wrong)
+        if isinstance(record, FrameRecord) and record.q is not None and abs(math.hypot(*record.q) - 1.0) > NORM_TOLERANCE:
+            return InputError(f"{path}: message {which}: {wrong_in_frame(record)}")
+    return _not_ours(path, "", error)
+
+
+class PacketTally:
+    """The number of packets, accepted or by the reason for their refusal."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+
+    def add(self, record: RunRecord) -> None:
+        """Add a recorded packet, or a count of packets."""
+        if isinstance(record, PacketForm):
+            self.count("accepted" if record.accepted else (record.reason or "format").split(":")[0], 1)
+        elif isinstance(record, CountRecord) and record.kind == "packet":
+            self.count(record.reason, record.count)
+
+    def count(self, reason: str, number: int) -> None:
+        """Add packets of one kind."""
+        key = reason[:MAX_REASON_CHARACTERS] if len(self.counts) < MAX_REASONS or reason in self.counts else "others"
+        self.counts[key] = self.counts.get(key, 0) + number
+
+
+def read_head(path: Path) -> dict[str, str]:
+    """The head of a ledger, {} if there is none. Raises InputError for damage."""
+    try:
+        return read_metadata(path, RUN_METADATA)
+    except OSError as error:
+        raise cannot_read(path, error, "give the ledger of a run") from error
+
+
+def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
+    """What codes cost in a run (see `[render] codes_ms`), from its ledger's head; None where nothing was measured or fixed."""
+    try:
+        return msgspec.json.decode(head.get("codes_ms", "null"), type=tuple[float, float] | None)
+    except msgspec.MsgspecError:
+        return None
+
+
+def raw_convention(config: BenchConfig) -> str:
+    """What a ledger's head says of the bytes in `raw`: their convention and the mounting, by which
+    `q` was made of them.
+
+    `q` and `rate` of the ledger are hilstar's own: whoever reads them applies neither again. JSON;
+    null for a source that has no packets.
+    """
+    settings = config.attitude
+    if settings.source not in PACKET_SOURCES:
+        return "null"
+    of_body = settings.convention.frame == "body"
+    mounting = config.tracker.q_body_to_cam if of_body else None
+    meaning = {**msgspec.structs.asdict(settings.convention), "q_body_to_cam": mounting}
+    return msgspec.json.encode(meaning).decode()
+
+
+def config_of(head: dict[str, str]) -> BenchConfig | None:
+    """The configuration of a run, from its ledger's head; None if that holds none that can be read."""
+    try:
+        return msgspec.convert(parse_toml(Path("the ledger's head"), head.get("bench_text", "")), BenchConfig)
+    except (InputError, msgspec.ValidationError, RecursionError):
+        return None

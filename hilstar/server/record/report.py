@@ -1,0 +1,544 @@
+"""The figures of a run's report, from its ledger: added in blocks, in memory that does not grow with the run."""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import UNSET, UnsetType
+
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import MAX_DETAIL_CHARACTERS
+from hilstar.basics.running_statistics import Percentiles, RunningStatistics
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import WrongSky, WrongSkyTotal
+from hilstar.server.record.answer_figures import AnswerReport, AnswerTally, answer_rows
+from hilstar.server.record.ledger_records import (
+    MAX_REASON_CHARACTERS,
+    MAX_REASONS,
+    NO_FRAMES,
+    PULSES,
+    AnswerRecord,
+    CountRecord,
+    EventRecord,
+    FaultRecord,
+    FrameRecord,
+    PacketForm,
+    PacketTally,
+    ProcessRecord,
+    RunRecord,
+    attitudes_of,
+    config_of,
+    read_head,
+    run_blocks,
+)
+
+SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
+SPANS = 8192  # in which a run is drawn along its time
+BLOCK = 4096  # records that are added at once
+
+
+class ThinnedRows:
+    """Every n-th row of a stream; n doubles as the stream grows."""
+
+    def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
+        self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
+        self._kept, self._seen, self.stride = 0, 0, 1
+
+    def add(self, rows: npt.NDArray[Any]) -> None:
+        """Add rows (n, columns), or skip them."""
+        while len(rows):
+            first = -self._seen % self.stride
+            fitting = rows[first :: self.stride][: len(self._rows) - self._kept]
+            self._rows[self._kept : self._kept + len(fitting)] = fitting
+            self._kept += len(fitting)
+            taken = min(len(rows), first + len(fitting) * self.stride)
+            self._seen, rows = self._seen + taken, rows[taken:]
+            if len(rows) and self._kept == len(self._rows):
+                half = len(self._rows) // 2
+                self._rows[:half] = self._rows[::2]
+                self._kept, self.stride = half, 2 * self.stride
+
+    @property
+    def rows(self) -> npt.NDArray[Any]:
+        """The rows that are kept, (n, columns)."""
+        return self._rows[: self._kept]
+
+
+class SpanColumn(NamedTuple):
+    """Minimum and maximum, NaN where a span has no value, and the sum, (n,) each."""
+
+    low: FloatArray
+    high: FloatArray
+    total: FloatArray
+
+
+class SpanTable:
+    """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
+
+    def __init__(self, columns: int, capacity: int = SPANS) -> None:
+        shape = (capacity, columns)
+        self._low, self._high, self._sum = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
+        self._begin = np.zeros(capacity)
+        self._used = self._in_last = 0
+        self.length = 1
+
+    def add(self, rows: FloatArray) -> None:
+        """Add frames (n, 1 + columns): when each was, and its values; NaN is no value."""
+        while len(rows):
+            if self._used == 0 or self._in_last == self.length:
+                if self._used == len(self._begin):
+                    self._halve()
+                    continue
+                self._begin[self._used] = rows[0, 0]
+                self._used, self._in_last = self._used + 1, 0
+            whole = 0 if self._in_last else min(len(rows) // self.length, len(self._begin) - self._used + 1)
+            count = max(whole, 1) * self.length - self._in_last
+            self._add(rows[:count], max(whole, 1))
+            rows = rows[count:]
+
+    def _add(self, rows: FloatArray, spans: int) -> None:
+        values = rows[:, 1:].reshape(spans, -1, rows.shape[1] - 1)
+        place = slice(self._used - 1, self._used - 1 + spans)
+        self._begin[self._used : place.stop] = rows[:: max(len(rows) // spans, 1), 0][1:spans]
+        self._low[place] = np.fmin(self._low[place], np.fmin.reduce(values, axis=1))
+        self._high[place] = np.fmax(self._high[place], np.fmax.reduce(values, axis=1))
+        self._sum[place] += np.nansum(values, axis=1)
+        self._used, self._in_last = place.stop, self._in_last + values.shape[1]
+
+    def _halve(self) -> None:
+        half = self._used // 2
+        self._low[:half] = np.minimum(self._low[::2], self._low[1::2])
+        self._high[:half] = np.maximum(self._high[::2], self._high[1::2])
+        self._sum[:half] = self._sum[::2] + self._sum[1::2]
+        self._begin[:half] = self._begin[::2]
+        self._low[half:], self._high[half:], self._sum[half:] = np.inf, -np.inf, 0.0
+        self._used, self._in_last, self.length = half, 2 * self.length, 2 * self.length
+
+    @property
+    def begin(self) -> FloatArray:
+        """When each span begins, (n,)."""
+        return self._begin[: self._used]
+
+    def column(self, number: int) -> SpanColumn:
+        """One column over all spans."""
+        low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
+        some = np.isfinite(low)
+        return SpanColumn(np.where(some, low, np.nan), np.where(some, high, np.nan), total)
+
+
+class TimeBins:
+    """Counts of some kinds over time, in bins of a width that doubles as the run grows."""
+
+    def __init__(self, kinds: int, capacity: int = SPANS) -> None:
+        self._counts = np.zeros((capacity, kinds), dtype=np.int64)
+        self._first_ns: int | None = None
+        self._used, self.width_ns = 0, NS_PER_S
+
+    def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
+        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first counts in the first bin."""
+        if not len(at_ns):
+            return
+        if self._first_ns is None:
+            self._first_ns = int(at_ns[0])
+        since_ns = np.maximum(at_ns - self._first_ns, 0)
+        while (last := int(since_ns.max()) // self.width_ns) >= len(self._counts):
+            half = len(self._counts) // 2
+            self._counts[:half] = self._counts[::2] + self._counts[1::2]
+            self._counts[half:] = 0
+            self._used, self.width_ns = (self._used + 1) // 2, 2 * self.width_ns
+        np.add.at(self._counts, (since_ns // self.width_ns, kinds), number)
+        self._used = max(self._used, last + 1)
+
+    def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
+        """The start of each bin, s after a host time, (n,), and the rate of each kind in it, 1/s, (n, kinds)."""
+        if self._first_ns is None:
+            return np.zeros(0), np.zeros((0, self._counts.shape[1]))
+        begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(self._used, dtype=np.float64) * (self.width_ns / NS_PER_S)
+        return begin_s, self._counts[: self._used].astype(np.float64) * (NS_PER_S / self.width_ns)
+
+
+MEGABYTE = 1e6
+WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
+KEYFRAMES = 16
+MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
+SMALL_RAD = 1e-8
+RECOUNTED = 8192  # newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
+
+
+class Keyframes:
+    """Frames of a run to be drawn in its report: some evenly over the run, and the first or worst of each kind."""
+
+    def __init__(self) -> None:
+        self._even = ThinnedRows(1, KEYFRAMES, object)
+        self._best: dict[str, tuple[int, FrameRecord]] = {}
+
+    def add(self, frames: list[FrameRecord], worths: dict[str, IntArray]) -> None:
+        """Look at frames (n), whose `worths` (n,) say how special each is."""
+        self._even.add(np.array([*frames, None], dtype=object)[:-1, None])
+        for why, worth in worths.items():
+            place = int(worth.argmax())
+            if worth[place] > self._best.get(why, (0, None))[0]:
+                self._best[why] = int(worth[place]), frames[place]
+
+    def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
+        """The frames in order, each with what is special about it, or ""."""
+        found = {id(frame): (frame, "") for frame in self._even.rows[:, 0]}
+        for why, (_, frame) in self._best.items():
+            before = found.get(id(frame), (frame, ""))[1]
+            found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
+        if last is not None:
+            found.setdefault(id(last), (last, ""))
+        return sorted(found.values(), key=lambda each: each[0].swap_ns)
+
+
+# Times of a frame, ms, and the keys that a report has them under.
+METRICS = {
+    **{"interval": "interval_ms", "late": "swap_late_ms", "draw": "draw_to_swap_ms", "age": "attitude_age_ms"},
+    **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
+}
+HEAD = ("bench_sha256", "calibration", "calibration_sha256", "certificate", "gl_renderer", "gl_version", "render_path")
+FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames", "wrong_frames")
+COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
+# The columns of the spans: METRICS, then these.
+COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
+ACCEPTED, REFUSED = range(2)
+NUMBERS, WORDS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"), ("operator", "hidden")
+
+
+@dataclass(slots=True)
+class FrameMarks:
+    """The newest frames (n,): when each was swapped, whether nothing else is wrong with it, and whether its sky was."""
+
+    swap_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    plain: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    wrong: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def add(self, swap_ns: npt.NDArray[np.int64], plain: BoolArray, wrong: BoolArray) -> None:
+        """Add frames, and forget the oldest ones."""
+        self.swap_ns = np.concatenate([self.swap_ns, swap_ns])[-RECOUNTED:]
+        self.plain = np.concatenate([self.plain, plain])[-RECOUNTED:]
+        self.wrong = np.concatenate([self.wrong, wrong])[-RECOUNTED:]
+
+
+def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
+    """Which of these moments (n,) of host time had a wrong sky."""
+    covered = np.zeros(len(swap_ns), dtype=bool)
+    if wrong_sky.any:
+        for begin_ns, end_ns in wrong_sky.spans_ns():
+            covered |= (swap_ns >= begin_ns) & (swap_ns < end_ns)
+    return covered
+
+
+@dataclass(slots=True)
+class RunFigures:
+    """The figures of a run's report."""
+
+    head: dict[str, str]
+    packets: PacketTally = field(default_factory=PacketTally)
+    events: dict[str, int] = field(default_factory=dict)
+    pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
+    # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an attitude.
+    counted: Counter[str] = field(default_factory=Counter)
+    most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
+    last: FrameRecord | None = None
+    first_swap_ns: int = 0
+    spreads: dict[str, RunningStatistics] = field(default_factory=lambda: {name: RunningStatistics() for name in METRICS})
+    samples: ThinnedRows = field(default_factory=lambda: ThinnedRows(len(METRICS)))
+    spans: SpanTable = field(default_factory=lambda: SpanTable(len(METRICS) + len(COUNTS)))
+    # run_s, t_s, q, turned about x, y, z (rad)
+    path: ThinnedRows = field(default_factory=lambda: ThinnedRows(9, SAMPLES // 8))
+    process: ThinnedRows = field(default_factory=lambda: ThinnedRows(3, SAMPLES // 16))  # host time in s, MB, CPU time in s
+    keyframes: Keyframes = field(default_factory=Keyframes)
+    packet_times: TimeBins = field(default_factory=lambda: TimeBins(2))
+    answers: AnswerTally = field(default_factory=AnswerTally)
+    faults: list[FaultRecord] = field(default_factory=list)
+    residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))  # host time in s, x, y, z in arcsec
+    first_events: list[EventRecord] = field(default_factory=list)
+    last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
+    wrong_sky: WrongSky = field(default_factory=WrongSky)
+    lost: int = 0  # packets
+    first_process: ProcessRecord | None = None
+    warm: ProcessRecord | None = None
+    last_process: ProcessRecord | None = None
+    _newest: FrameMarks = field(default_factory=FrameMarks)
+    _turned: FloatArray = field(default_factory=lambda: np.zeros(3))
+    _q: FloatArray | None = None
+    _first_t_ns: int | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """From the first swap to the last."""
+        return 0.0 if self.last is None else (self.last.swap_ns - self.first_swap_ns) / NS_PER_S
+
+    @property
+    def memory_growth_mb(self) -> float | None:
+        """Growth of the process's memory since its first minute; None for a shorter run."""
+        if self.warm is None or self.last_process is None or self.warm is self.last_process:
+            return None
+        return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
+
+    def add(self, *records: RunRecord) -> None:
+        """Add records of the ledger, in their order: many at once take a third of the time."""
+        frames = [record for record in records if type(record) is FrameRecord]
+        packets = [record for record in records if type(record) is PacketForm]
+        others = [record for record in records if type(record) not in {FrameRecord, PacketForm}]
+        in_order = self.answers.replayed or FaultRecord in set(map(type, others))
+        for record in records if in_order else others:
+            if isinstance(record, FrameRecord):
+                self.answers.frame(record)
+            elif not isinstance(record, PacketForm):
+                self._add_one(record)
+        accepted = _whole(packets, "accepted")[0] > 0
+        if plain := bool(accepted.all()) and "accepted" in self.packets.counts:
+            self.packets.count("accepted", len(packets))
+        for record in others if plain else records:
+            self.packets.add(record)
+        times_ns, known = _whole(packets, "receive_ns")
+        self.packet_times.add(times_ns[known], np.where(accepted, ACCEPTED, REFUSED)[known])
+        self._recount()
+        if frames:
+            self._add_frames(frames)
+
+    def _recount(self) -> None:
+        """Count frames as wrong that were added before it was found that they are: conditions say since when they hold."""
+        if not self.wrong_sky.any:
+            return
+        newest = self._newest
+        found = _covered(self.wrong_sky, newest.swap_ns) & ~newest.wrong
+        newest.wrong |= found
+        self.counted["wrong_frames"] += int(found.sum())
+        self.counted["right_frames"] -= int((found & newest.plain).sum())
+
+    def _add_one(self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord) -> None:
+        if isinstance(record, ProcessRecord):
+            first = self.first_process = self.first_process or record
+            if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
+                self.warm = record
+            self.last_process = record
+            self.process.add(np.array([(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]))
+        elif isinstance(record, EventRecord):
+            self._add_event(record)
+        elif isinstance(record, FaultRecord):
+            self.faults.append(record)
+            self.answers.fault(record)
+        elif isinstance(record, AnswerRecord):
+            self.answers.answer(record)
+            if record.verdict == "right" and record.residual_arcsec is not None:
+                self.residuals.add(np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)]))
+        elif record.kind == "pulse" and record.reason in PULSES:
+            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+            self.pulses[record.reason] += record.count
+        elif record.kind == "lost":
+            self.lost += record.count
+        elif record.kind == "packet":
+            place = ACCEPTED if record.reason == "accepted" else REFUSED
+            self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
+
+    def _add_event(self, record: EventRecord) -> None:
+        kind = record.kind[:MAX_REASON_CHARACTERS]
+        if kind in self.events or len(self.events) < MAX_REASONS:
+            self.events[kind] = self.events.get(kind, 0) + 1
+        record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
+        self.wrong_sky.see(kind, record.detail, record.host_ns, record.since_ns)
+        (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
+
+    def _add_frames(self, frames: list[FrameRecord]) -> None:
+        before, self.last = self.last, frames[-1]
+        if before is None:
+            self.first_swap_ns = frames[0].swap_ns
+        self.counted["frames"] += len(frames)
+        stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
+        blank = np.array([frame.q is None for frame in frames])
+        words = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
+        swap_ns, _ = _whole(frames, "swap_ns")
+        wrong = _covered(self.wrong_sky, swap_ns)
+        masks = dict(zip(FAULTS, (stale > 0, blank, *words, wrong), strict=True))
+        self._newest.add(swap_ns, ~np.any([*masks.values()][:-1], axis=0), wrong)
+        masks |= {"right_frames": ~np.any([*masks.values()], axis=0), "late": (stale > 0) & ~blank, "capped_frames": capped > 0}
+        for name, mask in masks.items():
+            self.counted[name] += int(mask.sum())
+        for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
+            self.most[name] = max(self.most[name], int(number.max()))
+        times = _times_ms(frames, swap_ns, before, missed > 0)
+        for name, values in zip(METRICS, times.T, strict=True):
+            self.spreads[name].add_all(values[~np.isnan(values)])
+        self.samples.add(times)
+        run_s = (swap_ns - self.first_swap_ns) / NS_PER_S
+        self.spans.add(np.column_stack([run_s, times, missed, stars, clipped, below, stale, blank]))
+        self.keyframes.add(frames, {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars})
+        seen = np.flatnonzero(~blank)
+        if not len(seen):
+            return
+        q, t_ns = attitudes_of(frames), _whole(frames, "t_ns")[0][seen]
+        self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
+        last_q = q[0] if self._q is None else self._q
+        turned = np.cumsum(np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0)
+        self._q, self._turned = q[-1], turned[-1]
+        self.path.add(np.column_stack([run_s[seen], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]]))
+
+
+def _times_ms(
+    frames: list[FrameRecord], swap_ns: npt.NDArray[np.int64], before: FrameRecord | None, after_missed: BoolArray
+) -> FloatArray:
+    """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames does not count."""
+    intervals_ns = np.diff(swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns).astype(np.float64)
+    intervals_ns[after_missed] = np.nan
+    if before is None:
+        intervals_ns[0] = np.nan
+    times_ns = [intervals_ns]
+    for name in ("predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns"):
+        ns, known = _whole(frames, name)
+        times_ns.append(np.where(known, ns if name in {"age_ns", "prediction_ns"} else swap_ns - ns, np.nan))
+    return np.column_stack(times_ns) / NS_PER_MS
+
+
+def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:
+    """A whole number of each record, 0 for None, and whether it is known, (n,) each."""
+    count, known = len(records), np.ones(len(records), dtype=bool)
+    try:
+        return np.fromiter(map(attrgetter(name), records), np.int64, count), known
+    except TypeError:
+        values = list(map(attrgetter(name), records))
+        known[[number for number, value in enumerate(values) if value is None]] = False
+        return np.array([value or 0 for value in values], dtype=np.int64), known
+
+
+def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The turns (n, 3) from attitudes (n, 4) to others about the camera's axes."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
+    w = aw * bw + ax * bx + ay * by + az * bz
+    x = -bw * ax + bx * aw - by * az + bz * ay
+    y = -bw * ay + bx * az + by * aw - bz * ax
+    z = -bw * az - bx * ay + by * ax + bz * aw
+    sine = np.sqrt(x * x + y * y + z * z)
+    small = sine <= SMALL_RAD
+    scale = -2.0 * np.copysign(1.0, w) * np.where(small, 1.0, np.arctan2(sine, np.abs(w)) / np.where(small, 1.0, sine))
+    return np.asarray(scale[:, None] * np.stack([x, y, z], axis=1))
+
+
+def figures_of(path: Path) -> RunFigures:
+    """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
+    figures = RunFigures(read_head(path))
+    figures.answers = AnswerTally(_begun_ns(figures.head))
+    for block in run_blocks(path, BLOCK):
+        figures.add(*block)
+    if figures.last is None:
+        raise InputError(f"{path}: {NO_FRAMES}")
+    return figures
+
+
+def _begun_ns(head: dict[str, str]) -> int:
+    text = head.get("monotonic_ns", "")
+    return int(text) if text.isdecimal() else 0
+
+
+class RunReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a run: the JSON object of `hilstar report`. Times in ms, but for `duration_s`."""
+
+    frames: int
+    duration_s: float
+    missed_frames: int
+    stale_frames: int
+    blank_frames: int
+    operator_frames: int
+    hidden_frames: int
+    capped_frames: int
+    timestamp_source: str
+    refresh_hz: float | None
+    pacing_jitter_ms: float | None
+    interval_ms: Percentiles
+    swap_late_ms: Percentiles
+    draw_to_swap_ms: Percentiles
+    attitude_age_ms: Percentiles
+    attitude_age_frames: Percentiles | None
+    prediction_ms: Percentiles
+    packet_to_swap_ms: Percentiles
+    packets: dict[str, int]
+    events: dict[str, int]
+    pulses: dict[str, int]
+    right_frames: int = 0  # on the screen, with a fresh attitude, not changed by the operator, of a sky that is right
+    wrong_frames: int = 0
+    wrong_sky: WrongSkyTotal = WrongSkyTotal()
+    lost_packets: int = 0
+    clipped: int
+    below_step: int
+    stars_drawn: int
+    memory_growth_mb: float | None
+    bench_sha256: str | None
+    calibration: str | None
+    calibration_sha256: str | None
+    certificate: str | None
+    gl_renderer: str | None
+    gl_version: str | None
+    render_path: str | None
+    answers: AnswerReport | UnsetType = UNSET
+
+
+def summarise(run: RunFigures) -> RunReport:
+    """The figures of a run, from those of its frames."""
+    config, last = config_of(run.head), run.last
+    refresh_hz = None if config is None else config.monitor.refresh_hz
+    times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
+    found: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {name: run.head.get(name) for name in HEAD}
+    found |= {name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")}
+    return RunReport(
+        **(found | times | run.most),
+        missed_frames=0 if last is None else last.missed,
+        timestamp_source="" if last is None else last.timestamp_source,
+        refresh_hz=refresh_hz,
+        pacing_jitter_ms=run.spreads["interval"].deviation,
+        attitude_age_frames=None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3),
+        packets=run.packets.counts,
+        lost_packets=run.lost,
+        wrong_sky=run.wrong_sky.total(run.first_swap_ns, run.first_swap_ns if last is None else last.swap_ns),
+        answers=run.answers.report(run.first_swap_ns) or UNSET,
+    )
+
+
+def table_rows(found: RunReport) -> list[tuple[str, str]]:
+    """The figures as rows of text: name and value."""
+    refused = sum(count for reason, count in found.packets.items() if reason != "accepted")
+
+    def three(figure: Percentiles | None, unit: str = "ms") -> str:
+        values = (None, None, None) if figure is None else (figure.p50, figure.p99, figure.max)
+        return " / ".join("-" if v is None else f"{v:.2f}" for v in values) + f" {unit} (p50 / p99 / max)"
+
+    def number(value: float | None, unit: str) -> str:
+        return "-" if value is None else f"{value:.2f} {unit}"
+
+    pulses = "none"
+    if found.pulses:
+        lost = f", the line lost {found.pulses['lost']} times" if found.pulses["lost"] else ""
+        pulses = f"{found.pulses['sent']} at their frames, {found.pulses['skipped']} skipped{lost}"
+    frames = f"{found.frames} in {found.duration_s:.1f} s, {found.missed_frames} missed"
+    return [
+        ("frames", f"{frames}, {found.stale_frames} stale, {found.blank_frames} blank"),
+        ("not the plain sky", f"{found.operator_frames} by an operator's keys, {found.hidden_frames} hidden"),
+        ("coarser paths", f"{found.capped_frames} frames, because the turn was too fast"),
+        ("time stamps", f"{found.timestamp_source}; the bench file's refresh rate is {number(found.refresh_hz, 'Hz')}"),
+        ("pacing jitter", f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval between swaps)"),
+        ("interval", three(found.interval_ms)),
+        ("swap later than predicted", three(found.swap_late_ms)),
+        ("start of drawing to swap", three(found.draw_to_swap_ms)),
+        ("age of the attitude at light", f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}"),
+        ("predicted past the last packet", three(found.prediction_ms)),
+        ("packet to swap", three(found.packet_to_swap_ms)),
+        *[(one.kind, f"{one.seconds:.1f} s: {one.text}") for one in found.wrong_sky.conditions],
+        ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused, {found.lost_packets} lost"),
+        ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
+        ("pulses", pulses),
+        ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
+        *answer_rows(found.answers or None),
+        ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
+        ("bench file", f"SHA-256 {found.bench_sha256}"),
+        ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
+        *([("certificate", found.certificate)] if found.certificate else []),
+        ("renderer", f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}"),
+    ]

@@ -1,0 +1,118 @@
+"""Files that a user names: whatever is no regular file of a sensible size is refused in one line, and never awaited."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from hilstar.basics.errors import InputError, one_line, shortened
+from hilstar.basics.reading import MAGIC, exists, open_lines, open_regular, read_bytes, read_text
+
+ADVICE = "give a file of text"
+LIMIT_BYTES = 1000
+
+
+def refusal(path: Path, limit_bytes: int = LIMIT_BYTES) -> str:
+    with pytest.raises(InputError) as error:
+        read_text(path, ADVICE, limit_bytes)
+    line = str(error.value)
+    assert line.startswith(one_line(f"{path}:"))
+    assert line.endswith(ADVICE)
+    return line.removeprefix(f"{path}: ")
+
+
+def test_a_text_is_read_without_its_byte_order_mark(tmp_path):
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfg\xc3\xbcnstig")
+    assert read_text(path, ADVICE, LIMIT_BYTES) == "günstig"
+    assert read_bytes(path, ADVICE, 11) == path.read_bytes()
+
+
+def test_what_is_no_regular_file_is_named_and_never_awaited(tmp_path):
+    pipe, local = tmp_path / "pipe", tmp_path / "socket"
+    os.mkfifo(pipe)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(local))
+        assert "it is a socket" in refusal(local)
+    assert "it is a pipe" in refusal(pipe)
+    assert "it is a directory" in refusal(tmp_path)
+    for device in ("zero", "full", "null", "urandom"):
+        assert "it is a device" in refusal(Path("/dev") / device)
+
+
+def test_a_name_that_is_no_file_s_is_refused(tmp_path):
+    assert "(No such file or directory)" in refusal(tmp_path / "none")
+    assert "(File name too long)" in refusal(tmp_path / ("n" * 300))
+    assert "(no file has such a name)" in refusal(tmp_path / "a\0b")
+    assert not any(map(exists, (tmp_path / "none", tmp_path / ("n" * 300), tmp_path / "a\0b")))
+    assert exists(tmp_path)
+
+
+def test_a_link_to_a_device_is_a_device(tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to("/dev/zero")
+    assert "it is a device" in refusal(link)
+
+
+def test_a_file_past_the_limit_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(10**12)  # a hole: nothing is on the disk
+    assert "has 1000 GB or more, and at most 1 kB are read" in refusal(path)
+    with pytest.raises(InputError, match="at most 50 MB"):
+        open_regular(path, ADVICE, 50_000_000)
+
+
+def test_a_file_that_does_not_tell_its_size_is_bounded_too():
+    assert "at most 4 bytes are read" in refusal(Path("/proc/self/maps"), 4)
+
+
+def test_the_first_byte_that_is_not_utf_8_is_named(tmp_path):
+    path = tmp_path / "latin"
+    for mark in (b"", b"\xef\xbb\xbf"):
+        path.write_bytes(mark + b"abc\xe9 xx")
+        assert f"byte {len(mark) + 3} is 0xe9" in refusal(path)
+
+
+def test_lines_come_one_by_one_and_as_the_file_has_them(tmp_path):
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n\nd")
+    with open_lines(path, ADVICE, LIMIT_BYTES) as lines:
+        assert list(lines) == ["a\r\n", "b\r", "c\n", "\n", "d"]
+
+
+def test_a_line_without_end_and_a_late_byte_that_is_no_text_are_named(tmp_path):
+    path, limit_bytes = tmp_path / "text", 10**8
+    path.write_bytes(b"a\n" + b"b" * 5_000_000)
+    with (
+        pytest.raises(InputError, match="text:2: the line has 1000000 characters or more"),
+        open_lines(path, ADVICE, limit_bytes) as lines,
+    ):
+        list(lines)
+    for text, words in ((b"abc\n" * 10**6 + b"\xe9 ", "byte 4000000 is 0xe9"), (b"\xc3", "ends within a character, at byte 1")):
+        path.write_bytes(text)
+        with pytest.raises(InputError, match=words), open_lines(path, ADVICE, limit_bytes) as lines:
+            list(lines)
+
+
+def test_a_file_of_another_kind_is_called_by_its_kind(tmp_path):
+    path = tmp_path / "other"
+    for magic, kind in MAGIC.items():
+        path.write_bytes(magic + b"\x01rest")
+        assert f"it is {kind})" in refusal(path)
+
+
+def test_a_long_piece_keeps_its_beginning_and_its_end():
+    assert shortened("x" * 120) == "x" * 120
+    cut = shortened("/first" + "x" * 100_000 + "last.toml")
+    assert len(cut) == 120
+    assert cut.startswith("/first") and cut.endswith("last.toml")
+
+
+def test_a_line_is_one_line_and_bounded_whatever_it_repeats():
+    line = one_line("bench\udcff.toml:\n\x1b[31m " + "x" * 10**6 + " word" * 10**6)
+    assert line.startswith("bench\\xff.toml: \\x1b[31m xxx")
+    assert len(line) <= 1000

@@ -1,0 +1,44 @@
+"""Statistics of a run of values without keeping them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.running_statistics import STEP, Percentiles, RunningStatistics
+
+# A value is known to half a bin; a percentile of n values besides to the gap between its neighbours, here far less.
+RELATIVE = STEP
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.geomspace(0.01, 50, 5000), np.linspace(-3, 5, 5001), np.full(10, 16.7), np.array([0.0, 1e-9]), np.array([-2.5])],
+    ids=["log", "both signs", "one value", "zero", "negative"],
+)
+def test_percentiles_are_those_of_the_values(values, rng):
+    statistics = RunningStatistics()
+    for value in rng.permutation(values):
+        statistics.add(float(value))
+    found = statistics.percentiles()
+    for name, percent in (("p50", 50), ("p99", 99)):
+        exact = np.percentile(values, percent, method="inverted_cdf")
+        assert getattr(found, name) == pytest.approx(exact, rel=RELATIVE, abs=2e-6)
+    assert found.max == values.max()
+    assert statistics.mean == pytest.approx(values.mean(), abs=1e-12)
+    if len(values) > 1:
+        assert statistics.deviation == pytest.approx(values.std(), rel=1e-9, abs=1e-12)
+
+
+def test_no_values_have_no_statistics():
+    statistics = RunningStatistics()
+    assert statistics.percentiles() == Percentiles(None, None, None)
+    assert statistics.mean is None and statistics.deviation is None
+
+
+def test_what_lies_beyond_the_bins_is_counted_in_the_last():
+    statistics = RunningStatistics()
+    for value in (1e15, -1e15, 1.0):
+        statistics.add(value)
+    assert statistics.percentiles().max == 1e15
+    assert statistics.percentile(50) == pytest.approx(1.0, rel=RELATIVE)

@@ -1,0 +1,210 @@
+"""Text tables: every dialect reads the same, units are taken as stated, and what is not plain is refused or said."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
+from hilstar.basics.text_tables import open_table, read_rows
+from hilstar.basics.units import factor, plain_unit
+
+LIMIT = 1_000_000
+COLUMNS = ("t_s", "x_px")
+
+
+def rows(path, columns=COLUMNS, more=(), **options):
+    return list(read_rows(path, columns, "write a table", LIMIT, more, **options))
+
+
+def numbers(path, columns=COLUMNS):
+    return [[float(cell) for cell in cells] for _, cells in rows(path, columns)]
+
+
+@pytest.fixture
+def table(tmp_path):
+    def write(text, encoding="utf-8"):
+        path = tmp_path / "table.txt"
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write
+
+
+@pytest.fixture(autouse=True)
+def warnings_anew():
+    warn_once.cache_clear()
+
+
+DELIMITERS = (",", ";", "\t", "|", "  ")
+HEADERS = ("plain", "comment", "units line", "vizier", "brackets")
+ENDS = ("\n", "\r\n")
+ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "cp1252")
+
+
+def in_dialect(values, delimiter, header, end, decimal):
+    """A table of t in ms and x in pixels, with a text beside them that is not ASCII."""
+    number = [[f"{value:.4f}".replace(".", decimal) for value in row] for row in values]
+    lines = [delimiter.join((*row, "étoile")) for row in number]
+    plain = delimiter.join(("t_ms", "x_px", "note"))
+    named = delimiter.join(("t", "x", "note"))
+    heads = {
+        "plain": [plain],
+        "comment": ["# made by a program", f"# {plain}"],
+        "units line": [named, delimiter.join(("ms", "pixel", "-"))],
+        "vizier": ["#Column t", "", named, delimiter.join(("ms", "pix", "---")), delimiter.join(("-----", "---", "----"))],
+        "brackets": [delimiter.join(("t[ms]", "x(px)", "note"))],
+    }
+    return end.join([*heads[header], *lines[:2], "", *lines[2:], ""])
+
+
+@pytest.mark.parametrize("delimiter", DELIMITERS)
+@pytest.mark.parametrize("header", HEADERS)
+def test_a_table_reads_the_same_in_every_dialect(table, delimiter, header):
+    values = np.random.default_rng(5).uniform(-1000, 1000, (7, 2)).round(4)
+    wanted = values * (1e-3, 1.0)
+    for end, encoding, decimal in itertools.product(ENDS, ENCODINGS, ".,"):
+        if decimal == delimiter:
+            continue
+        path = table(in_dialect(values, delimiter, header, end, decimal), encoding)
+        assert np.allclose(numbers(path), wanted, rtol=1e-15, atol=0), (end, encoding, decimal)
+
+
+def test_what_was_taken_is_said_once(table, caplog):
+    path = table("t_ms;x_px;note\n1,5;2,5;été\n2,5;3,5;x\n", "cp1252")
+    assert numbers(path) == [[0.0015, 2.5], [0.0025, 3.5]]
+    rows(path)
+    lines = [record.getMessage().removeprefix(f"{path}: ") for record in caplog.records]
+    assert lines == [
+        "line 2 is not UTF-8, and is read as Windows-1252; save the file as UTF-8",
+        "numbers such as 1,5 are read with a decimal comma",
+        "column t_ms is in ms: its numbers are multiplied by 0.001, to be in s",
+    ]
+
+
+def test_excel_and_programs_write_tables_of_their_own(table):
+    assert numbers(table("sep=;\nt_s;x_px\n1;2\n")) == [[1, 2]]
+    assert numbers(table(";t_s;x_px\n0;1;2\n1;3;4\n")) == [[1, 2], [3, 4]]  # pandas' index
+    assert numbers(table("t_s,x_px,\n1,2\n3,4\n")) == [[1, 2], [3, 4]]
+    assert numbers(table("t_s,x_px\n1,2,\n3,4, \n")) == [[1, 2], [3, 4]]
+    assert numbers(table("x_px,t_s\n−1,\u00a02\n")) == [[2, -1]]
+    assert numbers(table('"t_s","x_px"\n"1","2"\n')) == [[1, 2]]
+    assert numbers(table("# t x_px\n% t_s, x_px\n1,2\n")) == [[1, 2]]
+    assert numbers(table("T_S,Time,x_px\n1,9,2\n")) == [[1, 2]]
+
+
+def test_lines_are_those_of_the_file(table):
+    path = table("# a\n\nt_s,x_px\n1,2\n\n# between\n3,4\n")
+    assert [line for line, _ in rows(path)] == [4, 7]
+
+
+REFUSED = {
+    "t_s,x_px,t_s\n1,2,3\n": ":1: column t_s is there twice",
+    "t_ms,t_us,x_px\n1,2,3\n": ":1: column t_s is there twice (t_ms, t_us)",
+    "t,x_px\n1,2\n": ":1: column t has no unit; write t_s, or its unit as t [s]",
+    "t [deg],x_px\n1,2\n": ":1: column t [deg] is in 'deg', and s is wanted",
+    "t_s [ms],x_px\n1,2\n": ":1: column t_s [ms] states two units",
+    "u,x_px\n1,2\n": ":1: column t_s is missing (its columns are u, x_px)",
+    "t_s,x_px\n1,2\n3\n": ":3: 1 cells and 2 columns; write a table",
+    "t_s,x_px\n1,2\n3,4,5\n": ":3: 3 cells and 2 columns (a decimal comma, or commas between thousands? write 1234.5)",
+    "t_s,x_px\n1,2\n3,4,5,6\n": ":3: 4 cells and 2 columns (a decimal comma? write points)",
+    "t_s;x_px\n1,234;2,345\n": "'1,234' is a decimal comma, or a comma between thousands? write 1234.5",
+    "t_s;x_px\n1,23;2.345\n": "'1,23' is a decimal comma, or a comma between thousands? write 1234.5",
+    't_s,x_px\n1,"2\n': "not CSV",
+    "1,2\n3,4\n": ":1: column t_s is missing",
+    "t_s,x_px\n1,\x00\xff\n": "it is no text: line 2 has a byte 0x00",
+    "," * 2000 + "\n": "its first line names more than 1000 columns",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_is_not_plain_is_refused_with_its_line(table, text):
+    path = table(text, "latin-1")
+    with pytest.raises(InputError) as refusal:
+        rows(path)
+    assert REFUSED[text] in str(refusal.value)
+    assert str(refusal.value).startswith(str(path))
+
+
+CUT_ENDS = {
+    # the last line as it was cut off: whether it is read
+    "1.5,0.0362700": True,
+    "1.5,0.036": False,
+    "1.5,0.": False,
+    "1.5": False,
+    "1.": False,
+}
+
+
+@pytest.mark.parametrize("last", CUT_ENDS)
+def test_a_last_line_without_an_end_is_left_out_where_it_may_be_cut(table, last, caplog):
+    path = table(f"t_s,x_px\n0.5,0.1234567\n1.0,0.2345678\n{last}")
+    read = rows(path, keep_cut=False)
+    assert len(read) == 2 + CUT_ENDS[last]
+    assert ("the last line has no line end" in caplog.text) is not CUT_ENDS[last]
+
+
+def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table):
+    for others, last, whole in (
+        (("57", "58"), "59", True),
+        (("57", "58"), "5", False),
+        (("0.12345678901234567", "0.1234567890123456"), "0.123456789012", True),
+        (("1.5e-05", "1.5e-05"), "1.5e-0", False),
+        (("1.5e-05", "1.5e-05"), "1.512345678901", False),
+        (("yes", "no"), "yes", True),
+        (("yes", "no"), "ye", False),
+    ):
+        text = "".join(f"1,{other}\n" for other in others)
+        assert len(rows(table(f"t_s,x_px\n{text}2,{last}"), keep_cut=False)) == 2 + whole, last
+
+
+def test_a_document_cut_off_is_read_and_said(table, caplog):
+    path = table("t_s,x_px\n1,0.25\n2,0.35\n3,0.4")
+    assert len(rows(path)) == 3
+    assert f"{path}:4: the last line has no line end, and may be cut off: is the file whole?" in caplog.text
+
+
+def test_rows_that_do_not_hold_are_told_by_any_name(table):
+    for header, flags in (("valid", "10"), ("is_valid", "TF"), ("Valid", "yn"), ("lost", "01"), ("invalid", ("false", "true"))):
+        path = table(f"t_s,{header}\n1,{flags[0]}\n2,{flags[1]}\n")
+        cells = [cells[1].lower() for _, cells in rows(path, ("t_s",), ("valid",))]
+        assert [cell in {"1", "t", "y"} for cell in cells] == [True, False]
+
+
+def test_columns_know_their_names_and_units(table):
+    with open_table(table('ra (h),RA(ICRS),"flux [DN]",pmRA\nh,deg,DN,mas/yr\n1,2,3,4\n'), "", LIMIT) as opened:
+        assert [(column.name, column.unit) for column in opened.columns] == [
+            ("ra", "h"),
+            ("RA(ICRS)", "deg"),
+            ("flux", "DN"),
+            ("pmRA", "mas/yr"),
+        ]
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted", "size"),
+    [
+        ("ms", "s", 1e-3),
+        ("µs", "s", 1e-6),
+        ("Å", "nm", 0.1),
+        ("Angstroms", "nm", 0.1),
+        ("um", "nm", 1e3),
+        ("°/s", "rad/s", np.pi / 180),
+        ("deg per s", "rad/s", np.pi / 180),
+        ("hours", "deg", 15),
+        ('"/yr', "mas/yr", 1e3),
+        ("%", "1", 0.01),
+        ("ns", "ns", 1),
+    ],
+)
+def test_units_as_people_spell_them(unit, wanted, size):
+    assert float(factor(unit, wanted)) == pytest.approx(size, rel=1e-15)
+
+
+def test_units_of_another_kind_have_no_factor():
+    assert factor("deg", "s") is None
+    assert factor("furlong", "nm") is None
+    assert plain_unit("e⁻/s") == "e-/s"

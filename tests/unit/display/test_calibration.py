@@ -1,0 +1,177 @@
+"""Calibration files: what they say, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.display.calibration import load_calibration
+from tools import make_lcd_example
+
+HEAD = """[calibration]
+kind = "photometric"
+who = "tester"
+when = 2026-03-01
+instrument = "meter"
+unit = "cd/m2"
+bits = 2
+response = "table.csv"
+"""
+TABLE = "code,w\n0,0.5\n1,1.5\n2,4.5\n3,10.5\n"
+RGB = "code,r,g,b\n0,0.4,0.4,0.4\n1,1.4,2.4,0.5\n2,2.4,12.4,0.9\n3,4.4,30.4,6.4\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def make(head=HEAD, table=TABLE, **files):
+        (tmp_path / "monitor.toml").write_text(head)
+        (tmp_path / "table.csv").write_text(table)
+        for name, text in files.items():
+            (tmp_path / f"{name}.csv").write_text(text)
+        return tmp_path / "monitor.toml"
+
+    return make
+
+
+@pytest.mark.parametrize("name", ["srgb", "gamma2.2", "lcd-example"])
+def test_built_ins_load_with_and_without_bit_stealing(name):
+    plain, stolen = load_calibration(name, 8), load_calibration(name, 8, bit_stealing=True)
+    assert plain.name == name
+    assert len(plain.sha256) == 64
+    assert len(plain.response.light) == 256
+    assert len(stolen.response.light) == 1786
+    # The greys of both are the same levels, but for the rounding of the sums.
+    grey = np.all(stolen.response.rgb == stolen.response.rgb[:, :1], axis=1)
+    assert stolen.response.light[grey] == pytest.approx(plain.response.light, abs=1e-12)
+
+
+def test_the_example_is_an_invention_with_1000_to_1_and_dark_corners():
+    example = load_calibration("lcd-example", 8)
+    assert "not a measurement" in example.instrument
+    assert example.response.black == pytest.approx(1e-3, rel=1e-5)  # the CSV has six figures
+    assert example.noise == 0.005
+    light = example.uniformity_map((192, 108))
+    assert light.shape == (108, 192)
+    assert light.max() == 1
+    assert 0.85 <= light.min() < 0.86
+    assert make_lcd_example.uniformity().max() <= 1
+
+
+def test_the_example_is_what_its_script_writes(monkeypatch, tmp_path):
+    shipped = make_lcd_example.DATA
+    monkeypatch.setattr(make_lcd_example, "DATA", tmp_path)
+    make_lcd_example.main()
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (shipped / path.name).read_bytes()
+
+
+def test_light_is_above_black_and_relative_to_white(write):
+    calibration = load_calibration(write(), 2)
+    assert calibration.response.light == pytest.approx([0, 0.1, 0.4, 1])
+    assert calibration.response.threshold == pytest.approx([0.05, 0.25, 0.7])
+    assert calibration.response.black == pytest.approx(0.05)
+    assert (calibration.who, calibration.when, calibration.unit) == ("tester", "2026-03-01", "cd/m2")
+    assert calibration.weights is None
+    assert calibration.uniformity_map((8, 8)) is None
+
+
+def test_primaries_add_to_grey_by_their_white_light_or_by_given_weights(write):
+    measured = load_calibration(write(table=RGB), 2)
+    assert measured.weights == pytest.approx((0.1, 0.75, 0.15))
+    assert measured.response.light == pytest.approx([0, 3.1 / 40, 14.5 / 40, 1])
+    assert measured.response.black == pytest.approx(0.01)
+    seen = load_calibration(write(HEAD + "[weights]\nr = 1\ng = 1\nb = 2\n", RGB), 2)
+    assert seen.response.light[1] == pytest.approx(0.25 * 1 / 4 + 0.25 * 2 / 30 + 0.5 * 0.1 / 6)
+
+
+def test_codes_between_the_rows_follow_the_light_s_power(write):
+    rows = "".join(f"{code},{0.25 + 250 * (code / 255) ** 2.2!r}\n" for code in (0, 4, 16, 40, 90, 160, 255))
+    calibration = load_calibration(write(HEAD.replace("bits = 2", "bits = 8"), "code,w\n" + rows), 8)
+    # A power law is a straight line in log light over log code, which PCHIP keeps; so is what lies below the first row.
+    assert calibration.response.light == pytest.approx((np.arange(256) / 255) ** 2.2, rel=1e-9)
+
+
+def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0.8\n0.6,0.4\n")
+    light = load_calibration(path, 2).uniformity_map((4, 4))
+    assert light.dtype == np.float32
+    plane = np.add.outer([0, -0.2, -0.4, -0.6], [0, -0.1, -0.2, -0.3]) + 1.15  # the grid is a plane: -0.2 and -0.4 a field
+    assert light == pytest.approx(plane / plane.max(), rel=1e-6)
+
+
+def test_the_hash_covers_every_file(write, tmp_path):
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0.8\n")
+    hashes = {load_calibration(path, 2).sha256}
+    for name in ("monitor.toml", "table.csv", "grid.csv"):
+        (tmp_path / name).write_text("# more\n" + (tmp_path / name).read_text())
+        hashes.add(load_calibration(path, 2).sha256)
+    assert len(hashes) == 4
+
+
+def refusal(path, bits=2, **more):
+    with pytest.raises(InputError) as caught:
+        load_calibration(path, bits, **more)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        ("", "the table [calibration] is missing"),
+        ("calibration = 3\n", "calibration = 3; a table is wanted"),
+        ("[calibration\n", "not TOML"),
+        (HEAD.replace("who", "whom"), "unknown key whom"),
+        (HEAD.replace('who = "tester"\n', ""), "the key who is missing"),
+        (HEAD.replace("photometric", "geometric"), '"photometric" is wanted'),
+        (HEAD.replace("bits = 2", "bits = 2.5"), "[calibration] bits = 2.5; a whole number is wanted"),
+        (HEAD.replace("bits = 2", "bits = 99"), "bits = 99"),
+        (HEAD.replace("bits = 2", "bits = 10"), "the monitor has 2"),
+        (HEAD.replace("table.csv", "none.csv"), "no such file"),
+        (HEAD.replace("table.csv", "\\u0000"), "no such file"),
+        (HEAD + "[weights]\nr = 1\ng = -1\nb = 1\n", "[weights] g = -1"),
+        (HEAD + "[weights]\nr = 1\ng = nan\nb = 1\n", "[weights] g"),
+        (HEAD + "[weights]\nr = 0\ng = 0\nb = 0\n", "all 0"),
+        (HEAD + "[noise]\nrelative = 7\n", "[noise] relative = 7"),
+        (HEAD + '[uniformity]\nfile = "gone.csv"\n', "[uniformity] file"),
+        (HEAD + "[extra]\n", "unknown key extra"),
+        (HEAD + "[noise]\nabsolute = 1\n", "[noise] unknown key absolute; known are relative"),
+        (HEAD + "[noise]\nrelative = 2\n", "[noise] relative = 2; a number <= 1.0 is wanted"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line(write, head, words):
+    assert words in refusal(write(head))
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("", "write code,w or code,r,g,b"),
+        ("code,w,r\n0,1,1\n", "write code,w or code,r,g,b"),
+        ("code,w\n", "no row of numbers"),
+        ("code,w\n0,0.5\n1,1.5\n2,1.5\n3,10\n", "code 1 to code 2"),
+        ("code,w\n0,0.5\n1,1.5\n2,1.4\n3,10\n", "code 1 to code 2"),
+        ("code,w\n0,0.5\n1,1\n2,two\n3,10\n", ".csv:4: w = 'two'"),
+        ("code,w\n0,0.5\n1,1\n2,nan\n3,10\n", ".csv:4: w = 'nan'"),
+        ("code,w\n0,0.5\n1,1\n2,2,2\n3,10\n", ".csv:4: 3 cells"),
+        ("code,w\n0,-0.5\n3,10\n", ".csv:2: "),
+        ("code,w\n1,1\n2,2\n3,10\n", "0 (black) to 3"),
+        ("code,w\n0,1\n2,2\n1,10\n3,11\n", "sort the rows"),
+        ("code,w\n0,1\n3,11\n", "two codes"),
+        ("code,r,g,b\n0,1,2,1\n1,2,3,2\n2,3,4,3\n3,9,9,9\n", "one black screen"),
+    ],
+)
+def test_a_table_that_is_no_response_is_refused(write, table, words):
+    assert words in refusal(write(table=table))
+
+
+def test_what_is_not_there_or_not_text_is_refused(tmp_path, write):
+    assert "no such built-in" in refusal("adobe")
+    assert "cannot be read" in refusal(tmp_path / "none.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    assert "UTF-8" in refusal(tmp_path / "bytes.toml")
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0\n")
+    assert "no light" in refusal(path)
+    assert "add [weights]" in refusal(write(), bit_stealing=True)
+    assert "the monitor has 10" in refusal("lcd-example", bits=10)

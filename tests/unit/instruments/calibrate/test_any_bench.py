@@ -1,0 +1,414 @@
+"""First light on benches that are not ours: large screens, turned screens, wide pixels, wide stars, faint stars."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_rotation_vector, multiply, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.calibrate.first_light import focus as focuses
+from hilstar.instruments.calibrate.first_light import session as sessions
+from hilstar.instruments.calibrate.first_light.context import DarkSubtracted, FittedFigure, StepContext, StepOutcome
+from hilstar.instruments.calibrate.first_light.focus import seen_sharpness, sharpness
+from hilstar.instruments.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
+from hilstar.instruments.calibrate.first_light.image_sources import ImageSource
+from hilstar.instruments.calibrate.first_light.photometry import rounds_alike
+from hilstar.instruments.calibrate.first_light.seen_stars import Beyond, StarSpot
+from hilstar.instruments.calibrate.first_light.session import FirstLightSession, Progress
+from hilstar.instruments.calibrate.first_light.stars import P95_OF_TWO, frames_for, noise_words, place_reasons
+from hilstar.instruments.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
+from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
+from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.instruments.calibrate.scale import StarReading, scale_of
+from hilstar.instruments.certify.readings import dot_settings
+from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.optics.camera import Lens
+from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.tracker.centroids import find_stars, noisiest_background
+from hilstar.tracker.settings import DetectorSettings
+from tests.support.benches import bench_text
+from tests.support.waiting import PATIENCE_S
+
+# A 27-inch monitor before a 500 mm collimator, and a tracker of 50 mm: it sees 6.4 % of the screen.
+LARGE_SCREEN = {
+    "tracker": {
+        "aperture_mm": 30,
+        "focal_length_mm": 50,
+        "pixel_pitch_um": 5.5,
+        "resolution_px": [2048, 2048],
+        "psf_sigma_px": [0.5, 0.5],
+    },
+    "monitor": {"resolution_px": [2560, 1440], "pixel_pitch_um": 233.1},
+    "collimator": {"focal_length_mm": 500},
+}
+NOISE_PX = 0.02
+# A place's error is that of a fit of 11 numbers to 150 dots: 0.02 px / sqrt(150 * 6 / 11) is 0.002 px, 0.05 arcsec.
+PLACES_SIGMAS = 4.0
+
+
+def large_screen(folder):
+    (folder / "bench.toml").write_text(bench_text(LARGE_SCREEN))
+    return read_bench_file(folder / "bench.toml")
+
+
+def true_geometry(file, turn_deg):
+    """The bench really: 1.5 % longer, tilted by 3 degrees, with a lens, and turned."""
+    nominal = nominal_of(file)
+    q = multiply(from_rotation_vector(np.radians([0.2, -0.15, 0.0])), nominal.q_cam_to_mon)
+    q = multiply(from_rotation_vector(np.radians([0.0, 0.0, turn_deg])), q)
+    lens = Lens((0.05, 0.0, 0.0), (0.0, 0.0), (math.radians(3.0), math.radians(-3.0)))
+    monitor = replace(
+        nominal.monitor, focal_length_px=1.015 * nominal.monitor.focal_length_px, cam_to_image=to_matrix(q), lens=lens
+    )
+    return SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=0.5)
+
+
+def observed(plan, real, rng, first=0):
+    """Centroids that the tracker has of a plan's dots, with their noise."""
+    u, v = real.tracker.project(real.monitor.rays(plan.x_px, plan.y_px) @ real.tracker.cam_to_image.T)
+    width, height = real.tracker.resolution_px
+    inside = (u > 3) & (u < width - 4) & (v > 3) & (v < height - 4)
+    dot, frame = np.nonzero(plan.lit & inside[:, None])
+    x_px, y_px = (part[dot] + rng.normal(0, NOISE_PX, len(dot)) for part in (u, v))
+    return Observed(frame + first, np.zeros_like(frame), x_px, y_px, np.ones(len(frame)))
+
+
+@pytest.mark.parametrize("turn_deg", [37.0, -44.0])
+def test_dots_stand_where_the_tracker_sees_the_screen_and_the_fit_is_right(tmp_path, turn_deg):
+    """Dots over the whole screen were 11 where 12 are needed, and a turn of over 15 degrees was refused."""
+    file, rng = large_screen(tmp_path), np.random.default_rng(0)
+    real = true_geometry(file, turn_deg)
+    first = plan_seen_dots(replace(real, monitor=replace(real.monitor, lens=None)), 8, 18, rng)
+    seen = observed(first, real, rng)
+    rough = rough_geometry(file, first, seen)
+    assert rough.shows(first.x_px, first.y_px).mean() > 0.9
+    second = plan_seen_dots(rough, 16, lit_for(rough), rng)
+    assert real.shows(second.x_px, second.y_px).mean() > 0.95
+    found = calibrate_seen(file, joined(first, second), seen.joined(observed(second, real, rng, 8)), tracker_is_ideal=True)
+    assert found.recognised > 0.95 * len(found.plan)
+    x_px, y_px = second.x_px, second.y_px
+    mine, its = (camera.rays(x_px, y_px) for camera in (found.fit.geometry.monitor, real.monitor))
+    mine, its = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (mine, its))
+    off_arcsec = np.linalg.norm(np.cross(mine, its), axis=1) * ARCSEC_PER_RAD
+    noise_arcsec = NOISE_PX * ARCSEC_PER_RAD / real.tracker.focal_length_px
+    assert np.sqrt((off_arcsec**2).mean()) < PLACES_SIGMAS * noise_arcsec * math.sqrt(2 * 13 / (2 * len(found.data)))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 3.0])
+def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_screen(share):
+    screen = monitor_camera((1920, 1080), 57.65, 350, np.array([1.0, 0.0, 0.0, 0.0]))
+    side_px = 1024
+    focal_px = screen.focal_length_px * side_px / math.sqrt(share * 1920 * 1080)
+    tracker = replace(screen, resolution_px=(side_px, side_px), focal_length_px=focal_px, principal_point_px=(511.5, 511.5))
+    seen = SeenScreen(screen, tracker, is_sure=True, psf_sigma_px=0.5)
+    plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
+    assert len(plan) >= 21
+    assert seen.shows(plan.x_px, plan.y_px).all()
+    # The part that the dots stand on is nearly all that is seen.
+    low, high = seen.box()
+    assert (np.ptp(np.stack([plan.x_px, plan.y_px]), axis=1) > 0.95 * (high - low)).all()
+
+
+def test_too_few_dots_are_laid_to_who_asked_for_them(tmp_path):
+    with pytest.raises(InputError, match=r"--dots 1: 20 frames then hold 2 dots, and 12 are needed; write more --dots"):
+        plan_seen_dots(seen_screen_of(large_screen(tmp_path)), 20, 1, np.random.default_rng(0))
+
+
+def test_a_bench_file_that_may_be_wrong_gets_dots_beyond_the_field(tmp_path):
+    file = large_screen(tmp_path)
+    surely = replace(seen_screen_of(file), is_sure=True)
+    low, high = surely.box()
+    wide_low, wide_high = seen_screen_of(file).box()
+    assert (wide_low < low).all()
+    assert (wide_high > high).all()
+
+
+def dots_image(sigma_px, side_px, turn_deg, rng):
+    """25 square dots of light under a Gaussian PSF, by sixty points a dot's side, in noise."""
+    image = rng.normal(0, 3.0, (500, 500))
+    along = ((np.arange(60) + 0.5) / 60 - 0.5) * side_px
+    x, y = (part.ravel() for part in np.meshgrid(along, along))
+    turn = math.radians(turn_deg)
+    x, y = math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y
+    edges = np.arange(62) - 30.5
+    for column in np.linspace(50, 450, 5).astype(int):
+        for row in np.linspace(50, 450, 5).astype(int):
+            off_x, off_y = rng.uniform(-0.5, 0.5, 2)
+            across, down = (
+                np.diff(ndtr((edges - off - part[:, None]) / sigma_px), axis=1) for off, part in ((off_x, x), (off_y, y))
+            )
+            image[row - 30 : row + 31, column - 30 : column + 31] += 30_000 * down.T @ across / len(x)
+    return image
+
+
+@pytest.mark.parametrize(("sigma_px", "side_px", "turn_deg"), [(0.55, 12.6, 0.0), (0.55, 12.6, 30.0), (3.0, 1.0, 0.0)])
+def test_psf_and_pixel_are_fitted_together(sigma_px, side_px, turn_deg):
+    """A monitor pixel of 4.2 tracker px made of a PSF of 0.55 px "0.150, error 0.0": the end of the model."""
+    image = dots_image(sigma_px, side_px, turn_deg, np.random.default_rng(3))
+    found = sharpness(image, 1.005 * side_px, turn_deg)
+    assert abs(found.psf_sigma_px - sigma_px) < 3 * found.psf_sigma_error_px < 0.1 * sigma_px
+    assert abs(found.dot_side_px - side_px) < 3 * found.dot_side_error_px + 0.01 * side_px
+
+
+@pytest.mark.parametrize("turn_deg", [30.0, -20.0])
+def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
+    """A bench file that states the turn leaves orientation none to find, and a certificate has it from the geometry file."""
+    turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
+    monitor = monitor_camera((640, 480), 57.65, 30, turned)
+    seen = SeenScreen(
+        monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True, psf_sigma_px=0.6
+    )
+    assert seen.turn_deg == pytest.approx(-turn_deg, abs=0.01)
+    side_px = DOT_PX * seen.tracker_px_a_monitor_px
+    image = dots_image(0.6, side_px, seen.turn_deg, np.random.default_rng(4))
+    found = seen_sharpness(image, seen, DetectorSettings(gain_e_per_dn=25.0))
+    assert abs(found.psf_sigma_px - 0.6) < 4 * found.psf_sigma_error_px < 0.1
+    assert abs(sharpness(image, side_px).psf_sigma_px - 0.6) > 0.1
+
+
+def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
+    """Thirds of a pixel of 4.2 tracker px made its edges as soft as those of a PSF of 0.68 instead of 0.55."""
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    geometry = BenchGeometry(monitor_camera((64, 64), 233.1, 500, turn), monitor_camera((256, 256), 5.5, 50, turn))
+    light = np.zeros((64, 64))
+    for row in range(10, 60, 12):
+        for column in range(10, 60, 12):
+            light[row - 1 : row + 2, column - 1 : column + 2] = 1e5
+    with TwinOptics(geometry, GaussianPsf((0.55, 0.55))) as optics:
+        image = optics.image_e_per_s(light) + np.random.default_rng(0).normal(0, 3.0, (256, 256))
+    side_px = DOT_PX * geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    found = sharpness(image, side_px)
+    assert abs(found.psf_sigma_px - 0.55) < 4 * found.psf_sigma_error_px < 0.03
+
+
+def test_no_step_is_done_with_a_figure_at_an_end_of_its_model():
+    outcome = StepOutcome("done", "PSF sigma 0.1 px", fitted=(FittedFigure("PSF sigma", 0.1, 0.1, 12.0),))
+    checked = outcome.checked()
+    assert checked.verdict == "failed"
+    assert "PSF sigma 0.1 is at an end of its model (0.1 to 12)" in checked.line
+    inside = StepOutcome("done", "", fitted=(FittedFigure("PSF sigma", 0.11, 0.1, 12.0),))
+    assert inside.checked() is inside
+
+
+class Dark(ImageSource):
+    """A source that shows nothing."""
+
+    identity, sets_exposure = "dark", True
+
+
+def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypatch):
+    at_end = StepOutcome("done", "found", fitted=(FittedFigure("tilt", -60.0, -60.0, 60.0),))
+    monkeypatch.setattr(sessions, "RUNS", {name: lambda context: at_end for name in sessions.NAMES})
+    (tmp_path / "bench.toml").write_text(bench_text())
+    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
+    (tmp_path / "s").mkdir()
+    assert session.run(frozenset(), lambda line: None) == 1
+    assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
+
+
+@pytest.mark.parametrize(("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")])
+def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
+    """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
+    runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
+    runs["photometry"] = lambda context: StepOutcome(photometry, "so it ended")
+    monkeypatch.setattr(sessions, "RUNS", runs)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "s").mkdir()
+    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
+    session.run(frozenset(), lambda line: None)
+    assert session.records["scale"].verdict == scale
+
+
+def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
+    monkeypatch.setattr(sessions, "PROGRESS_S", 0.01)
+    lines: list[str] = []
+    told = threading.Event()
+
+    def tell(line):
+        lines.append(line)
+        told.set()
+
+    progress = Progress(tell)
+    with progress.of("geometry"):
+        progress.stage("fits lenses")
+        while not any("fits lenses" in line for line in lines):
+            assert told.wait(PATIENCE_S)
+            told.clear()
+    assert lines[-1].startswith("geometry")
+
+
+def test_a_focus_that_has_not_settled_is_not_done(tmp_path, monkeypatch):
+    """The fit ended after its rounds without a word."""
+    monkeypatch.setattr(focuses, "ROUNDS", 1)
+    file = large_screen(tmp_path)
+    image = np.random.default_rng(4).normal(0, 1.0, (400, 400))
+    for x, y in itertools.product(range(50, 400, 75), repeat=2):
+        image[y : y + 3, x : x + 3] += 300
+    found = sharpness(image, 3.0)
+    assert not found.has_settled
+    dots = focuses.SharpDots(255, found, DarkSubtracted(tmp_path / "dots.png", image, 300.0, 0.0))
+    monkeypatch.setattr(focuses, "sharp_dots", lambda context: dots)
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 1)
+    outcome = focuses.focus(context)
+    assert outcome.verdict == "failed"
+    assert "has not settled in 1 rounds" in outcome.line
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
+def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    geometry = BenchGeometry(monitor_camera((640, 480), 57.65, 120, turn), monitor_camera((400, 400), 13, 25, turn))
+    figure, image = figure_for(geometry), np.random.default_rng(1).normal(0, 1.0, (400, 400))
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    for x, y, sides in zip(figure.x_px, figure.y_px, (3, 2, 1), strict=True):
+        right, down = x - 319.5, y - 239.5
+        left = round(199.5 + ratio * (cos * right - sin * down) - 1.4 * sides)
+        top = round(199.5 + ratio * (sin * right + cos * down) - 1.4 * sides)
+        image[top : top + round(2.8 * sides), left : left + round(2.8 * sides)] += 500
+    found = see_figure(image, figure, geometry)
+    assert (found.way == UPRIGHT) == (abs(turn_deg) < 45)
+    assert abs(found.whole_turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
+
+
+def wide_star(spot, dn, noise_dn, rng):
+    """An image with one star of `dn` in all, at a place of its own, and that place."""
+    x_px, y_px = 120 + rng.uniform(-0.5, 0.5, 2)
+    edges = np.arange(242) - 0.5
+    across, down = (np.diff(ndtr((edges - place) / spot.sigma_px[0])) for place in (x_px, y_px))
+    light = dn * np.outer(down, across)
+    image = light + rng.normal(0, noise_dn, light.shape) + rng.normal(0, 1, light.shape) * np.sqrt(light / spot.gain_e_per_dn)
+    return image, x_px, y_px
+
+
+def test_the_noise_of_wide_stars_is_known_in_place_and_light():
+    """A window of 9 px lost 0.26 mag of stars of 2.5 px, and took their noise for an error of the geometry."""
+    spot, rng, dn, noise_dn = StarSpot((4.0, 4.0), 2.0, 0.0), np.random.default_rng(4), 20_000.0, 3.0
+    off_px, light = [], []
+    for _ in range(60):
+        image, x_px, y_px = wide_star(spot, dn, noise_dn, rng)
+        found = find_stars(image, spot.settings, noisiest_background(image))
+        off_px.append((found.x_px[0] - x_px, found.y_px[0] - y_px))
+        light.append(found.flux[0] / spot.window_share)
+    noise_px = float(spot.place_noise_px(np.array([dn]), noise_dn)[0])
+    assert np.std(off_px) == pytest.approx(noise_px, rel=0.25)  # 120 offsets: 6.5 % of sigma, four times
+    noise_mag = float(spot.light_noise_mag(np.array([dn]), noise_dn)[0])
+    assert np.std(light) / dn * 1.0857 == pytest.approx(noise_mag, rel=0.4)
+    assert np.mean(light) == pytest.approx(dn, rel=4 * noise_mag / math.sqrt(60))
+
+
+def test_what_is_beyond_noise_is_told_from_noise():
+    rng = np.random.default_rng(5)
+    noise = rng.uniform(0.05, 0.4, 200)
+    alone, more = (Beyond.of(rng.normal(0, np.hypot(noise, extra)), noise) for extra in (0.0, 0.3))
+    assert alone.low == 0.0
+    assert alone.high < 0.1
+    assert more.low < 0.3 < more.high
+    assert more.low > 0.2
+
+
+class Distances:
+    """Stars `off_px` from the sky along x and y, with noise along each axis, for `noise_words`."""
+
+    def __init__(self, off_px, noise_px):
+        self.residual_px, self.place_noise_px = np.full((4, 2), off_px), np.full(4, noise_px)
+
+
+def test_noise_is_never_said_to_be_more_than_the_whole():
+    """A line said that stars were 0.081 px off, of which noise was 0.086."""
+    assert noise_words(Distances(0.1, 0.05)) == "of which noise is 0.071 px"
+    assert noise_words(Distances(0.05, 0.06)) == "no more than their noise makes (0.085 px)"
+
+
+class Places:
+    """The places of stars, for `frames_for`."""
+
+    def __init__(self, beyond, frames=1):
+        self.beyond_px, self.frames = beyond, frames
+
+
+def test_frames_are_asked_for_where_noise_hides_the_places():
+    limit_px = 0.1
+    sigma = limit_px / P95_OF_TWO
+    assert frames_for(Places(Beyond(0.0, 0.0, 0.9 * sigma)), limit_px) == 1
+    assert frames_for(Places(Beyond(3 * sigma, 2 * sigma, 4 * sigma)), limit_px) == 1
+    assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
+
+
+@pytest.mark.parametrize(("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")])
+def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
+    limit_px = 0.1
+    (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
+    assert advised in reason
+    assert ("--frames" in reason) == bool(advised)
+    assert "a longer [tracker] exposure_s" in reason
+
+
+def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
+    ratios = np.array([1.0, 1.02, 0.98, 2.0])
+    assert scale_of(10.0, ratios, np.zeros(4)).flux_at_white_e_per_s == pytest.approx(10.1)
+    weighed = scale_of(10.0, ratios, np.array([0.01, 0.01, 0.01, 0.5]))
+    assert weighed.flux_at_white_e_per_s == pytest.approx(10.0, abs=0.06)
+    assert weighed.relative_error is not None
+    assert StarReading(1, 5.0).sigma_dn == 0.0
+
+
+def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
+    """They are 12 tracker px apart, so none stood alone in a square of 13."""
+    rng, sigma_px = np.random.default_rng(6), 0.6
+    image, edges = rng.normal(0, 3.0, (120, 120)), np.arange(121) - 0.5
+    steps = ((np.arange(30) + 0.5) / 30 - 0.5) * 2.7
+    for place_x in np.arange(12, 110, 12) + 0.3:
+        for place_y in np.arange(12, 110, 12) - 0.2:
+            across, down = (
+                np.diff(ndtr((edges - place - steps[:, None]) / sigma_px), axis=1).mean(axis=0) for place in (place_x, place_y)
+            )
+            image += 30_000 * np.outer(down, across)
+    found = sharpness(image, 2.7)
+    assert abs(found.psf_sigma_px - sigma_px) < 4 * found.psf_sigma_error_px < 0.05
+
+
+@pytest.mark.parametrize(("read_noise_e", "alike"), [(0.0, True), (5.0, True), (12.0, False)])
+def test_an_adc_rounds_alike_where_read_noise_is_under_its_steps(read_noise_e, alike):
+    """A session by a detector without read noise said that stray light or a cold monitor may be why levels were not smooth."""
+    detector = DetectorSettings(read_noise_e=read_noise_e, gain_e_per_dn=24.0)
+    light_dn = np.linspace(0.0, 1.0, 101)
+    noise_dn = np.random.default_rng(2).normal(0, read_noise_e / 24.0, (20_000, 1))
+    lost_dn = np.abs(np.rint(light_dn + noise_dn).mean(axis=0) - light_dn).max()
+    assert rounds_alike(detector) == alike == (lost_dn > 0.03)
+
+
+def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
+    """In a window of 1 px a dot of 12.6 px had its place to 0.18 px and half its light."""
+    file, rng = large_screen(tmp_path), np.random.default_rng(7)
+    side_px, edges = DOT_PX * seen_screen_of(file).tracker_px_a_monitor_px, np.arange(81) - 0.5
+    steps = ((np.arange(60) + 0.5) / 60 - 0.5) * side_px
+    light, off_px = 1000 * side_px**2, []
+    for place_x, place_y in 40 + rng.uniform(-0.5, 0.5, (10, 2)):
+        across, down = (
+            np.diff(ndtr((edges - place - steps[:, None]) / 0.5), axis=1).mean(axis=0) for place in (place_x, place_y)
+        )
+        image = rng.normal(0, 3.0, (80, 80)) + light * np.outer(down, across)
+        found = find_stars(image, dot_settings(file), noisiest_background(image))
+        off_px.append(float(found.x_px[0]) - place_x)
+        assert found.flux[0] == pytest.approx(light, rel=0.005)
+    assert float(np.std(off_px)) < 0.01
+
+
+def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
+    """Dots are seen through the collimator: with a blur that the file states, `focus` asked to turn the focus."""
+    (tmp_path / "bench.toml").write_text(bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}}))
+    file = read_bench_file(tmp_path / "bench.toml")
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)
+    ratio = seen_screen_of(file).tracker_px_a_monitor_px
+    assert context.psf_sigma_px == pytest.approx(math.hypot(0.5, 0.5 * ratio))

@@ -1,0 +1,198 @@
+"""Light against place: an uneven screen is measured and evened out, and stars then scatter as their errors do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.units import magnitude
+from hilstar.display.calibration import load_calibration, with_uniformity
+from hilstar.instruments.calibrate.first_light.context import StepContext, rewrite
+from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
+from hilstar.instruments.calibrate.first_light.photometry import photometry
+from hilstar.instruments.calibrate.first_light.stars import scale, verify
+from hilstar.instruments.calibrate.first_light.uniformity import DotLight, map_of, uniformity, warm_up
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import TWIN, bench_text
+
+SIZE_PX = (640, 480)
+Y, X = np.mgrid[-1:1:11j, -1:1:15j]
+VIGNETTING = (1 + 0.2 * (X**2 + Y**2)) ** -2.0  # half of the light in the corners of the screen
+PANEL = 1 + np.random.default_rng(4).normal(0, 0.05, (5, 7))
+# A dot is read to 0.004 mag, and a field of the map has ten dots or more; between the fields it is bilinear.
+MAP_MAG = 0.005
+NOISE = "[tracker.detector]\nread_noise_e = 12.0\nprnu = 0.005\ngain_e_per_dn = 4.0\nbits = 14\n"
+
+
+def planted(folder, grid, name="srgb", bench=None):
+    """A bench file that knows nothing of its truth's light against place."""
+    bits = 10 if name == "srgb" else 8
+    with_uniformity(name, bits, folder / "true.toml", grid)
+    changes = {"monitor": {"bits": bits, "calibration": name}}
+    text = bench_text(TWIN, changes) + (bench or "")
+    (folder / "bench.toml").write_text(text)
+    (folder / "truth.toml").write_text(text.replace(f'"{name}"', '"true.toml"'))
+    return folder
+
+
+@pytest.fixture
+def charts_of_one(request, grid):
+    """The first case has charts."""
+    if grid is not VIGNETTING:
+        request.getfixturevalue("without_charts")
+
+
+def did(folder, step, patches=0, known=None, watched_s=0.0):
+    """What a step comes to, with the bench file rewritten as a session does it."""
+    file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
+    source = VirtualBench(file, true, 0)
+    try:
+        outcome = step(
+            StepContext(
+                file,
+                folder,
+                folder / step.__name__,
+                source,
+                known or {},
+                {},
+                patches,
+                watched_s=watched_s,
+            )
+        )
+    finally:
+        source.close()
+    rewrite(file, outcome.changes)
+    return outcome
+
+
+@pytest.mark.parametrize(("grid", "seen"), [(VIGNETTING, 0.1), (PANEL, 0.03)], ids=["vignetting", "panel"])
+@pytest.mark.usefixtures("charts_of_one")
+def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp_path, grid, seen):
+    folder = planted(tmp_path, grid)
+    before = did(folder, verify)
+    assert before.verdict == "failed"
+    assert "scatters" in before.line
+    assert before.figures["flux_scatter_mag"] > 3 * before.figures["flux_error_mag"]
+    found = did(folder, uniformity)
+    assert found.verdict == "done", found.line
+    assert found.figures["truth_rms_mag"] < MAP_MAG
+    assert found.figures["truth_rms_mag"] < 1.5 * found.figures["map_error_mag"]
+    assert found.number.error > 0 and found.number.value == pytest.approx(100 * found.figures["darkest_of_brightest"])
+    assert found.figures["change_rms_mag"] == pytest.approx(seen, rel=0.5)
+    assert (folder / "uniformity.svg") in found.pictures
+    assert load_calibration(folder / "light.toml", 10).uniformity is not None
+    assert did(folder, scale).verdict == "done"
+    after = did(folder, verify)
+    assert after.verdict == "done", after.line
+    assert after.figures["flux_scatter_mag"] < 1.5 * after.figures["flux_error_mag"]
+    assert before.figures["flux_scatter_mag"] > 3 * after.figures["flux_scatter_mag"]
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_an_even_screen_has_nothing_written(tmp_path):
+    folder = planted(tmp_path, None)
+    found = did(folder, uniformity)
+    assert (found.verdict, found.changes) == ("done", ())
+    assert "even" in found.line
+    assert not (folder / "light.toml").exists()
+    assert did(folder, verify).verdict == "done"
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
+    folder = planted(tmp_path, VIGNETTING)
+    did(folder, uniformity)
+    again = did(folder, uniformity)
+    assert (again.verdict, again.changes) == ("done", ())
+    assert "has it so" in again.line
+    truth = (folder / "truth.toml").read_text()
+    (folder / "truth.toml").write_text(truth.replace('"true.toml"', '"srgb"'))
+    mended = did(folder, uniformity)
+    assert (mended.verdict, mended.figures["grid"]) == ("done", "1 x 1")
+    assert load_calibration(folder / "light.toml", 10).uniformity is None
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
+    """By 8 bits, with the response measured after the map: both are in the file that the bench names."""
+    folder = planted(tmp_path, VIGNETTING, "lcd-example")
+    found = did(folder, uniformity)
+    assert found.verdict == "done", found.line
+    mine, its = (load_calibration(path, 8, bit_stealing=True) for path in (folder / "light.toml", "lcd-example"))
+    assert mine.weights == pytest.approx(its.weights)
+    assert np.array_equal(mine.response.light, its.response.light)
+    assert did(folder, photometry, 96).verdict == "done"
+    measured = load_calibration(folder / read_bench_file(folder / "bench.toml").config.monitor.calibration, 8)
+    assert np.allclose(measured.uniformity, load_calibration(folder / "light.toml", 8).uniformity)
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
+    folder = planted(tmp_path, None, bench=NOISE)
+    found = did(folder, uniformity)
+    assert (found.verdict, found.changes) == ("done", ()), found.line
+    assert found.figures["left_rms_mag"] == pytest.approx(found.figures["dot_noise_mag"], rel=0.3)
+    assert did(folder, verify).verdict == "done"
+
+
+def dots(light, rng, noise=0.004):
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(8, 632, 12), np.arange(8, 472, 12)))
+    return DotLight(x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise)
+
+
+def test_wild_dots_do_not_bend_the_map():
+    rng = np.random.default_rng(1)
+    seen = dots(lambda x, y: 1 - 0.1 * x, rng)
+    seen.light[rng.choice(len(seen.light), 40, replace=False)] *= 0.3
+    found = map_of(seen, seen.light, SIZE_PX)
+    assert (~found.used).sum() == 40
+    assert found.left_mag == pytest.approx(seen.noise_mag, rel=0.1)
+    true = 1 - 0.1 * (seen.x / 320 - 1)
+    assert np.std(found.at_dots / true) < 0.002
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
+    """A panel of 80 x 60 fields with 8 % between neighbours: no map of at most 18 x 24 has them."""
+    folder = planted(tmp_path, 1 + np.random.default_rng(2).normal(0, 0.08, (60, 80)))
+    found = did(folder, uniformity)
+    assert found.verdict == "failed"
+    assert "far above" in found.line
+
+
+@pytest.mark.parametrize("fall", [0.0, 0.004, 0.012, 0.05])
+def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
+    """Dots over a small part of a screen whose light falls towards its sides, down to less than their noise shows."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(200, 440, 8), np.arange(150, 330, 8)))
+    true = 1 - fall * ((x / 320 - 1) ** 2 + (y / 240 - 1) ** 2) - fall * (x / 320 - 1)
+    sigmas = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        light = true * rng.normal(1, 0.005, x.shape)
+        found = map_of(DotLight(x, y, light, 0.0054), light, SIZE_PX)
+        off_mag = np.std(magnitude(found.at_dots / true))
+        error_mag = found.error_mag(0.0054)
+        assert error_mag > 0
+        sigmas.append(off_mag / error_mag)
+    assert max(sigmas) < 3
+    # No error is worth anything that is many times the difference.
+    assert np.median(sigmas) > (0.2 if fall else -1)
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_path):
+    """The step ended there, and sent its user back to a focus that was right."""
+    folder = planted(tmp_path, VIGNETTING)
+    found = did(folder, uniformity, known={"focus.dot_code": 1023})
+    assert found.verdict == "done", found.line
+    names = {path.stem.rpartition("_")[0] for path in found.files if path.stem.startswith("lattice")}
+    assert len(names) == 1
+    assert names != {"lattice_01023"}
+    assert found.figures["truth_rms_mag"] < MAP_MAG
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_white_is_watched_in_a_code_that_does_not_saturate(tmp_path):
+    folder = planted(tmp_path, None)
+    found = did(folder, warm_up, known={"focus.dot_code": 1023}, watched_s=600.0)
+    assert found.verdict == "done", found.line

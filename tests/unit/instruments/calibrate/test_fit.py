@@ -1,0 +1,338 @@
+"""From measured patches to a response: how near it comes, and which data are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.basics.errors import InputError
+from hilstar.display.calibration import load_calibration, primary_responses
+from hilstar.display.response import srgb_light
+from hilstar.instruments.calibrate.measurements import drift_over_run, read_measurements
+from hilstar.instruments.calibrate.photometric import (
+    Provenance,
+    calibrate_photometric,
+    draw_calibration,
+    fit_channel,
+    strictly_rising,
+)
+from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches, planned_codes
+from tests.support.commands import run_hilstar_here
+
+NOISE = 0.01
+# The issue's aim, over three decades below white.
+WORST, RMS, FAINTEST = 0.01, 0.005, 1e-3
+
+
+def cell(signal):
+    """An S-curve: what a twisted-nematic cell lets through, against its voltage."""
+    return np.sin(np.pi / 2 * signal**1.1) ** 2
+
+
+def bent(signal):
+    """A table as measured: a power law with waves of 6 %."""
+    return signal**2.2 * np.exp(0.06 * (np.sin(3 * np.pi * signal**0.5) - np.sin(3 * np.pi)))
+
+
+CURVES = {"gamma": lambda s: s**2.2, "srgb": srgb_light, "s-curve": cell, "table": bent}
+
+
+def write(path, rows, header="code,channel,value"):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def measure(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=250.0):
+    """The default plan, measured with a noise relative to the light."""
+    patches = plan_patches(PlanSettings(bits, repeats=repeats), rng)
+    light = (curve(np.array([patch.code for patch in patches]) / (2**bits - 1)) + black) * unit
+    light *= 1 + noise * rng.standard_normal(len(light))
+    return write(path, [(patch.code, patch.channel, value) for patch, value in zip(patches, light, strict=True)])
+
+
+def errors(fit, curve):
+    true = curve(np.arange(len(fit.light)) / (len(fit.light) - 1))
+    return (fit.light / np.where(true > 0, true, 1) - 1)[true >= FAINTEST]
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("black", [0.0, 1e-3])
+@pytest.mark.parametrize("name", CURVES)
+def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, bits, tmp_path):
+    """3 repeats do where a formula fits; a shape of its own has twice the free parameters, and is measured 6 times.
+
+    Of 200 seeds, 96 to 100 % then meet the aim; ten are run here, of which one may miss it.
+    """
+    repeats = 3 if name in ("gamma", "srgb") else 6
+    met = 0
+    for seed in range(10):
+        path = measure(tmp_path / "m.csv", CURVES[name], np.random.default_rng(seed), bits, repeats, black)
+        error = errors(fit_channel(read_measurements(path), "w"), CURVES[name])
+        met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
+    assert met >= 9
+
+
+def test_even_steps_of_code_do_where_the_light_is_a_power_law(tmp_path):
+    codes = np.repeat(np.rint(np.linspace(0, 255, 32)).astype(int), 3)
+    met = 0
+    for seed in range(10):
+        light = (codes / 255) ** 2.2 * (1 + NOISE * np.random.default_rng(seed).standard_normal(len(codes)))
+        path = write(tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)])
+        error = errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])
+        met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
+    assert met >= 9
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_without_noise_nothing_is_lost(name, tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES[name], rng, black=1e-3, noise=0)
+    fit = fit_channel(read_measurements(path), "w")
+    assert np.abs(errors(fit, CURVES[name])).max() < 1e-3  # sRGB's kink and the waves, between levels 8 % apart
+    assert fit.black / fit.white == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_stated_error_is_the_error(tmp_path):
+    """Over 30 seeds and the codes above FAINTEST, error over its stated sigma has an rms near 1."""
+    ratios = []
+    for seed in range(30):
+        path = measure(tmp_path / "m.csv", cell, np.random.default_rng(seed), black=1e-3)
+        fit = fit_channel(read_measurements(path), "w")
+        true = cell(np.arange(255) / 255)
+        shown = true >= FAINTEST
+        ratios.append((fit.light[:-1][shown] / true[shown] - 1) / fit.error[:-1][shown])
+    rms = np.sqrt(np.mean(np.concatenate(ratios) ** 2))
+    # A seed has about 6 free parameters: 30 * 6 draws give the rms to 1 / sqrt(360) = 5 %; the smooth prior adds its bias.
+    assert 0.75 < rms < 1.3
+
+
+def test_a_held_out_residual_is_that_of_a_fit_without_the_level(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    data = read_measurements(path)
+    whole = fit_channel(data, "w")
+    for place in (8, 15, 25):
+        code = int(whole.levels.code[place])
+        kept = [row for row in path.read_text().splitlines() if not row.startswith(f"{code},")]
+        (tmp_path / "less.csv").write_text("\n".join(kept))
+        without = fit_channel(read_measurements(tmp_path / "less.csv"), "w")
+        left = (whole.levels.mean[place] - without.black) / (without.white * without.light[code]) - 1
+        # The stiffness and the noise are chosen anew without the level: a tenth of the noise of a level's mean.
+        assert whole.residual[place - 1] == pytest.approx(left, abs=0.1 * NOISE)
+
+
+def test_a_flat_dark_end_is_made_strictly_rising():
+    light = strictly_rising(np.array([0, 0, 0, 1e-12, 0.5, 0.4, 1.0]))
+    assert np.all(np.diff(light) > 0)
+    assert light[-1] == 1
+    assert light[4] == pytest.approx(0.5)
+
+
+def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):
+    """Codes 1 to 16 are as black as 0."""
+    path = measure(tmp_path / "m.csv", lambda s: np.maximum(s - 16 / 255, 0) ** 2.2, rng, black=1e-3)
+    calibrate_photometric(path, tmp_path / "monitor.toml")
+    assert load_calibration(tmp_path / "monitor.toml", 8).response.light[20] < 1e-2
+
+
+def test_every_code_of_16_bits_is_fitted(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, bits=16)
+    assert np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max() < WORST
+
+
+def test_dn_are_divided_by_their_exposure(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    plain = read_measurements(path)
+    rows = [(c, "w", v * t, t) for c, v, t in zip(plain.code, plain.value, rng.uniform(0.01, 2, len(plain.code)), strict=True)]
+    exposed = read_measurements(write(tmp_path / "dn.csv", rows, "code,channel,value,exposure_s"))
+    assert exposed.value == pytest.approx(plain.value)
+
+
+def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
+    """5e-5 of white added to each reading: without its own term the noise of the faint levels would be far underrated."""
+    worst = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3, noise=0.003, unit=1.0)
+        data = read_measurements(path)
+        value = np.maximum(data.value + 5e-5 * rng.standard_normal(len(data.value)), 0)
+        write(path, [(c, "w", v) for c, v in zip(data.code, value, strict=True)])
+        worst.append(np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max())
+    assert np.median(worst) < WORST
+
+
+def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
+    codes = planned_codes(8, 64)
+    light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + NOISE * rng.standard_normal(len(codes)))
+    path = write(tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)])
+    fit = fit_channel(read_measurements(path), "w")
+    assert fit.noise_relative == pytest.approx(NOISE, rel=4 / np.sqrt(2 * 60))  # four sigma of a scatter of 60
+
+
+def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3)
+    summary = calibrate_photometric(path, tmp_path / "monitor.toml", Provenance('a "b"\nc', instrument="meter", unit="cd/m2"))
+    calibration = load_calibration(tmp_path / "monitor.toml", 8)
+    assert calibration.who == 'a "b"\nc'
+    assert calibration.sha256 == summary["sha256"]
+    assert calibration.response.black == pytest.approx(1e-3, rel=0.02)  # black is measured 25 times at 1 %
+    assert summary["black_level"]["unit"] == pytest.approx(0.25, rel=0.02)
+    assert summary["noise_relative"] == pytest.approx(NOISE, rel=0.3)  # some 60 repeats of bright levels: 9 %
+    # A level's mean of three repeats to 0.58 %, seen from a response that is known better.
+    assert 0.3 < summary["holdout"]["rms_percent"] < 0.9
+    assert summary["holdout"]["max_mag"] == pytest.approx(summary["holdout"]["max_percent"] / 100 * 1.0857, rel=1e-4)
+    assert summary["error_percent"]["1e-3"] > summary["error_percent"]["1e-2"]
+    assert summary["additivity_percent"] is None
+    light = load_calibration(tmp_path / "monitor.toml", 8).response.light
+    assert np.abs(light[4:] / srgb_light(np.arange(4, 256) / 255) - 1).max() < WORST
+
+
+def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
+    shares, powers = {"r": 0.2, "g": 0.7, "b": 0.1}, {"r": 2.1, "g": 2.2, "b": 2.4}
+
+    def light(code, channel):  # primaries add to each other's light, more at dark codes
+        if channel != "w":
+            return shares[channel] * (code / 255) ** powers[channel] + 1e-3
+        together = sum(light(code, name) - 1e-3 for name in shares)
+        return 1.02 * together * (1 + 0.1 * (1 - code / 255)) + 1e-3
+
+    rows = [
+        (p.code, p.channel, light(p.code, p.channel) * (1 + 0.005 * rng.standard_normal()))
+        for p in plan_patches(PlanSettings(8, 24, channels="wrgb"), rng)
+    ]
+    summary = calibrate_photometric(write(tmp_path / "m.csv", rows), tmp_path / "monitor.toml")
+    assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
+    assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
+    assert list(summary["crosstalk_percent"]) == [f"1e-{decade}" for decade in range(4)]
+    for code, decade in ((255, "1e-0"), (90, "1e-1"), (31, "1e-2")):
+        planted = 100 * (1 / (1.02 * (1 + 0.1 * (1 - code / 255))) - 1)
+        assert summary["crosstalk_percent"][decade] == pytest.approx(
+            planted, abs=3 * summary["crosstalk_error_percent"][decade]
+        )
+        assert summary["crosstalk_error_percent"][decade] < 2
+    for found, (name, power) in zip(primary_responses(tmp_path / "monitor.toml", 8), powers.items(), strict=True):
+        for code, decade in ((90, "1e-1"), (31, "1e-2")):
+            error = summary["channels"][name]["error_percent"][decade]
+            assert found.light[code] == pytest.approx((code / 255) ** power, rel=3 * error / 100)
+    said = run_hilstar_here("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "again.toml").stdout
+    assert "channel b" in said and "crosstalk at 1e-1" in said
+    calibration = load_calibration(tmp_path / "monitor.toml", 8, bit_stealing=True)
+    assert calibration.weights == pytest.approx((0.2, 0.7, 0.1), rel=0.01)
+    assert len(calibration.response.light) == 1786
+
+
+def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng):
+    """As first light reads an OLED: too few repeats of bright levels, and black is its own noise."""
+    times = {0: 5, 2: 2, 5: 2, 13: 2, 25: 2, 44: 1, 71: 1, 90: 1, 111: 1, 127: 3, 169: 1, 255: 4}
+    codes = [code for code, count in times.items() for _ in range(count)]
+    rows = [
+        (code, "w", 1e5 * (code / 255) ** 2.2 * (1 + 0.003 * rng.standard_normal()) + 0.2 * rng.standard_normal())
+        for code in codes
+    ]
+    path = write(tmp_path / "m.csv", [(code, channel, abs(value)) for code, channel, value in rows])
+    assert calibrate_photometric(path, tmp_path / "monitor.toml")["noise_relative"] < 0.1
+
+
+def test_a_drawing_says_what_it_shows(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    finding = draw_calibration(path, tmp_path / "m.png")
+    assert "rms off" in finding
+    with Image.open(tmp_path / "m.png") as image:
+        assert image.size[0] > 500
+
+
+def refused(path, **more):
+    with pytest.raises(InputError) as caught:
+        calibrate_photometric(path, path.with_name("monitor.toml"), **more)
+    assert "\n" not in str(caught.value)
+    assert not path.with_name("monitor.toml").exists()
+    return str(caught.value)
+
+
+def ramp(codes, bits=8, curve=CURVES["gamma"], repeats=3, black=1e-3):
+    return [
+        (int(c), "w", float(curve(c / (2**bits - 1)) + black) * (1 + 1e-3 * (k - 1))) for k in range(repeats) for c in codes
+    ]
+
+
+STEPS = [0, 1, *range(5, 256, 10)]
+
+
+@pytest.mark.parametrize(
+    ("codes", "words"),
+    [
+        (STEPS[1:], "code 0 is not measured"),
+        (STEPS[:-1], "white, code 255 of 8 bits, is not measured"),
+        ([0, 10, 20, 40, 80, 160, 255], "7 distinct codes; measure 10 or more"),
+    ],
+)
+def test_levels_that_are_missing_are_named(codes, words, tmp_path):
+    assert words in refused(write(tmp_path / "m.csv", ramp(codes)))
+
+
+def test_a_saturated_instrument_is_named(tmp_path):
+    clipped = ramp(STEPS, curve=lambda s: min(s**2.2, 0.8))
+    assert "saturated or the link clips" in refused(write(tmp_path / "m.csv", clipped))
+    at_limit = [(c, "w", min(round(4000 * (v / 0.85)), 4095)) for c, _, v in ramp(STEPS)]
+    assert "codes 245 to 255 read the same" in refused(write(tmp_path / "m.csv", at_limit))
+
+
+def test_light_that_falls_beyond_the_noise_is_named(tmp_path):
+    rows = [(c, n, v * (0.7 if c == 125 else 1)) for c, n, v in ramp(STEPS)]
+    assert "from code 115 to code 125" in refused(write(tmp_path / "m.csv", rows))
+
+
+def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
+    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng)
+    data = read_measurements(path)
+    for seed in range(20):
+        again = read_measurements(measure(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(seed)))
+        drift, error = drift_over_run(again)
+        assert abs(drift) < 4 * error
+    falling = data.value * np.linspace(1, 0.97, len(data.value))
+    rows = list(zip(data.code, data.channel, falling, strict=True))
+    assert "light drifts by -" in refused(write(tmp_path / "m.csv", rows))
+    # The same rows sorted, their times beside them.
+    timed = sorted((c, n, v, 10.0 * t) for t, (c, n, v) in enumerate(rows))
+    assert "light drifts by -" in refused(write(tmp_path / "m.csv", timed, "code,channel,value,t_s"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "has no measurement"),
+        ("code,value\n", "the column channel is missing"),
+        ("code,channel,value,colour\n", "unknown or repeated column"),
+        ("code,code,channel,value\n", "column code is there twice"),
+        ("code,channel,value\n1,w\n", ":2: 2 cells"),
+        ("code,channel,value\n1,w,\n", "line 2: value is empty"),
+        ("code,channel,value\n# so\n1.5,w,2\n", "line 3: code = 1.5"),
+        ("code,channel,value\n-1,w,2\n", "code = -1"),
+        ("code,channel,value\n70000,w,2\n", "code = 70000"),
+        ("code,channel,value\n1,x,2\n", "channel = x; write w, r, g or b"),
+        ("code,channel,value\n1,w,nan\n", "value = nan; write a finite number"),
+        ("code,channel,value\n1,w,-2\n", "light is not negative"),
+        ("code,channel,value\n1,w,bright\n", "value = bright"),
+        ("code,channel,value,exposure_s\n1,w,2,0\n", "exposure_s = 0"),
+        ("code,channel,value,t_s\n1,w,2,\n2,w,2,1\n", "t_s is empty in some rows"),
+        ("code,channel,value\n1,r,2\n", "only channel r"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line(text, words, tmp_path):
+    (tmp_path / "m.csv").write_text(text)
+    assert words in refused(tmp_path / "m.csv")
+
+
+def test_bits_are_those_of_the_largest_code_unless_given(tmp_path):
+    path = write(tmp_path / "m.csv", ramp([0, 300]))
+    assert read_measurements(path).bits == 10
+    assert read_measurements(path, 12).bits == 12
+    assert "outside 8 bits" in refused(path, bits=8)
+    assert "white, code 1023 of 10 bits" in refused(path)
+
+
+def test_other_files_are_refused(tmp_path):
+    assert "cannot be read" in refused(tmp_path / "none.csv")
+    (tmp_path / "m.csv").write_bytes(b"\xff\xfe\x00")
+    assert "not UTF-16 to its end" in refused(tmp_path / "m.csv")
+    (tmp_path / "monitor.csv").write_text("\ufeffcode,channel,value\n" + "".join(f"{c},w,{v}\n" for c, _, v in ramp(STEPS)))
+    assert "written over" in refused(tmp_path / "monitor.csv")  # and a byte-order mark is no fault

@@ -1,0 +1,117 @@
+"""The stated error of a geometry holds the truth: of a lens that noise hides, of dots with errors of their own, of few dots."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.geometric.calibration import nominal_of
+from hilstar.instruments.calibrate.geometric.dots import SeenScreen, lit_for, plan_seen_dots
+from hilstar.instruments.calibrate.geometric.fit import (
+    BROWN_CONRADY,
+    GAIN,
+    PINHOLE,
+    Candidate,
+    MatchedDots,
+    Model,
+    Problem,
+    best_of,
+    fit,
+    noise_of_repeats,
+    uncertainty_of,
+)
+from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
+from hilstar.optics.camera import Lens
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import bench_text
+
+# A tracker of 256 x 256 px, of 39 arcsec that sees the whole of a small screen.
+SMALL_FIELD = {
+    "tracker": {"focal_length_mm": 45, "pixel_pitch_um": 8.5, "resolution_px": [256, 256], "psf_sigma_px": [1.0, 1.0]},
+    "monitor": {"resolution_px": [640, 360], "pixel_pitch_um": 60.0},
+    "collimator": {"focal_length_mm": 900},
+}
+SEEDS, FRAMES = 6, 12
+# The rms of six errors, each an rms over the field of a fit's few numbers, in their sigmas: over 1.5 comes once in a thousand.
+MAX_RMS_SIGMAS = 1.5
+GRID = 9
+
+
+def planted(folder, tilt_deg=0.0):
+    """A bench file and the screen as it truly stands."""
+    (folder / "bench.toml").write_text(bench_text(SMALL_FIELD))
+    file = read_bench_file(folder / "bench.toml")
+    nominal = nominal_of(file)
+    monitor = dataclasses.replace(nominal.monitor, lens=Lens(tilt_rad=(math.radians(tilt_deg), 0.0)))
+    return file, SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=1.0)
+
+
+def error_of(file, seen, names, seed, noise_px, dot_noise_px=0.0):
+    """The rms error of a lens with such parameters over the tracker's field, in its stated error.
+
+    It is fitted to centroids with noise of each frame, and of each dot in all its frames.
+    """
+    rng = np.random.default_rng(seed)
+    plan = plan_seen_dots(seen, FRAMES, lit_for(seen), rng)
+    places = np.stack(seen.tracker.project(seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T))
+    dot, frame = np.nonzero(plan.lit)
+    places = (places + rng.normal(0, dot_noise_px, places.shape))[:, dot] + rng.normal(0, noise_px, (2, len(dot)))
+    data = MatchedDots(Observed(frame, np.zeros_like(frame), *places, np.ones(len(dot))), dot)
+    problem = Problem(plan, nominal_of(file), np.array([[1.0, 0.0, 0.0, 0.0]]), noise_of_repeats(data))
+    found = fit(problem, Model(names), 0, data)
+    return off_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
+
+
+def off_arcsec(geometry, seen):
+    """The rms error of directions over the tracker's field."""
+    sides = (np.linspace(0, size - 1, GRID) for size in seen.tracker.resolution_px)
+    u, v = (part.ravel() for part in np.meshgrid(*sides))
+    x_px, y_px = seen.monitor.project(seen.tracker.rays(u, v) @ seen.monitor.cam_to_image.T)
+    on_screen = seen.monitor.contains_px(x_px, y_px)
+    rays = geometry.monitor.rays(x_px[on_screen], y_px[on_screen])
+    seen_x, seen_y = seen.tracker.project(rays @ seen.tracker.cam_to_image.T)
+    off_px = np.hypot(seen_x - u[on_screen], seen_y - v[on_screen])
+    return float(np.sqrt((off_px**2).mean())) * ARCSEC_PER_RAD / seen.tracker.focal_length_px
+
+
+def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
+    """A tilt of 2.5 degrees: the covariance of a pinhole's four numbers alone is half of its error."""
+    file, seen = planted(tmp_path, tilt_deg=2.5)
+    off = [error_of(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
+    assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
+
+
+def test_dots_with_errors_of_their_own_are_not_averaged_over_frames(tmp_path):
+    file, seen = planted(tmp_path, tilt_deg=3.0)
+    off = [error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02) for seed in range(SEEDS)]
+    assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
+
+
+def candidate(name, off_arcsec):
+    return Candidate(name, Model(PINHOLE), 0, np.arange(len(off_arcsec)), off_arcsec)
+
+
+@pytest.mark.parametrize(("is_chance", "chosen"), [(True, "small"), (False, "large")])
+def test_a_larger_model_is_taken_for_more_than_chance(is_chance, chosen):
+    """Both are 4 % better: one has other residuals, the other smaller ones."""
+    rng = np.random.default_rng(2)
+    small, other = candidate("small", rng.normal(0, 1.0, (50, 2))), candidate("other", rng.normal(0, 1.0, (50, 2)))
+    large = other if is_chance else small
+    large = candidate("large", large.off_arcsec * (0.96 * small.rms_arcsec / large.rms_arcsec))
+    assert large.rms_arcsec < GAIN * small.rms_arcsec
+    assert best_of([small, large]).name == chosen
+
+
+@pytest.mark.parametrize("psf_sigma_px", [0.5, 2.8])
+def test_no_dot_is_planned_whose_window_leaves_the_image(tmp_path, psf_sigma_px):
+    _, seen = planted(tmp_path)
+    seen = dataclasses.replace(seen, psf_sigma_px=psf_sigma_px)
+    plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
+    x, y = seen.tracker.project(seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T)
+    reach = dot_centroids(seen.dot_sigma_px).radius_px
+    assert min(x.min(), y.min()) >= reach
+    assert max(x.max(), y.max()) <= 255 - reach

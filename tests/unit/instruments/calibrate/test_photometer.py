@@ -1,0 +1,184 @@
+"""What the tracker reads of a response is as far off as its errors say: noise, ratios of ranges,
+rounding and black.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from hilstar.display.calibration import CalibrationHead, NotesTable, load_calibration, read_toml, write_calibration
+from hilstar.display.geometry import monitor_camera
+from hilstar.display.response import gamma_response
+from hilstar.instruments.calibrate.first_light.context import StepContext
+from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
+from hilstar.instruments.calibrate.first_light.photometer import monitor_area
+from hilstar.instruments.calibrate.first_light.photometry import photometry
+from hilstar.instruments.calibrate.measurements import read_measurements
+from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit_channel
+from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
+from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.tracker.rounding import rounding_error, rounding_rms
+from tests.support.benches import TWIN, bench_text
+
+pytestmark = pytest.mark.usefixtures("without_charts")
+BITS, BLACK, POWER = 8, 1e-3, 2.35
+DECADES = (1e-1, 1e-2, 1e-3)
+SURE = 4.0  # sigmas: one figure in 16 000 is further off
+# Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
+# three times.
+MAX_RMS = 1.6
+NOISY = {"gain_e_per_dn": 8.0, "read_noise_e": 12.0, "full_well_e": 30_000.0, "offset_dn": 40.0, "prnu": 0.005}
+# Nothing spreads a level over the ADC's steps: the defaults of a bench file.
+SILENT = {"gain_e_per_dn": 24.0, "read_noise_e": 0.0, "dark_e_per_s": 0.0, "offset_dn": 40.0}
+
+
+def planted(folder, detector, collimator_mm=120):
+    """A bench file that supposes sRGB, and its truth: a power law with a black level."""
+    light = gamma_response(BITS, POWER).light + BLACK
+    head = CalibrationHead("photometric", "planted", "2026-11-28", "none", "relative", BITS, "true-response.csv")
+    write_calibration(folder / "true-light.toml", head, {"w": light}, 0.0, NotesTable())
+    tables = {"monitor": {"bits": BITS}, "tracker.detector": detector, "collimator": {"focal_length_mm": collimator_mm}}
+    (folder / "bench.toml").write_text(bench_text(TWIN, tables))
+    true = tables | {"monitor": {"bits": BITS, "calibration": "true-light.toml"}}
+    (folder / "truth.toml").write_text(bench_text(TWIN, true))
+
+
+def measured(folder, seed, sets_exposure=True):
+    """What the step comes to on the planted bench, and its figures in sigmas: the response by
+    decades, and black.
+    """
+    file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
+    source = VirtualBench(file, true, seed)
+    source.sets_exposure = sets_exposure
+    try:
+        outcome = photometry(StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96))
+    finally:
+        source.close()
+    assert outcome.verdict == "done", outcome.line
+    response = load_calibration(folder / "response.toml", BITS).response
+    light = gamma_response(BITS, POWER).light
+    off = []
+    for decade in DECADES:
+        code = int(np.argmin(np.abs(light - decade)))
+        error = float(outcome.figures[f"error_at_1e-{round(-math.log10(decade))}_percent"]) / 100
+        off.append((response.light[code] / light[code] - 1) / error)
+    black = (response.black - BLACK) / read_toml(folder / "response.toml").errors.black
+    return outcome, np.array(off), black
+
+
+@pytest.mark.parametrize("detector", [NOISY, SILENT], ids=["noisy", "silent"])
+def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detector, tmp_path):
+    """The ratios of lattices, read once each, put all codes beside white up to 8 sigmas off, and
+    black was 20 off.
+    """
+    planted(tmp_path, detector)
+    off, black = [], []
+    for seed in range(4):
+        _, response, level = measured(tmp_path, seed)
+        off.append(response)
+        black.append(level)
+    assert np.sqrt(np.mean(np.square(off))) < MAX_RMS
+    assert np.abs(off).max() < SURE
+    assert np.abs(black).max() < SURE
+
+
+def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tmp_path):
+    """A monitor pixel is 3.7 tracker pixels: no lattice is brighter than a lone pixel, and codes
+    were read as 0 or 1 DN.
+    """
+    planted(tmp_path, SILENT, collimator_mm=30)
+    outcome, off, black = measured(tmp_path, 0)
+    assert np.abs(off).max() < SURE
+    assert abs(black) < SURE
+    assert float(outcome.figures["error_at_1e-3_percent"]) < 1.0
+    assert "exposed 16 times longer" in (tmp_path / "measured.csv").read_text()
+
+
+def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_errors(tmp_path):
+    planted(tmp_path, SILENT, collimator_mm=30)
+    outcome, off, black = measured(tmp_path, 0, sets_exposure=False)
+    assert np.abs(off).max() < SURE
+    assert abs(black) < SURE
+    # Half a step of the ADC, of codes whose peak is a few steps.
+    assert float(outcome.figures["error_at_1e-3_percent"]) > 1.0
+
+
+def test_the_command_and_the_step_give_the_same_figures(tmp_path):
+    planted(tmp_path, NOISY)
+    outcome, _, _ = measured(tmp_path, 0)
+    found = calibrate_photometric(tmp_path / "measured.csv", tmp_path / "again.toml", bits=BITS)
+    mine, its = (read_toml(tmp_path / name).errors for name in ("response.toml", "again.toml"))
+    assert mine == its
+    assert found["holdout"]["rms_mag"] == outcome.figures["held_out_rms_mag"]
+    assert found["black_level"]["relative"] == pytest.approx(outcome.figures["black_level"])
+    responses = [load_calibration(tmp_path / name, BITS).response.light for name in ("response.toml", "again.toml")]
+    assert np.array_equal(*responses)
+
+
+def written(path, rows, header):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
+    """Codes below half were read in a range whose ratio is known to 1 %; each reading repeats to
+    0.1 %.
+    """
+    ratios = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        patches = plan_patches(PlanSettings(BITS, repeats=1), rng)
+        codes = np.array([patch.code for patch in patches])
+        light = gamma_response(BITS, POWER).light[codes]
+        faint = (codes < 128) & (codes > 0)
+        value = light * (1 + 0.001 * rng.standard_normal(len(codes))) * np.where(faint, 1 + 0.01 * rng.standard_normal(), 1)
+        rows = [
+            (code, "w", one, 0.001 * one + 1e-7, 0.01 * one * below)
+            for code, one, below in zip(codes, value, faint, strict=True)
+        ]
+        path = written(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
+        fit = fit_channel(read_measurements(path), "w")
+        code = 60
+        ratios.append((fit.light[code] / gamma_response(BITS, POWER).light[code] - 1) / fit.error[code])
+    # 40 draws give an rms to 11 %; the fit takes most of the step away, for a power law is smooth.
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
+    """Stated errors of 0.01 % and a scatter of 0.5 %: the errors grow by what the levels are off."""
+    rng = np.random.default_rng(1)
+    codes = np.repeat(np.arange(0, 256, 15), 2)
+    scatter = np.repeat(1 + 0.005 * rng.standard_normal(18), 2)
+    light = gamma_response(BITS, POWER).light[codes] * scatter
+    rows = [(code, "w", one, 1e-4 * one + 1e-9) for code, one in zip(codes, light, strict=True)]
+    fit = fit_channel(read_measurements(written(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w")
+    codes = np.arange(40, 255)
+    off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1
+    assert fit.lack_of_fit > 10
+    assert np.abs(off / fit.error[codes]).max() < SURE
+
+
+def test_rounding_is_that_of_levels_in_noise():
+    rng = np.random.default_rng(2)
+    level = np.linspace(0, 1, 9)
+    for noise_dn in (0.15, 0.3, 0.5):
+        read = np.rint(level + noise_dn * rng.standard_normal((200_000, 9)))
+        assert rounding_error(level, np.array(noise_dn)) == pytest.approx(read.mean(axis=0) - level, abs=0.005)
+    assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
+    assert rounding_rms(0.6) < 1e-3
+
+
+def test_the_monitor_pixels_that_a_tilted_screen_shows_are_counted():
+    """A detector over the screen's edge: what it sees of the screen, and no more."""
+    q = np.array([math.cos(0.02), math.sin(0.02), 0.0, 0.0])
+    monitor = monitor_camera((640, 480), 57.65, 120, np.array([1.0, 0, 0, 0]))
+    geometry = BenchGeometry(monitor, monitor_camera((400, 400), 13, 25, q))
+    area = monitor_area(geometry, slice(0, 400), slice(0, 400))
+    y, x = np.mgrid[0:480, 0:640].astype(float)
+    seen = np.stack(geometry.to_tracker(x.ravel(), y.ravel()))
+    inside = ((seen > -0.5) & (seen < 399.5)).all(axis=0).sum()
+    assert area == pytest.approx(inside, rel=3e-3)

@@ -1,0 +1,250 @@
+"""A sensor from its data sheet and from its own frames: what comes out is what went in, within the errors that are stated."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from PIL import Image
+
+from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.sensor import import_emva, measure_sensor, write_sensor
+from hilstar.server.bench.build import bench_optics
+from hilstar.server.bench.config import read_config
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import DetectorSettings
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import run_hilstar_here
+
+SIZE_PX = (256, 200)
+SHAPE = (200, 256)
+# Nine quantities, errors of their own pixels: 4 sigmas are one of 16 000. Seeds are fixed, so this is a margin, not a flake.
+SIGMAS = 4.0
+LEVELS_E = (1500.0, 4000.0, 8000.0, 14_000.0, 20_000.0, 24_000.0, 27_000.0, 32_000.0, 40_000.0)
+SENSOR = DetectorSettings(
+    gain_e_per_dn=1.5, bits=16, offset_dn=200.0, read_noise_e=6.0, prnu=0.02, dark_e_per_s=203.0, dsnu_e_per_s=30.0,
+    dsnu_e=5.0, full_well_e=30_000.0, device_seed=3,
+)  # fmt: skip
+SHEET = """quantity,value,unit
+# A camera of 12 bits.
+K,0.25,DN/e-
+sigma_d,6.2,e-
+mu_e.sat,10500,e-
+DSNU1288,1.4,e-
+PRNU1288,0.5,%
+mu_I,12,e-/s
+T_d,7.5,K
+temperature,35,degC
+bits,12,bit
+mu_y.dark,30,DN
+SNRmax,40,dB
+eta@530nm,64,%
+eta@450 nm,0.55,1
+"""
+
+
+def write_frames(
+    folder: Path, settings: DetectorSettings, levels_e, darks_s=(0.01, 5.0, 20.0)
+) -> tuple[list[Path], list[Path]]:
+    """Flats of 0.1 s and darks, two of each, as FITS with EXPTIME."""
+    detector, rng = Detector(settings, SIZE_PX), np.random.default_rng(7)
+    flats = [(level_e, 0.1) for level_e in levels_e for _ in range(2)]
+    darks = [(0.0, seconds) for seconds in darks_s for _ in range(2)]
+    named: list[Path] = []
+    for number, (level_e, seconds) in enumerate([*flats, *darks]):
+        named.append(folder / f"frame_{number:03}.fits")
+        frame = detector.expose(np.full(SHAPE, level_e), seconds, rng)
+        fits.PrimaryHDU(frame, fits.Header({"EXPTIME": seconds})).writeto(named[-1])
+    return named[: len(flats)], named[len(flats) :]
+
+
+def test_frames_of_the_virtual_detector_give_its_settings_back(tmp_path):
+    found = measure_sensor(*write_frames(tmp_path, SENSOR, LEVELS_E))
+    for key in ("gain_e_per_dn", "read_noise_e", "prnu", "dsnu_e", "dark_e_per_s", "dsnu_e_per_s", "offset_dn"):
+        assert found.keys[key] == pytest.approx(getattr(SENSOR, key), abs=SIGMAS * found.sigmas[key]), key
+        assert found.sigmas[key] < 0.02 * found.keys[key], key
+    # The flat before saturation, of levels 3000 e- apart.
+    assert found.keys["full_well_e"] == pytest.approx(30_000.0, abs=4000.0)
+    assert found.keys["bits"] == math.ceil(math.log2(200 + 30_000 / 1.5 + 60))
+
+
+@pytest.mark.parametrize(("key", "in_extension"), [("EXPOSURE", False), ("EXPTIME", True), ("EXPOINUS", False)])
+def test_exposures_are_read_wherever_they_stand(tmp_path, key, in_extension):
+    """The same frames with their exposure under another keyword, or in a header that fpack's image has."""
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    expected = measure_sensor(flats, darks)
+    for path in (*flats, *darks):
+        with fits.open(path) as hdus:
+            seconds, frame = hdus[0].header["EXPTIME"], hdus[0].data.copy()
+        scale = 1e6 if key == "EXPOINUS" else 1.0
+        kind = fits.CompImageHDU if in_extension else fits.PrimaryHDU
+        kind(frame, fits.Header({key: seconds * scale})).writeto(path, overwrite=True)
+    found = measure_sensor(flats, darks)
+    assert found.keys == pytest.approx(expected.keys)
+    assert "dark_e_per_s" in found.keys
+
+
+def test_darks_of_unknown_exposures_are_no_repeats_of_one_level(tmp_path):
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    for path in (*flats, *darks):
+        fits.delval(path, "EXPTIME")
+    with pytest.raises(InputError, match=r"--darks: their means differ by .* DN, and no header says their exposures.*EXPTIME"):
+        measure_sensor(flats, darks)
+    # Darks of one exposure are repeats, whatever it was.
+    assert "dark_e_per_s" not in measure_sensor(flats, darks[:2]).keys
+
+
+def test_frames_of_which_some_say_an_exposure_are_refused(tmp_path):
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    for path in darks[:2]:
+        fits.delval(path, "EXPTIME")
+    with pytest.raises(InputError, match="--darks: some frames say no exposure and some do"):
+        measure_sensor(flats, darks)
+
+
+def test_frames_by_plain_numpy_give_back_what_made_them(tmp_path):
+    gain, read_e, prnu = 2.5, 12.0, 0.01
+    rng = np.random.default_rng(1)
+    response = 1 + prnu * rng.standard_normal(SHAPE)
+    paths = []
+    for number, level_e in enumerate(np.repeat([0.0, 2000.0, 8000.0, 20_000.0, 40_000.0, 60_000.0], 2)):
+        charge_e = rng.poisson(level_e * response) + read_e * rng.standard_normal(SHAPE)
+        paths.append(tmp_path / f"{number:02}.png")
+        Image.fromarray(np.rint(charge_e / gain + 100).astype(np.uint16)).save(paths[-1])
+    found = measure_sensor(paths[2:], paths[:2])
+    for key, value in {"gain_e_per_dn": gain, "read_noise_e": read_e, "prnu": prnu, "offset_dn": 100.0}.items():
+        assert found.keys[key] == pytest.approx(value, abs=SIGMAS * found.sigmas[key]), key
+        assert found.sigmas[key] < 0.02 * value, key
+    # No pattern in the dark, no saturation, no EXPTIME: none is claimed.
+    assert found.keys["dsnu_e"] < SIGMAS * found.sigmas["dsnu_e"]
+    assert not {"full_well_e", "dark_e_per_s"} & set(found.keys)
+    assert "do not saturate" in " ".join(found.notes)
+    assert "no dark current" in " ".join(found.notes)
+
+
+def test_a_data_sheet_gives_the_keys_in_their_units(tmp_path):
+    (tmp_path / "emva.csv").write_text(SHEET)
+    found = import_emva(tmp_path / "emva.csv")
+    settings = found.settings
+    assert settings.gain_e_per_dn == 4.0  # K is DN/e-
+    assert (settings.read_noise_e, settings.full_well_e, settings.bits, settings.offset_dn) == (6.2, 10_500.0, 12, 30.0)
+    assert (settings.dsnu_e, settings.dsnu_e_per_s) == (1.4, 0.0)  # an offset map, and no rate
+    assert settings.prnu == pytest.approx(0.005)
+    assert settings.dark_factor == 1.0
+    warmer = DetectorSettings(**{**found.keys, "temperature_k": 308.15 + 7.5})
+    assert warmer.dark_factor == pytest.approx(2.0, rel=1e-12)
+    assert found.efficiency == ((450.0, 0.55), (530.0, pytest.approx(0.64)))
+    assert found.notes == ("not used: SNRmax",)
+
+
+def test_json_says_what_csv_says(tmp_path):
+    (tmp_path / "emva.csv").write_text(SHEET)
+    rows = [line.split(",") for line in SHEET.splitlines()[1:] if not line.startswith("#")]
+    objects = [{"quantity": name, "value": float(value), "unit": unit} for name, value, unit in rows]
+    (tmp_path / "emva.json").write_text(json.dumps(objects))
+    assert import_emva(tmp_path / "emva.json") == import_emva(tmp_path / "emva.csv")
+
+
+def test_photon_transfer_of_an_imported_sensor_gives_its_sheet_back(tmp_path):
+    (tmp_path / "emva.csv").write_text(SHEET.replace("K,0.25,DN/e-", "1/K,0.8,e-/DN").replace("bits,12", "bits,16"))
+    sheet = import_emva(tmp_path / "emva.csv")
+    found = measure_sensor(*write_frames(tmp_path, sheet.settings, (800.0, 2000.0, 4000.0, 6000.0, 9000.0)))
+    for key in ("gain_e_per_dn", "read_noise_e", "prnu", "dsnu_e", "dark_e_per_s"):
+        assert found.keys[key] == pytest.approx(sheet.keys[key], abs=SIGMAS * found.sigmas[key]), key
+
+
+def test_a_bench_takes_the_tables_that_are_written(tmp_path):
+    (tmp_path / "emva.csv").write_text(SHEET)
+    files = write_sensor(tmp_path / "camera.toml", import_emva(tmp_path / "emva.csv"), "a test")
+    assert [file.name for file in files] == ["camera.toml", "camera_qe.csv", "camera_curves.png", "camera_curves.svg"]
+    assert all(file.is_file() for file in files)
+    _, tables = files[0].read_text().split("[tracker]\n")
+    bench = SMALL_BENCH.replace('quantum_efficiency = "ccd47-20"\n', "").replace(
+        "[tracker]\n", "[tracker]\n" + tables.split("[")[0]
+    )
+    (tmp_path / "bench.toml").write_text(bench + "[" + tables.split("[")[1])
+    tracker = read_config(tmp_path / "bench.toml").tracker
+    for key, value in import_emva(tmp_path / "emva.csv").keys.items():
+        assert getattr(tracker.detector, key) == pytest.approx(value, rel=1e-5), key  # six digits
+    assert bench_optics(tracker, tmp_path).quantum_efficiency(np.array([490.0])) == pytest.approx(0.595)
+
+
+@pytest.mark.parametrize(
+    ("sheet", "words"),
+    [
+        ("sigma_d,6,e-", "has no K"),
+        ("K,0.25,e-/DN", "emva.csv:2: K = 0.25 e-/DN; write it above 0 in dn/e-"),
+        ("K,0,DN/e-", "above 0"),
+        ("K,much,DN/e-", "is not a finite number"),
+        ("K,0.25,DN/e-\neta,60,%", "eta@530nm"),
+        ("K,0.25,DN/e-\neta@530nm,140,%", "emva.csv: eta@530nm = 140 %; write it from 0 to 100 %"),
+        ("K,0.25,DN/e-\neta@530nm,40,%\neta@530nm,44,%", "a wavelength twice"),
+        ("K,0.25,DN/e-\nbits,40,bit", "emva.csv: bits = 40; write a number from 1 to 16"),
+    ],
+)
+def test_a_sheet_that_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch, sheet, words):
+    monkeypatch.chdir(tmp_path)
+    Path("emva.csv").write_text("quantity,value,unit\n" + sheet + "\n")
+    result = run_hilstar_here("sensor", "import", "emva.csv", "-o", "sensor.toml")
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    flats, darks = ([path.name for path in paths] for paths in write_frames(tmp_path, SENSOR, LEVELS_E[:5]))
+    result = run_hilstar_here("sensor", "measure", *flats, "--darks", *darks, "-o", "sensor.toml", "--json")
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert told["keys"]["gain_e_per_dn"] == pytest.approx(1.5, rel=0.02)
+    assert "gain_e_per_dn = 1.5" in Path("sensor.toml").read_text()
+    for wrong, words in (
+        ((*flats[:3], "--darks", *darks), "3 frames; give two of each"),
+        ((*flats, "--darks", darks[0], darks[-1]), "EXPTIME is not that of"),
+        ((*darks, "--darks", *flats), "no noise that grows with light"),
+    ):
+        result = run_hilstar_here("sensor", "measure", *wrong, "-o", "other.toml")
+        assert result.returncode == 2
+        assert words in result.stderr
+        assert not Path("other.toml").exists()
+
+
+SPELLED = {
+    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {"gain_e_per_dn": 4, "read_noise_e": 2.5, "full_well_e": 10500},
+    "K,0.25,ADU/e-\nσ_{d},0.65,ADU\nDSNU_1288,0.2,counts": {"gain_e_per_dn": 4, "read_noise_e": 2.6, "dsnu_e": 0.8},
+    "sigma_d,0.65,DN\nsigma_d,2.6,e-\nK,0.25,DN/e-": {"gain_e_per_dn": 4, "read_noise_e": 2.6},
+    "K,0.25,DN/e−\nµ_I,3,e-/pixel/s\nTemperature,−10,°C": {"gain_e_per_dn": 4, "dark_e_per_s": 3, "temperature_k": 263.15},
+    "K,0.25,LSB/electron\nmu_I.mean,0.5,DN/s\nmu_I.mean,2,e-/(pixel s)": {"gain_e_per_dn": 4, "dark_e_per_s": 2},
+    "K,0.25,DN/e-\nK,0.25,DN/e-\n1/K,4.02,e-/DN": {"gain_e_per_dn": 4},
+}
+
+
+@pytest.mark.parametrize("rows", SPELLED)
+def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, rows):
+    (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
+    sensor = import_emva(tmp_path / "sheet.csv")
+    keys = {key: value for key, value in sensor.keys.items() if key != "dark_reference_temperature_k"}
+    assert keys == pytest.approx(SPELLED[rows])
+    assert sensor.notes == ()
+    assert [nm for nm, _ in sensor.efficiency] == ([530] if "530" in rows else [])
+
+
+TWO_VALUES = {
+    "K,0.25,DN/e-\nK,0.5,DN/e-\nsigma_d,2.5,e-": ":3: K makes gain_e_per_dn 2, and line 2 has K for 4; leave one of them",
+    "K,0.25,DN/e-\n1/K,5,e-/DN": ":3: 1/K makes gain_e_per_dn 5, and line 2 has K for 4",
+    "K,0.25,DN/e-\nsigma_d,2.5,e-\nσ_d,2.6,e⁻": ":4: σ_d makes read_noise_e 2.6, and line 3 has sigma_d for 2.5",
+    "sigma_d,1.2,DN\nsigma_d,2.5,e-\nK,0.25,DN/e-": ":2: sigma_d makes read_noise_e 4.8, and line 3 has sigma_d for 2.5",
+}
+
+
+@pytest.mark.parametrize("rows", TWO_VALUES)
+def test_a_quantity_with_two_values_is_refused(tmp_path, rows):
+    (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
+    with pytest.raises(InputError) as refusal:
+        import_emva(tmp_path / "sheet.csv")
+    assert TWO_VALUES[rows] in str(refusal.value)

@@ -1,0 +1,121 @@
+"""Warm-up from planted curves of white: when it is stable, the drift that remains, and how often the stated errors hold."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.warm_up import MAX_TAU, STABLE, WarmUp, judge_warm_up, watch_white
+from tests.support.fake_clock import FakeClock
+
+CHANGE, TAU_S = 0.04, 200.0
+STABLE_S = TAU_S * math.log(CHANGE * -math.expm1(-600 / TAU_S) / STABLE)  # its change in ten minutes is 0.2 % then
+EVERY_S, READINGS = 10.0, 120
+TRIALS, HELD = 60, 0.86  # share of trials within two stated errors: 0.95 is expected, and 3 sigma of counting are 0.085
+
+
+def planted(kind: str, noise: float, seed: int = 0, readings: int = READINGS) -> WarmUp:
+    """A planted curve, with relative noise of each reading, judged."""
+    t_s: FloatArray = np.arange(readings, dtype=np.float64) * EVERY_S
+    curves: dict[str, FloatArray] = {
+        "exponential": 1 + CHANGE * np.exp(-t_s / TAU_S),
+        "brightening": 1 - CHANGE * np.exp(-t_s / TAU_S),
+        "none": np.ones(readings),
+        "never": 1 - t_s / 60_000,  # 1 % in ten minutes
+        "slow": 1 + 0.05 * np.exp(-t_s / 3000),
+        "step": 1 + 0.01 * (t_s > 0.4 * t_s[-1]),
+        "late step": 1 + 0.01 * (t_s > 0.9 * t_s[-1]),
+        "two": 1 + 0.05 * np.exp(-t_s / 40) + 0.02 * np.exp(-t_s / 300),
+    }
+    scattered = 1 + noise * np.random.default_rng(seed).standard_normal(readings)
+    return judge_warm_up(t_s, np.asarray(812 * curves[kind] * scattered, dtype=np.float64))
+
+
+@pytest.mark.parametrize("kind", ["exponential", "brightening"])
+def test_an_exponential_is_found_with_its_time_to_stable_white(kind: str) -> None:
+    found = planted(kind, 0.0)
+    assert found.law == "exponential" and found.is_stable
+    assert found.stable_after_s == pytest.approx(
+        STABLE_S, abs=10.0
+    )  # where white brightens, "relative to white" differs a little
+    assert found.tau_s == pytest.approx(TAU_S, rel=1e-3)
+    true = -100 * 3600 * CHANGE / TAU_S * math.exp(-(READINGS - 1) * EVERY_S / TAU_S)
+    assert found.drift_percent_per_h == pytest.approx(true if kind == "exponential" else -true, rel=0.01)
+
+
+def test_a_warm_monitor_is_stable_from_the_first_reading_on() -> None:
+    found = planted("none", 2e-4)
+    assert (found.is_stable, found.stable_after_s, found.stable_after_error_s) == (True, 0.0, 0.0)
+    assert abs(found.drift_percent_per_h) < 3 * found.drift_error_percent_per_h < 0.1
+
+
+@pytest.mark.parametrize(("kind", "drift_percent_per_h"), [("never", -6.12), ("slow", -4.01)])
+def test_a_drift_that_does_not_end_is_not_called_stable(kind: str, drift_percent_per_h: float) -> None:
+    found = planted(kind, 2e-4)
+    assert not found.is_stable and found.stable_after_s > READINGS * EVERY_S
+    assert abs(found.drift_percent_per_h - drift_percent_per_h) < 3 * found.drift_error_percent_per_h < 0.6
+    assert "not" in found.line
+
+
+def test_noise_of_a_fifth_of_a_percent_leaves_the_stated_errors_true() -> None:
+    true = -100 * 3600 * CHANGE / TAU_S * math.exp(-(READINGS - 1) * EVERY_S / TAU_S)
+    trials = [planted("exponential", 2e-3, seed) for seed in range(TRIALS)]
+    assert np.mean([abs(each.stable_after_s - STABLE_S) < 2 * each.stable_after_error_s for each in trials]) > HELD
+    assert np.mean([abs(each.drift_percent_per_h - true) < 2 * each.drift_error_percent_per_h for each in trials]) > HELD
+    assert np.median([each.noise for each in trials]) == pytest.approx(2e-3, rel=0.05)
+
+
+def test_what_noise_hides_is_not_called_stable() -> None:
+    assert sum(planted("never", 2e-3, seed, readings=40).is_stable for seed in range(TRIALS)) < 0.05 * TRIALS
+    short = planted("none", 2e-3, readings=20)
+    assert not short.is_stable and short.ahead_error > STABLE / 2
+
+
+def test_readings_before_a_step_are_left_out() -> None:
+    found = planted("step", 2e-4)
+    assert found.is_stable and found.from_s > 0.4 * (READINGS - 1) * EVERY_S
+    assert abs(found.drift_percent_per_h) < 3 * found.drift_error_percent_per_h
+    late = planted("late step", 2e-4)
+    assert (late.law, late.is_stable, math.isinf(late.stable_after_s)) == ("none", False, True)
+
+
+def test_a_fast_start_is_left_out_before_a_slow_exponential() -> None:
+    found = planted("two", 1e-5)
+    assert found.is_stable and found.from_s > 0
+    assert found.stable_after_s == pytest.approx(300 * math.log(0.02 * -math.expm1(-2) / STABLE), abs=5.0)
+
+
+def test_white_is_watched_until_it_is_stable_on_the_given_clock() -> None:
+    clock, rng = FakeClock(), np.random.default_rng(3)
+
+    def read() -> float:
+        clock.sleep(0.5)  # an exposure
+        return float(1 + CHANGE * math.exp(-clock.now_ns() / 1e9 / TAU_S) + 1e-4 * rng.standard_normal())
+
+    t_s, light = watch_white(read, clock.now_ns, clock.sleep)
+    assert np.diff(t_s) == pytest.approx(EVERY_S) and len(t_s) == len(light)
+    found = judge_warm_up(t_s, light)
+    assert found.is_stable and STABLE_S < t_s[-1] < STABLE_S + 100
+    assert abs(found.stable_after_s - STABLE_S) < 3 * found.stable_after_error_s + 1
+
+
+def test_watching_ends_at_the_longest_time_and_refuses_a_dark_reading() -> None:
+    clock = FakeClock()
+    t_s, _ = watch_white(lambda: 1 + clock.now_ns() / 1e12, clock.now_ns, clock.sleep, longest_s=300.0)
+    assert t_s[-1] == pytest.approx(300, abs=EVERY_S)
+    with pytest.raises(InputError, match="white reads 0"):
+        watch_white(lambda: 0.0, clock.now_ns, clock.sleep)
+    with pytest.raises(InputError, match="12 or more"):
+        judge_warm_up(np.arange(5.0), np.ones(5))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_time_constant_is_one_that_ends_what_is_tried(seed: int) -> None:
+    """A curve that still bends at the end fits an exponential without end: that law is no finding."""
+    t_s = np.arange(60) * 10.0
+    bent = 1 + 1e-5 * t_s - 2e-9 * t_s**2
+    scattered = bent * (1 + 1e-4 * np.random.default_rng(seed).standard_normal(len(t_s)))
+    found = judge_warm_up(t_s, np.asarray(scattered, dtype=np.float64))
+    assert found.law != "exponential" or found.tau_s < 0.98 * MAX_TAU * float(t_s[-1])

@@ -1,0 +1,118 @@
+"""Plans: what is refused, in one line, and what a design and its parameters make of a case's number."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_matrix
+from hilstar.instruments.campaign.cases import CaseMaker
+from hilstar.instruments.campaign.plan import Design, read_plan
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.campaigns import write_campaign
+from tests.support.commands import assert_refused, run_hilstar_here
+
+PSF: dict[str, Any] = {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0}
+
+WRONG = {
+    "no bench": ({}, {"bench": None}, ["bench", "missing"]),
+    "unknown key": ({}, {"case": 3}, ["unknown key case", "cases"]),
+    "unknown sampling": ({}, {"sampling": "random"}, ["sampling", "latin-hypercube"]),
+    "no cases": ({}, {"cases": None}, ["cases"]),
+    "negative cases": ({}, {"cases": -1}, ["cases", "-1"]),
+    "no such bench": ({}, {"bench": "other.toml"}, ["other.toml"]),
+    "unknown bench key": ({"key": "tracker.psf_sigma"}, {}, ["tracker.psf_sigma", "psf_sigma_px"]),
+    "beyond the bench's limits": ({"minimum": 0.01}, {}, ["tracker.psf_sigma_px", "0.01"]),
+    "no table": ({"key": "psf"}, {}, ["psf"]),
+    "turned round": ({"minimum": 2.0}, {}, ["smaller one first"]),
+    "half a range": ({"maximum": None}, {}, ["minimum"]),
+    "neither": ({"minimum": None, "maximum": None}, {}, ["values"]),
+    "both": ({"values": [1.0]}, {}, ["either"]),
+    "log of 0": ({"key": "rate_deg_s.x", "minimum": 0, "maximum": 1, "scale": "log"}, {}, ["log", "above 0"]),
+    "grid without steps": ({}, {"sampling": "grid"}, ["steps"]),
+    "rate of text": ({"key": "rate_deg_s.x", "minimum": None, "maximum": None, "values": ["fast"]}, {}, ["fast"]),
+    "display's key, no display": ({"key": "monitor.refresh_hz", "minimum": 50, "maximum": 60}, {}, ["display"]),
+    "index beyond": ({"key": "tracker.psf_sigma_px.7"}, {}, ["0 to 1"]),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_wrong_with_a_plan_is_said_in_one_line_with_exit_code_2(tmp_path: Path, wrong: str) -> None:
+    varied, keys, words = WRONG[wrong]
+    plan = write_campaign(tmp_path, PSF | varied, **keys)
+    assert_refused(run_hilstar_here("campaign", plan, "-o", tmp_path / "out"), 2, *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_log_or_a_field_that_is_not_said_is_asked_for(tmp_path: Path) -> None:
+    for attitudes, word in (({"kind": "field"}, "radec_deg"), ({"kind": "log"}, "log"), ({"radec_deg": [1, 2]}, "field")):
+        plan = write_campaign(tmp_path, attitudes=attitudes)
+        with pytest.raises(InputError, match=word):
+            read_plan(plan)
+
+
+@pytest.mark.parametrize("sampling", ["sobol", "latin-hypercube", "grid"])
+def test_a_designs_points_do_not_depend_on_how_they_are_asked_for(sampling: Any) -> None:
+    levels = [3, 4] if sampling == "grid" else [1, 1]
+    whole = Design(sampling, 5, 40, 3, levels).points(0, 40)
+    other = Design(sampling, 5, 40, 3, levels)
+    parts = [other.points(30, 40), other.points(0, 7), other.points(7, 30)]
+    assert np.array_equal(np.concatenate([parts[1], parts[2], parts[0]]), whole)
+    assert whole.shape == (40, 5) and whole.min() >= 0 and whole.max() < 1
+    assert not np.array_equal(Design(sampling, 6, 40, 3, levels).points(0, 40), whole)
+
+
+def test_a_latin_hypercube_has_one_case_in_each_stratum_and_a_grid_each_node_once() -> None:
+    cube = Design("latin-hypercube", 1, 50, 3, [1]).points(0, 50)
+    assert all(sorted(np.floor(50 * column)) == list(range(50)) for column in cube.T)
+    grid = Design("grid", 1, 12, 0, [3, 4]).points(0, 12)
+    assert len({tuple(np.floor(point * [3, 4])) for point in grid}) == 12
+
+
+def test_values_are_those_of_the_plan_and_reach_the_bench(tmp_path: Path) -> None:
+    plan = write_campaign(
+        tmp_path,
+        PSF | {"steps": 3},
+        {"key": "tracker.psf_sigma_px.1", "values": [0.7]},
+        {"key": "tracker.detector.bits", "minimum": 8, "maximum": 12, "steps": 2},
+        {"key": "sky.spectrum", "values": ["pickles", "blackbody"]},
+        {"key": "noise_seed", "values": [5]},
+        sampling="grid",
+        cases=None,
+    )
+    maker = CaseMaker(read_plan(plan), read_bench_file(tmp_path / "bench.toml"), tmp_path)
+    design = Design("grid", 7, 12, 3, [3, 1, 2, 2, 1])
+    cases = [maker.case(k, point) for k, point in enumerate(design.points(0, 12))]
+    trackers = [maker.bench(case).config.tracker for case in cases]
+    assert sorted({tracker.psf_sigma_px for tracker in trackers}) == [(0.5, 0.7), (0.75, 0.7), (1.0, 0.7)]
+    assert {tracker.detector.bits for tracker in trackers} == {8, 12}
+    assert {maker.bench(case).config.sky.spectrum for case in cases} == {"pickles", "blackbody"}
+    assert {case.noise_seed for case in cases} == {5}
+    assert len({maker.bench(case).sha256 for case in cases}) == 12
+
+
+# Of 4000 even directions: the mean of each component has a sigma of sqrt(1/3 / 4000) = 0.009, and five of them are allowed.
+EVEN = 5 * math.sqrt(1 / 3 / 4000)
+
+
+def test_attitudes_are_even_over_the_sky_and_within_the_field(tmp_path: Path) -> None:
+    file = read_bench_file(write_campaign(tmp_path).parent / "bench.toml")
+    rng = np.random.default_rng(1)
+    maker = CaseMaker(read_plan(write_campaign(tmp_path, PSF)), file, tmp_path)
+    sky = [to_matrix(maker.case(k, rng.random(4)).first.q_icrs_to_cam)[2] for k in range(4000)]
+    assert np.abs(np.mean(sky, axis=0)).max() < EVEN
+    assert np.abs(np.mean(np.square(sky), axis=0) - 1 / 3).max() < EVEN
+    field = {"kind": "field", "radec_deg": [84.0, -89.0], "radius_deg": 3.0, "roll_deg": [10, 10]}
+    maker = CaseMaker(read_plan(write_campaign(tmp_path, PSF, attitudes=field)), file, tmp_path)
+    dec, ra = math.radians(-89), math.radians(84)
+    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    looks = np.array([to_matrix(maker.case(k, rng.random(4)).first.q_icrs_to_cam)[2] for k in range(500)])
+    off_deg = np.degrees(np.arccos(np.clip(looks @ middle, -1, 1)))
+    assert off_deg.max() <= 3.0 + 1e-6
+    # Even over a small cap: half of the cases are beyond radius / sqrt 2; 500 of them have a sigma of 0.022.
+    assert abs((off_deg > 3 / math.sqrt(2)).mean() - 0.5) < 5 * 0.5 / math.sqrt(500)

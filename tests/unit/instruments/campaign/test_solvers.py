@@ -1,0 +1,137 @@
+"""Solvers: a real one solves from the pixels alone, and each way to fail is a reason in the case's row."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, multiply
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.campaign.cases import attitude_error_arcsec
+from hilstar.instruments.campaign.plan import Centroiding
+from hilstar.instruments.campaign.solvers import SolverFault, choose_solver, printed_attitude
+from hilstar.instruments.simulate.simulator import Exposure, Simulator
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import ROOT
+from tests.support.campaigns import write_campaign
+from tests.support.waiting import PATIENCE_S, wait_for
+
+EXAMPLES = ROOT / "examples"
+# A dozen stars with centroids to 0.03 px of 134 arcsec: 4 / sqrt 12 arcsec an axis; five sigma, and the field's lever for roll.
+CROSS_LIMIT_ARCSEC = 5 * 4 / np.sqrt(12)
+ROLL_LIMIT_ARCSEC = 30 * CROSS_LIMIT_ARCSEC
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("solvers")
+    write_campaign(folder)
+    simulator = Simulator(read_bench_file(folder / "bench.toml"))
+    motion = simulator.view(from_radec_roll_deg(84.057, -1.2, 30.0), np.zeros(3))
+    yield simulator, simulator.expose(motion, np.random.default_rng(1))
+    simulator.close()
+
+
+def solver(text: str, folder: Path = EXAMPLES, timeout_s: float = 60.0):
+    return choose_solver(text, Centroiding(), folder, timeout_s)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "centroids",
+        "python:star_solver:solve",
+        pytest.param(f"{sys.executable} star_solver.py {{image}} {{focal_length_px}}", marks=pytest.mark.e2e),
+    ],
+)
+def test_a_solver_finds_the_commanded_attitude_in_the_pixels(seen: tuple[Simulator, Exposure], text: str) -> None:
+    simulator, exposure = seen
+    answer = solver(text).solve(exposure, simulator)
+    assert answer.q_icrs_to_cam is not None
+    error_arcsec = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
+    assert np.abs(error_arcsec[:2]).max() < CROSS_LIMIT_ARCSEC and abs(error_arcsec[2]) < ROLL_LIMIT_ARCSEC
+    assert np.abs(error_arcsec).max() > 0
+
+
+def test_an_error_is_the_rotation_vector_from_the_commanded_to_the_reported_attitude() -> None:
+    q, turn_arcsec = from_radec_roll_deg(10, 20, 30), np.array([3.0, -2.0, 70.0])
+    reported = -multiply(from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD), q)
+    assert attitude_error_arcsec(q, reported) == pytest.approx(turn_arcsec, abs=1e-7)  # float64 on 1e6 arcsec
+
+
+def test_noise_alone_has_no_attitude_and_centroids_say_so(seen: tuple[Simulator, Exposure]) -> None:
+    simulator, exposure = seen
+    dark = np.random.default_rng(2).normal(100, 5, exposure.dn.shape).astype(np.uint16)
+    blind = Exposure(exposure.view, dark, exposure.mean_e, exposure.truth)
+    for text in ("centroids", "python:star_solver:solve"):
+        answer = solver(text).solve(blind, simulator)
+        assert answer.q_icrs_to_cam is None and answer.why
+
+
+FAULTS = {
+    "false {image}": "code 1",
+    "sh -c 'echo bad luck >&2; exit 3' {image}": "code 3: bad luck",
+    "sh -c 'cat $0 >/dev/null && cat no-such-file' {image}": "no-such-file",
+    "no-such-program {image}": "cannot be started",
+    "sh -c 'sleep 5' {image}": "longer than 0.3 s",
+    "echo 1 1 1 1 {png} ": "no attitude",
+    "sh -c 'echo 1 1 1 1' {image}": "norm 2",
+}
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("text", FAULTS)
+def test_a_command_that_fails_says_how(seen: tuple[Simulator, Exposure], text: str) -> None:
+    simulator, exposure = seen
+    try:
+        said = solver(text, timeout_s=0.3 if "sleep" in text else PATIENCE_S).solve(exposure, simulator).why
+    except SolverFault as fault:
+        said = str(fault)
+    assert FAULTS[text] in said and "hilstar-solver" not in said
+
+
+def test_what_a_program_prints_is_read_from_its_last_line_with_an_attitude() -> None:
+    assert printed_attitude("loading 4 files\n0.5 0.5 -0.5 0.5\ndone in 3 s\n") == [0.5, 0.5, -0.5, 0.5]
+    assert printed_attitude('{"q": [1, 0, 0, 0], "stars": 7}\n') == [1, 0, 0, 0]
+    assert printed_attitude("[1e0, -0.0, 0, 0]") == [1, 0, 0, 0]
+    assert printed_attitude("1 2 3\n") is None and printed_attitude("") is None and printed_attitude('{"q": null}') is None
+
+
+@pytest.mark.parametrize("line", ['{"q": 5}', '{"q": {"w": 1}}', '{"q": [1, 0, 0]}', '{"q": "north"}'])
+def test_an_answer_that_is_no_quaternion_is_a_fault_of_the_solver(seen: tuple[Simulator, Exposure], line: str) -> None:
+    simulator, exposure = seen
+    with pytest.raises(SolverFault, match="four numbers"):
+        solver(f"sh -c 'cat $0 >/dev/null; echo \"$1\"' {{image}} '{line}'", timeout_s=PATIENCE_S).solve(exposure, simulator)
+
+
+def test_what_is_nested_too_deep_is_no_answer() -> None:
+    assert printed_attitude('{"q":' * 20_000) is None
+
+
+NO_SOLVERS = ["solve me", "python:nothing", "python:no_such_module:f", "python:math:nothing", "a 'b {image}"]
+
+
+@pytest.mark.parametrize("text", NO_SOLVERS)
+def test_what_is_no_solver_is_refused_before_the_first_case(text: str) -> None:
+    with pytest.raises(InputError, match="--solver"):
+        solver(text)
+
+
+@pytest.mark.parametrize("stream", ["1", "2"])
+def test_a_solver_that_keeps_printing_is_ended_at_the_bound_with_its_children(
+    seen: tuple[Simulator, Exposure], tmp_path: Path, stream: str
+) -> None:
+    simulator, exposure = seen
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    text = f"sh -c 'sleep 1000 & echo $! > {tmp_path}/child; exec yes {{image}} >&{stream}'"
+    with pytest.raises(SolverFault, match="printed more than 4 MB"):
+        solver(text, timeout_s=PATIENCE_S).solve(exposure, simulator)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 50_000
+    child = Path(f"/proc/{(tmp_path / 'child').read_text().strip()}/stat")
+    # Without an init of its own a container keeps what has ended as a zombie.
+    wait_for(lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z", "the solver's child to end")

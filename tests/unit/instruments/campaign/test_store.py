@@ -1,0 +1,107 @@
+"""The store: what a kill leaves behind is mended, rows come back in order, and the table's bytes are the rows' alone."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import zlib
+from pathlib import Path
+
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.instruments.campaign import store
+from hilstar.instruments.campaign.store import About, Directory, Journal, file_sha256, schema_of, write_table
+from tests.support.campaigns import read_columns
+from tests.support.damage import NO_JSON
+
+
+def row(case: int) -> dict[str, object]:
+    return {"case": case, "why": "ä\n", "value": 0.1 * case, "whole": 3.0, "none": None}
+
+
+COLUMNS = {"case": "int64", "why": "text", "value": "float64", "whole": "float64", "none": "float64"}
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "BLOCK_CASES", 8)
+
+
+def test_rows_survive_a_cut_at_any_byte_and_none_is_there_twice(tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    journal = Journal(whole, 5)
+    journal.append([row(case) for case in (3, 0, 1)])
+    journal.close()
+    data = (whole / "000000.jsonl").read_bytes()
+    ends = [k + 1 for k, byte in enumerate(data) if byte == 10]
+    for cut in range(len(data) + 1):
+        folder = tmp_path / f"cut{cut}"
+        folder.mkdir()
+        (folder / "000000.jsonl").write_bytes(data[:cut])
+        journal = Journal(folder, 5)
+        kept = sum(end <= cut for end in ends)
+        assert journal.missing(0) == sorted(set(range(5)) - set([3, 0, 1][:kept]))
+        assert journal.append([row(case) for case in (0, 1, 2, 3, 4)]) == 5 - kept
+        assert journal.append([row(2)]) == 0
+        assert journal.rows(0) == [row(case) for case in range(5)]
+        journal.close()
+
+
+def test_a_flipped_byte_costs_its_own_row_alone(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", 6)
+    journal.append([row(case) for case in range(4)])
+    journal.close()
+    path = tmp_path / "j" / "000000.jsonl"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert len(Journal(tmp_path / "j", 6).missing(0)) == 3
+
+
+def test_a_table_is_the_same_bytes_whatever_the_order_and_the_pauses(tmp_path: Path) -> None:
+    found = []
+    for turn in range(3):
+        order = list(range(20))
+        random.Random(turn).shuffle(order)
+        for begin in range(0, 20, 7):
+            journal = Journal(tmp_path / str(turn), 20)
+            journal.append([row(case) for case in order[begin : begin + 7]])
+            journal.close()
+        journal = Journal(tmp_path / str(turn), 20)
+        assert journal.done == 20 and journal.blocks == 3
+        path = tmp_path / f"{turn}.parquet"
+        write_table(path, schema_of(COLUMNS, {"a": "b"}), (journal.rows(block) for block in range(journal.blocks)))
+        found.append(file_sha256(path))
+    assert len(set(found)) == 1
+    columns = read_columns(path)
+    assert columns["case"] == list(range(20)) and columns["value"] == [0.1 * case for case in range(20)]
+    journal.remove()
+    assert not (tmp_path / "2").exists()
+
+
+def test_a_full_block_that_lost_rows_is_refused(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", 3)
+    journal.append([row(case) for case in range(3)])
+    journal.close()
+    path = tmp_path / "j" / "000000.full.jsonl"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match="missing"):
+        Journal(tmp_path / "j", 3).rows(0)
+
+
+@pytest.mark.parametrize("text", [*NO_JSON, b"[]", b'{"case":"1"}', b"{}"])
+def test_a_line_that_is_no_row_is_dropped_though_its_checksum_is_right(tmp_path: Path, text: bytes) -> None:
+    journal = Journal(tmp_path / "j", 6)
+    journal.append([row(case) for case in range(3)])
+    journal.close()
+    with (tmp_path / "j" / "000000.jsonl").open("ab") as file:
+        file.write(b"%08x %s\n" % (zlib.crc32(text), text))
+    assert Journal(tmp_path / "j", 6).missing(0) == [3, 4, 5]
+
+
+@pytest.mark.parametrize("text", NO_JSON)
+def test_a_campaign_file_that_is_none_is_refused(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "campaign.json").write_bytes(text)
+    with contextlib.closing(Directory(tmp_path)) as directory, pytest.raises(InputError, match=r"campaign\.json"):
+        directory.claim(About({}, "", {}, "centroids", False, {}))

@@ -1,0 +1,301 @@
+"""Certificates: intervals that hold the truth, a budget that two ways agree on, and checks that catch what moved."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from hilstar.instruments.certify.assembly import DOT_IMAGES
+from hilstar.instruments.certify.budget import Input, by_trials, first_order, why_they_differ
+from hilstar.instruments.certify.check import compare, take_check
+from hilstar.instruments.certify.estimates import light_deviation, place_errors
+from hilstar.instruments.certify.lens import lens_fit
+from hilstar.instruments.certify.readings import LightReadings, VirtualReader, dot_places, geometry_of, grey_response
+from hilstar.instruments.certify.structure import in_place
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.record.ledger_records import read_head
+from tests.support.benches import bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.planted_certify import BENCH, REGIONS, coverage, coverage_by_images, drawn, plant, stated_lens
+from tests.support.planted_readings import (
+    ARCSEC,
+    DELAY_MS,
+    KINDS,
+    WHITE_E_PER_S,
+    PlantedReader,
+    SmoothField,
+    Truth,
+    supposed,
+    uneven,
+)
+from tests.support.planted_readings import in_place as dots_in_place
+from tests.support.planted_run import write_run
+from tests.support.planted_tracker import Planted, Sizes, scan
+from tests.support.planted_tracker import plant as plant_tracker
+
+BENCHES = 40
+FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
+UNCHANGED = 20
+FEW = 8
+MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)  # of figures that go together in each of FEW benches
+LONGEST = 2.5  # stated over true errors, by the median of FEW benches
+DIRECTION = "[certify.tracker]\ndirection_expanded_arcsec = 0.0\n"
+
+
+def test_intervals_hold_the_truth_of_planted_benches() -> None:
+    held = coverage(KINDS["as supposed"], BENCHES, 7)
+    assert {quantity for quantity, _ in held} >= {"flux", "place_along", "place_across", "attitude_x", "attitude_z", "latency"}
+    assert {region for quantity, region in held if quantity == "flux"} == {"left third", "middle third", "right third"}
+    for where, counted in held.items():
+        assert abs(np.mean(counted.held) - 0.95) < FAR, (where, np.mean(counted.held))
+        assert 1 / LONGEST < counted.ratio < LONGEST, where
+
+
+# What each has wrong where it is hard, and the figures that it moves.
+HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] = {
+    "readings in time": (lambda rng: replace(supposed(rng), lasts_readings=20.0), ("latency", "flux")),
+    "dots over 60 px": (lambda rng: dots_in_place(rng, 60, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
+    "dots over 200 px": (lambda rng: dots_in_place(rng, 200, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
+    "light over 30 px": (lambda rng: uneven(rng, 30, 0.01), ("flux",)),
+}
+
+
+@pytest.mark.parametrize("kind", HARD)
+def test_intervals_hold_the_truth_of_benches_whose_errors_correlate(kind: str) -> None:
+    draw, moved = HARD[kind]
+    held = coverage(draw, FEW, 3)
+    for (quantity, region), counted in held.items():
+        if quantity in moved:
+            assert np.mean(counted.held) > MIN_HELD, (quantity, region)
+            assert counted.ratio < 2 * LONGEST, (quantity, region)
+
+
+def test_codes_that_are_off_by_themselves_widen_the_response_between_those_read() -> None:
+    def rough(rng: np.random.Generator) -> Truth:
+        one = replace(supposed(rng), reading_noise=0.001)
+        light = one.light * (1 + 0.005 * rng.standard_normal(256))
+        return replace(one, light=light / light[-1])
+
+    for (quantity, region), counted in coverage(rough, FEW, 4).items():
+        if quantity == "flux":
+            assert np.mean(counted.held) > MIN_HELD, region
+
+
+def test_places_seen_through_an_unstated_lens_are_not_assessed_and_a_stated_one_counts() -> None:
+    own_lens = KINDS["tracker's own lens"]
+    unstated = coverage(own_lens, 2, 5, tables="")
+    assert {where for where, counted in unstated.items() if not counted.held} == {
+        *((f"place_{axis}", region) for axis in ("along", "across") for region in REGIONS),
+        *((f"attitude_{axis}", "field") for axis in "xyz"),
+    }
+    for where, counted in coverage(own_lens, FEW, 5, tables=stated_lens()).items():
+        assert np.mean(counted.held) > MIN_HELD, where
+
+
+def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
+    rng = np.random.default_rng(8)
+    x, y = (part.ravel() * 20.0 for part in np.meshgrid(np.arange(50.0), np.arange(40.0)))
+    terms = np.stack([np.ones_like(x), x / 500 - 1, y / 400 - 1], axis=1)[None]
+    noise = rng.standard_normal((1, len(x)))
+    found = in_place(x, y, noise, terms)
+    assert found.total == 0
+    assert found.noise_variance == pytest.approx(1, abs=4 * math.sqrt(2 / len(x)))
+    more = noise + math.sqrt(0.3) * SmoothField(80.0, rng)(x, y)
+    found = in_place(x, y, more, terms)
+    # A field of 1000 x 800 px has some thirty places that far apart: their variance is known to a quarter.
+    assert found.total == pytest.approx(0.3, rel=0.75)
+    assert found.mean_length == pytest.approx(80, rel=0.3)
+    # An oblique field fills half of its box.
+    oblique = np.abs(x - 490) / 490 + np.abs(y - 390) / 390 < 1
+    found = in_place(x[oblique], y[oblique], more[:, oblique], terms[:, oblique])
+    assert found.mean_length == pytest.approx(80, rel=0.6)
+
+
+# Of seed 32: their dots are a whole number of tracker pixels apart, nearly, so that all have one phase in a pixel.
+IN_PHASE = (29, 66, 72, 85)
+
+
+@pytest.mark.parametrize("number", IN_PHASE)
+def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
+    file = read_bench_file(path)
+    one = supposed(np.random.default_rng((32, number)))
+    x_px, y_px = dot_places(geometry_of(file))
+    dots = PlantedReader(one, np.random.default_rng((32, number, 2))).dots(x_px, y_px, DOT_IMAGES)
+    places = lens_fit(file, dots, place_errors(file, dots)).at(dots.x_px, dots.y_px)
+    wanted = geometry_of(file).monitor.rays(dots.x_px, dots.y_px)
+    true = (one.tangents(dots.x_px, dots.y_px) - wanted[:, :2] / wanted[:, 2:]) * ARCSEC
+    off = (places.value - true) / np.sqrt((places.noise**2).sum(axis=0))
+    assert np.sqrt((off**2).mean()) < 1.6
+
+
+def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
+    found = coverage_by_images(1, 3)
+    for axis in ("along", "across"):
+        for region in REGIONS:
+            # All but the one at the edge of the field; 0.003 px a star were 0.11 arcsec.
+            assert sorted(found[f"place_{axis}", region].standard)[-2] < 0.02
+    for where, counted in found.items():
+        assert max(abs(np.array(counted.error)) / np.array(counted.standard)) < 5, where
+
+
+def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) -> None:
+    """White of a sparse lattice is ten times as noisy as other codes: its interval is its own, and theirs are not wider."""
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
+    file = read_bench_file(path)
+    codes = np.array([0, 255, 40, 80, 120, 160, 200, 0, 255, 40, 80, 120, 160, 200, 0, 255, 40, 80, 120, 160, 200, 0])
+    shape = np.where(codes == 255, 10.0, 1.0)
+    rng = np.random.default_rng(4)
+    light = (grey_response(file).light[codes] + 1e-3) * 1e6
+    noisy = light * (1 + 1e-4 * shape * np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal()))
+    deviation = light_deviation(file, LightReadings(codes, noisy, np.zeros(len(codes)), noise_shape=shape))
+    sigma = np.linalg.norm(deviation.factors, axis=1) / deviation.value
+    assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
+
+
+def test_three_readings_hold_the_truth_by_their_t() -> None:
+    rng, trials = np.random.default_rng(3), 4000
+    read = rng.normal(0, 1, (trials, 3))
+    held = 0
+    for one in read:
+        error = float(one.std(ddof=1)) / math.sqrt(3)
+        middle = float(one.mean())
+        inputs = [Input("readings", "Student t", "", 1, error, "", 2.0)]
+        found = first_order(lambda z, middle=middle, u=error: middle + u * z[0], inputs)
+        held += bool(found.lower[0] <= 0 <= found.upper[0])
+    assert abs(held / trials - 0.95) < 4 * math.sqrt(0.95 * 0.05 / trials)
+
+
+def test_both_ways_agree_on_what_is_linear_and_say_why_where_it_is_not() -> None:
+    inputs = [Input("a", "normal", "", 2, 1.0, ""), Input("b", "rectangular", "", 1, 1.0, "")]
+    linear = lambda z: np.stack([z[0] @ [1.0, -2.0] + 0.5 * z[1][:, 0]], axis=1)  # noqa: E731
+    bent = lambda z: np.stack([z[0][:, 0] + 0.5 * z[0][:, 0] ** 2], axis=1)  # noqa: E731
+    rng = np.random.default_rng(1)
+    first, drawn_ones = first_order(linear, inputs), by_trials(linear, inputs, rng, 200_000)
+    assert drawn_ones.settled
+    assert drawn_ones.standard == pytest.approx(first.standard, rel=0.05)
+    assert why_they_differ(first, drawn_ones, inputs, 0) == ""
+    first, drawn_ones = first_order(bent, inputs), by_trials(bent, inputs, rng, 200_000)
+    assert drawn_ones.standard[0] > 1.1 * first.standard[0]  # sqrt(1 + 2 / 4)
+    assert "not linear" in why_they_differ(first, drawn_ones, inputs, 0)
+
+
+def test_correlations_within_an_input_count() -> None:
+    both = [Input("a", "normal", "", 1, 1.0, "")]
+    assert first_order(lambda z: z[0] - z[0], both).standard[0] == 0
+
+
+CHANGES = {
+    "brightness": {"white": 1.01},
+    "darker": {"white": 0.99},
+    "shift": {"mount_arcsec": (2.0, 0.0, 0.0)},
+    "roll": {"mount_arcsec": (0.0, 0.0, 2.0)},
+    "gamma": {"gamma": 0.02},
+}
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory):
+    """A planted bench, its readings at its certificate, and a function that checks it with other things planted."""
+    one = dataclasses.replace(drawn(np.random.default_rng(5)), reading_noise=0.002, dot_noise_px=0.02, drift_percent_per_h=0.0)
+    folder = tmp_path_factory.mktemp("check")
+    bench, truth = (read_bench_file(path) for path in plant(folder, one))
+    reference = take_check(bench, VirtualReader(bench, truth, 0))
+
+    def check(seed: int, focus: float = 1.0, **changes: float | tuple[float, float, float]):
+        changed = one
+        for name, value in changes.items():
+            now = getattr(one, name)
+            if isinstance(value, tuple):
+                new = tuple(a + b for a, b in zip(now, value, strict=True))
+            else:
+                new = now * value if name == "white" else now + value
+            changed = dataclasses.replace(changed, **{name: new})
+        as_it_is = read_bench_file(plant(folder, changed)[1])
+        tracker = msgspec.structs.replace(as_it_is.config.tracker, psf_sigma_px=(0.55 * focus, 0.55 * focus))
+        as_it_is = dataclasses.replace(as_it_is, config=msgspec.structs.replace(as_it_is.config, tracker=tracker))
+        return compare(bench, reference, take_check(bench, VirtualReader(bench, as_it_is, seed, 1)))
+
+    return check
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_check_catches_what_moved(checked, change: str) -> None:
+    for seed in range(3):
+        assert not all(each.in_tolerance for each in checked(seed, **CHANGES[change])), change
+
+
+def test_a_check_catches_a_new_focus(checked) -> None:
+    assert [each.quantity for each in checked(1, focus=1.05) if not each.in_tolerance] == ["psf"]
+
+
+def test_a_check_is_quiet_where_nothing_moved(checked) -> None:
+    for seed in range(UNCHANGED):
+        figures = checked(seed)
+        assert all(each.in_tolerance for each in figures), seed
+        assert all(abs(each.value) < 6 * each.standard_uncertainty for each in figures if each.quantity != "psf")
+
+
+def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
+    bench, truth = plant(
+        tmp_path,
+        drawn(np.random.default_rng(5)),
+        '[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n' + DIRECTION,
+    )
+    words = ["certify", str(bench), "-o", str(tmp_path / "out"), "--virtual", str(truth)]
+    done = run_hilstar_here(*words, "--quick", "--json")
+    found = msgspec.json.decode(done.stdout)
+    assert done.returncode == 0
+    assert found["conforms"] is False  # the bench file's delay is 8 ms, the truth's is not
+    assert found["who"] == "A. Tester"
+    figure = next(each for each in found["figures"] if each["quantity"] == "latency")
+    assert figure["lower"] < figure["value"] < figure["upper"]
+    assert figure["contributions"][0]["input"] == "delay"
+    assert (tmp_path / "out" / "index.html").read_text().count("<h2>") > 4
+    assert run_hilstar_here(*words).returncode == 2
+    assert run_hilstar_here(*words, "--check").returncode == 0
+    plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))
+    moved = run_hilstar_here(*words, "--check", "--json")
+    assert moved.returncode == 1
+    assert msgspec.json.decode(moved.stdout)["checks"] == 2
+    again = msgspec.json.decode(run_hilstar_here(*words, "--again", "--quick", "--json").stdout)
+    assert again["replaces"] == found["number"]
+    assert "drift" in {each["name"] for each in again["inputs"]}  # by the checks between
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
+    bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION)
+    words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
+    number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
+    bench.write_text(bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"'))
+    assert run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode == 0
+    assert fits.getheader(tmp_path / "a.fits")["CERTIF"] == number
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0.0,1,0,0,0\n0.1,1,0,0,0\n")
+    words = ("replay", bench, tmp_path / "log.csv", "--headless", "--speed", "max", "--ledger", tmp_path / "run.mcap")
+    assert run_hilstar_here(*words).returncode == 0
+    assert read_head(tmp_path / "run.mcap")["certificate"] == number
+    ledger, telemetry = write_run(
+        tmp_path, planted_run, bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}})
+    )
+    words = ("assess", ledger, telemetry, "-o", tmp_path / "assessed", "--json", "--display-attitudes", "0")
+    part = msgspec.json.decode(run_hilstar_here(*words).stdout)["bench"]
+    assert part["certificate"] == number
+    assert 0 < part["share_of_bias"]["cross"] <= 1
+    assert "could have made" in (tmp_path / "assessed" / "budget.html").read_text()
+    (tmp_path / "out" / "certificate.json").write_text("{}")
+    assert_refused(run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "b.fits"), 2, "is no certificate")
+
+
+@pytest.fixture(scope="module")
+def planted_run() -> Planted:
+    return plant_tracker(scan, Sizes(wild=5, offset_s=0.02), np.random.default_rng(11), seconds=60.0)

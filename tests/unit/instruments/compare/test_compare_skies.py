@@ -1,0 +1,331 @@
+"""Two skies compared star by star: right drivers pass, and each planted fault is named, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hilstar
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.display.render.reference import linear_image
+from hilstar.instruments.compare import MAX_LINES, assert_same_sky, compare
+from hilstar.instruments.compare.report import ChartPanel
+from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG
+from hilstar.instruments.compare.star_fit import star_psf
+from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
+from hilstar.server.bench.frame_files import write_frame_fits, write_truth_csv
+from tests.support.benches import SMALL_BENCH
+
+ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
+FAULT_MAG, FAULT_PX = 0.01, 0.02  # the smallest that must be seen
+# What the comparison itself is off by, of a fault that it measures: what is second order in the shift is under 1e-5, and the
+# light of the GL image is float32, 2e-6 mag and px at the worst (the drivers' test below).
+MEASURED_MAG = MEASURED_PX = 1e-4
+# Two drivers: 2e-6 mag and 1.4e-6 px on all but stars cut by the edge or with a 100 times brighter neighbour. 20 times that.
+DRIVER_MAG = DRIVER_PX = 4e-5
+DRIVER_SHARE = 0.98  # of stars; the others within their own limits
+EDGE_PX = 6.0
+
+
+class Field:
+    """A frame of a real bench whose stars can be changed one by one, drawn again by the same GL."""
+
+    def __init__(self, bench, q=ORION):
+        self.bench = bench
+        self.golden = bench.frame(q)
+        self.sprites = bench.sprites(self.golden.q_icrs_to_cam, bench.stars)
+        self.hip = bench.stars.hip[self.sprites.star]
+        self.x_px, self.y_px = self.sprites.x_px.copy(), self.sprites.y_px.copy()
+        self.flux = self.sprites.data["electrons_per_s"].astype(float)
+
+    def inside(self):
+        """The stars away from the edge and from each other, faintest first."""
+        x, y = self.x_px, self.y_px
+        width, height = self.bench.camera.resolution_px
+        kept = (np.minimum(x, y) > EDGE_PX) & (x < width - 1 - EDGE_PX) & (y < height - 1 - EDGE_PX)
+        near = np.hypot(x[:, None] - x, y[:, None] - y) < 2 * EDGE_PX
+        order = np.argsort(self.flux)
+        return [k for k in order if kept[k] and near[k].sum() == 1]
+
+    def frame(self):
+        size_px = self.bench.camera.resolution_px
+        sprites = pack_sprites(self.x_px, self.y_px, self.flux, self.sprites.star, size_px, self.sprites.footprint_px)
+        self.bench.renderer.draw(sprites)
+        return replace(self.golden, light=self.bench.renderer.linear()[np.newaxis].copy())
+
+    def bad(self):
+        return compare(self.frame(), self.golden).bad
+
+
+SKIES = {"default": "", "faint stars": "[sky]\nfaintest_v_mag = 9.5\n", "wide": "[render]\nsprite_sigma_px = [1.6, 0.6]\n"}
+
+
+@pytest.fixture(scope="module")
+def benches(tmp_path_factory):
+    """The benches of SKIES, each loaded once: no test changes one, and a Field has frames of its own."""
+    folder, opened = tmp_path_factory.mktemp("skies"), {}
+    for name, more in SKIES.items():
+        (folder / f"{name}.toml").write_text(SMALL_BENCH + more)
+        opened[name] = hilstar.load(folder / f"{name}.toml")
+    yield opened
+    for bench in opened.values():
+        assert bench.renderer.gl_error() == "GL_NO_ERROR"
+        bench.close()
+
+
+@pytest.fixture
+def field(benches):
+    return Field(benches["default"])
+
+
+def test_an_unchanged_frame_is_the_same_sky(field):
+    comparison = assert_same_sky(field.frame(), field.golden)
+    summary = comparison.summary()
+    assert summary["same"] and summary["missing"] == summary["extra"] == 0
+    assert summary["flux_error_mag"]["max"] == summary["centroid_error_px"]["max"] == 0
+    blended = sum(len(star.hip) - 1 for star in comparison.stars)
+    assert summary["stars"] + blended + summary["unmeasured"] == len(field.golden.truth)
+
+
+@pytest.mark.parametrize("sky", SKIES)
+@pytest.mark.parametrize("ra_dec", [(84.057, -1.2), (101.29, -16.7), (56.7, 24.1), (266.0, -29.0)])
+def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
+    """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way with 680 stars in 320 x 240."""
+    bench = benches[sky]
+    field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
+    oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.psf)
+    for one, other in ((field.golden, oracle), (oracle, field.golden), (field.golden.linear, oracle)):
+        stars = assert_same_sky(one, other).stars
+        assert np.mean([abs(star.flux_error_mag) < DRIVER_MAG for star in stars]) > DRIVER_SHARE
+        assert np.mean([star.centroid_error_px < DRIVER_PX for star in stars]) > DRIVER_SHARE
+    assert min(FLUX_MAG, CENTROID_PX) > 20 * max(DRIVER_MAG, DRIVER_PX)
+    assert FAULT_MAG >= 10 * FLUX_MAG and FAULT_PX >= 10 * CENTROID_PX
+
+
+@pytest.mark.parametrize("which", [0, 1, -1], ids=["faintest", "second faintest", "brightest"])
+def test_one_star_shifted_by_a_fiftieth_of_a_pixel_is_named(field, which):
+    k = field.inside()[which]
+    field.x_px[k] += 0.6 * FAULT_PX
+    field.y_px[k] -= 0.8 * FAULT_PX
+    (star,) = field.bad()
+    assert star.kind == "changed" and star.hip == (field.hip[k],)
+    assert (star.dx_px, star.dy_px) == pytest.approx((0.6 * FAULT_PX, -0.8 * FAULT_PX), abs=MEASURED_PX)
+    assert star.flux_error_mag == pytest.approx(0, abs=MEASURED_MAG)
+
+
+@pytest.mark.parametrize("which", [0, -1], ids=["faintest", "brightest"])
+def test_one_star_dimmed_by_a_hundredth_of_a_magnitude_is_named(field, which):
+    k = field.inside()[which]
+    field.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
+    (star,) = field.bad()
+    assert star.kind == "changed" and star.hip == (field.hip[k],)
+    assert star.flux_error_mag == pytest.approx(FAULT_MAG, abs=MEASURED_MAG)
+    assert star.centroid_error_px == pytest.approx(0, abs=MEASURED_PX)
+
+
+def test_a_star_gone_a_star_too_many_and_a_star_moved_are_told_apart(field):
+    gone, moved, far = field.inside()[:3]
+    field.flux[gone] = 0
+    field.x_px[moved] += 1.5
+    field.y_px[far] += 9
+    frame = field.frame()
+    with pytest.raises(AssertionError) as failure:
+        assert_same_sky(frame, field.golden)
+    lines = str(failure.value).splitlines()
+    assert "Not the same sky" in lines[0] and "1 changed, 2 missing, 1 extra" in lines[0]
+    assert len(lines) == 5
+    for k in (gone, far):
+        assert any(line.startswith(f"HIP {field.hip[k]} at") and "missing" in line for line in lines[1:])
+    assert f"star at ({field.x_px[far]:.1f}, {field.y_px[far]:.1f}): extra" in str(failure.value)
+    assert f"HIP {field.hip[moved]} at" in lines[4] and "1.5000 px (+1.5000, +0.0000) off" in lines[4]
+
+
+def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(field):
+    k = field.inside()[5]
+    frame = field.frame()
+    field.flux[k] = 0
+    golden = field.frame()
+    (star,) = compare(frame, golden.linear).bad
+    assert star.kind == "extra" and star.hip == (field.hip[k],)
+    assert star.flux_e_per_s == pytest.approx(frame.truth["electrons_per_s"][frame.truth["hip"] == field.hip[k]][0], rel=1e-3)
+
+
+def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_is_named(field):
+    """Also by more than any star is wide, where every star is missing from its place and extra in another."""
+    odd = field.inside()[-1]
+    for right, down in ((-0.75, 0.0), (0.31, -0.02), (11.3, -4.6)):
+        field.x_px, field.y_px = field.x_px + right, field.y_px + down
+        field.flux[odd] *= 0.9
+        found = compare(field.frame(), field.golden)
+        field.x_px, field.y_px = field.x_px - right, field.y_px - down
+        field.flux[odd] /= 0.9
+        assert found.common is not None and not found.same
+        assert found.common.shift_px == pytest.approx((right, down), abs=MEASURED_PX)
+        assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (0, 0, 0)
+        (named,) = [star for star in found.differing if star.hip == (int(field.hip[odd]),)]
+        assert named.flux_error_mag == pytest.approx(2.5 * np.log10(1 / 0.9), abs=MEASURED_MAG)
+        # Stars that share their light with a neighbour may be one star there and two here; in this dense field a star that
+        # moves by many widths may come to lie on another one's old place, too.
+        assert len(found.differing) <= (0.05 if abs(right) < 1 else 0.3) * len(found.stars)
+        assert found.common.line().startswith(f"all shifted by ({right:.2f}, {down:.2f}) px; ")
+
+
+def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(field):
+    width, height = field.bench.camera.resolution_px
+    x, y = field.x_px - (width - 1) / 2, field.y_px - (height - 1) / 2
+    turn, scale = np.radians(0.05), 1.0005
+    field.x_px += scale * (x * np.cos(turn) - y * np.sin(turn)) - x
+    field.y_px += scale * (x * np.sin(turn) + y * np.cos(turn)) - y
+    field.flux *= 10 ** (-0.4 * 0.1)
+    common = compare(field.frame(), field.golden).common
+    assert common is not None
+    assert common.shift_px == (0.0, 0.0)
+    assert common.rotation_deg == pytest.approx(0.05, abs=1e-4)
+    assert common.scale_error == pytest.approx(5e-4, abs=2e-6)
+    assert common.flux_mag == pytest.approx(0.1, abs=MEASURED_MAG)
+    assert "turned by +0.0500 deg" in common.line() and "dimmer by 0.10 mag" in common.line()
+
+
+def test_the_legend_counts_what_the_terminal_counts(field):
+    # Shifted as a whole, stars leave the image and come into it: they are common, and missing or extra all the same.
+    field.x_px += 3.0
+    found = compare(field.frame(), field.golden)
+    assert found.common is not None
+    assert found.summary()["missing"] > 0
+    panel = ChartPanel(found, "mag")
+    for kind in ("missing", "extra"):
+        drawn = len(panel.of(kind))
+        assert panel.label(kind, drawn).startswith(f"{kind}: {found.summary()[kind]}")
+    assert len(panel.of("missing")) < found.summary()["missing"]
+
+
+def test_what_a_few_stars_do_is_not_common(field):
+    for k in field.inside()[-3:]:
+        field.x_px[k] += 0.5
+        field.flux[k] *= 0.8
+    found = compare(field.frame(), field.golden)
+    assert found.common is None
+    assert len(found.differing) == len(found.bad) == 3
+    other = field.bench.frame(from_radec_roll_deg(280, 35, 20))
+    assert compare(other, field.golden).common is None
+    assert compare(field.golden, field.golden).common is None
+
+
+def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(field):
+    other = field.bench.frame(from_radec_roll_deg(280, 35, 20))
+    with pytest.raises(AssertionError) as failure:
+        assert_same_sky(other, field.golden.linear)
+    assert len(str(failure.value).splitlines()) == 1 + MAX_LINES + 1
+    assert str(failure.value).splitlines()[-1].startswith("and ")
+
+
+def grid(x_px, y_px, flux, sigma_px=(0.85, 0.85), size_px=(160, 120)):
+    x_px, y_px, flux = (np.asarray(values, dtype=float) for values in (x_px, y_px, flux))
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), size_px, GaussianPsf(sigma_px).footprint_px)
+    return linear_image(sprites, size_px, GaussianPsf(sigma_px)).astype(np.float32)
+
+
+@pytest.mark.parametrize("apart_px", [2.6, 4.0])
+@pytest.mark.parametrize("ratio", [1.0, 0.01])
+def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
+    """The other's light in its window is no fault of the neighbour, 100 times fainter as that one may be."""
+    x, y = np.array([60.2, 60.2 + apart_px, 120.4, 20.1, 130.3]), np.array([50.3, 50.1, 90.2, 99.7, 20.5])
+    flux = np.array([1e6, 1e6 * ratio, 3e5, 3e5, 3e5])
+    golden, truth = grid(x, y, flux), np.zeros(5, dtype=TRUTH_DTYPE)
+    for name, values in zip(("hip", "x_px", "y_px", "electrons_per_s"), (np.arange(1, 6), x, y, flux), strict=True):
+        truth[name] = values
+    for k in (0, 1):
+        changed = np.arange(5) == k
+        for frame, error in (
+            (grid(x + FAULT_PX * changed, y, flux), (0, FAULT_PX)),
+            (grid(x, y, flux * 10 ** (-0.4 * FAULT_MAG * changed)), (FAULT_MAG, 0)),
+        ):
+            (star,) = compare(frame, golden, truth=truth).bad
+            assert star.hip == (k + 1,)
+            assert (star.flux_error_mag, star.dx_px) == pytest.approx(error, abs=MEASURED_PX)
+            # Without a table a star that outshines its neighbour hides it; what that one does is still seen, and where.
+            bad = compare(frame, golden).bad
+            assert bad and all(abs(star.x_px - x[k]) < 2 and abs(star.y_px - y[k]) < 2 for star in bad)
+
+
+def test_a_blend_is_one_star_with_both_names(field):
+    """Two stars within a pixel: the fault of one is the blend's, by its share of the light."""
+    k, other = field.inside()[:2]
+    field.x_px[other], field.y_px[other] = field.x_px[k] + 0.4, field.y_px[k] - 0.3
+    golden = field.frame()
+    golden.truth["x_px"][golden.truth["hip"] == field.hip[other]] = field.x_px[other]
+    golden.truth["y_px"][golden.truth["hip"] == field.hip[other]] = field.y_px[other]
+    share = field.flux[k] / (field.flux[k] + field.flux[other])
+    field.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
+    (star,) = compare(field.frame(), golden).bad
+    assert set(star.hip) == {field.hip[k], field.hip[other]}
+    assert star.flux_error_mag == pytest.approx(FAULT_MAG * share, rel=0.1)
+
+
+@pytest.mark.parametrize("x_px", [-1.2, -0.5, 0.0, 0.4, 3.0, 158.9, 159.8])
+def test_a_star_cut_by_the_edge_is_compared(x_px):
+    places, flux = ([x_px, 80.3], [60.2, 40.4]), np.array([2e4, 1e6])
+    golden = grid(*places, flux)
+    (star,) = compare(grid([x_px + FAULT_PX, 80.3], places[1], flux), golden).bad
+    assert star.dx_px == pytest.approx(FAULT_PX, rel=0.05) and star.x_px == pytest.approx(x_px, abs=0.01)
+    (star,) = compare(grid(*places, flux * [10 ** (-0.4 * FAULT_MAG), 1]), golden).bad
+    assert star.flux_error_mag == pytest.approx(FAULT_MAG, rel=0.05)
+
+
+def test_a_wing_without_its_star_is_counted_and_its_light_still_looked_at():
+    golden = grid([-4.0, 80.3], [60.2, 40.4], [1e6, 1e6])
+    comparison = compare(golden, golden)
+    assert comparison.same and len(comparison.stars) == 1 and comparison.unmeasured == 1
+    (star,) = compare(grid([-4.0, 80.3], [60.2, 40.4], [1.3e6, 1e6]), golden).bad
+    assert star.kind == "extra" and star.x_px < 1 and star.y_px == pytest.approx(60.2, abs=0.5)
+
+
+@pytest.mark.parametrize("sigma_px", [(0.4, 0.4), (0.55, 0.85), (3.0, 1.0), (10.0, 10.0)])
+def test_the_sigma_is_that_of_the_stars(sigma_px, rng):
+    """To what the light of neighbours a footprint away, 1e-6 of theirs, may do where one is 1000 times brighter."""
+    x, y = (60 + 130 * axis.ravel() + rng.uniform(-5, 5, 9) for axis in np.mgrid[:3, :3])
+    image = grid(x, y, 10 ** rng.uniform(3, 6, 9), sigma_px, (400, 400))
+    assert star_psf(image.astype(float)).sigma_px == pytest.approx(sigma_px, rel=1e-3)
+
+
+def test_files_arrays_and_frames_are_one_sky(field, tmp_path):
+    write_frame_fits(tmp_path / "golden.fits", field.bench, field.golden)
+    write_truth_csv(tmp_path / "truth.csv", field.golden)
+    k = field.inside()[0]
+    field.x_px[k] += FAULT_PX
+    frame = field.frame()
+    for golden, truth in ((str(tmp_path / "golden.fits"), tmp_path / "truth.csv"), (tmp_path / "golden.fits", None)):
+        (star,) = compare(frame.linear if truth else frame, golden, truth=truth).bad
+        assert star.hip == (field.hip[k],)
+    (star,) = compare(frame.linear, field.golden.linear).bad
+    assert star.hip == () and star.name == f"star at ({star.x_px:.1f}, {star.y_px:.1f})"
+    assert_same_sky(frame, field.golden, centroid_px=1.5 * FAULT_PX)
+
+
+def test_what_is_no_sky_is_refused(field):
+    golden = field.golden
+    nothing = np.zeros_like(golden.linear)
+    broken = golden.linear.copy()
+    broken[3, 3] = np.nan
+    for frame, wanted, words in (
+        (golden.linear[:, 1:], golden, "319 x 240 px against 320 x 240 px"),
+        (golden.codes, golden, "not its codes"),
+        (broken, golden, "NaN"),
+        (golden.linear[0], golden, "shape"),
+        (golden, nothing, "no star"),
+    ):
+        with pytest.raises(InputError, match=words):
+            assert_same_sky(frame, wanted)
+    with pytest.raises(InputError, match="flux_mag"):
+        assert_same_sky(golden, golden, flux_mag=0)
+    with pytest.raises(InputError, match="centroid_px"):
+        assert_same_sky(golden, golden, centroid_px=float("nan"))
+    with pytest.raises(InputError, match="truth table"):
+        assert_same_sky(golden, golden, truth=field.bench.frame(from_radec_roll_deg(280, 35, 20)).truth)
+    with pytest.raises(AssertionError, match="missing"):
+        assert_same_sky(nothing, golden)

@@ -1,0 +1,26 @@
+"""The least-squares problem of all stars, against the same by dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.instruments.compare.star_fit import StarTemplates
+from hilstar.optics.psf import GaussianPsf
+
+SIZE_PX = 40, 30
+ROUNDING = 1e-14  # of sums of some hundred float64 products, all below 1
+SIGMA_PX = 0.85, 0.7
+
+
+def test_normal_matrix_and_fit_are_those_of_the_columns(rng):
+    """Stars that overlap, that stand alone, and that the image's edge cuts."""
+    places = np.concatenate([rng.uniform(-3, 43, (60, 1)), rng.uniform(-3, 33, (60, 1))], axis=1)
+    templates = StarTemplates(places, GaussianPsf(SIGMA_PX), SIZE_PX[::-1])
+    columns = np.stack([templates.image(unit).ravel() for unit in np.eye(180)], axis=1)
+    assert np.abs(templates.normal.toarray() - columns.T @ columns).max() < ROUNDING
+    assert np.abs(templates.in_view - columns[:, ::3].sum(axis=0)).max() < ROUNDING
+    image = columns @ rng.uniform(1, 2, 180)
+    alone = StarTemplates(np.array([[8.2, 9.7], [30.1, 20.4]]), GaussianPsf(SIGMA_PX), SIZE_PX[::-1])
+    dense = np.stack([alone.image(unit).ravel() for unit in np.eye(6)], axis=1)
+    wanted = np.linalg.lstsq(dense, image, rcond=None)[0].reshape(2, 3)
+    assert np.allclose(alone.fit(image.reshape(30, 40)), wanted, rtol=1e-10)

@@ -1,0 +1,78 @@
+"""The detector behind photographs: a gain that they do not tell is the bench file's, and the rest of the noise the pixels'."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.confront.background import NO_PATTERN, fixed_pattern, sky_level
+from hilstar.instruments.confront.photon_transfer import fit_pixels, transfer_points
+from hilstar.tracker.settings import DetectorSettings
+
+GAIN, PRNU, READ_E = 17.0, 0.03, 2.0  # the Rosetta NAVCAM of the thesis
+SKY_E = 28_000.0
+SHAPE = (512, 512)
+SIGMAS = 4.0
+BENCH = DetectorSettings(gain_e_per_dn=GAIN, read_noise_e=READ_E, prnu=PRNU)
+EVERY = np.zeros(SHAPE, dtype=bool)
+
+
+def photographs(rng, levels_e, prnu=PRNU):
+    """Photographs (n, height, width), DN, of one detector: each of a level, e-, or of an image of levels."""
+    response = 1 + prnu * rng.standard_normal(SHAPE)
+    for level_e in levels_e:
+        charge_e = rng.poisson(np.broadcast_to(level_e, SHAPE) * response)
+        yield np.rint((charge_e + READ_E * rng.standard_normal(SHAPE)) / GAIN)
+
+
+def fitted(images, bench=BENCH):
+    images = list(images)
+    levels = [sky_level(dn, 1.0).level for dn in images]
+    points = [transfer_points(dn, level, EVERY) for dn, level in zip(images, levels, strict=True)]
+    pattern = fixed_pattern((dn - level, level, ~EVERY) for dn, level in zip(images, levels, strict=True))
+    return fit_pixels(np.concatenate(points), 1.0, None, bench, pattern or NO_PATTERN)
+
+
+@pytest.mark.parametrize("ramp_e", [0.0, 12_000.0])
+def test_one_photograph_does_not_tell_the_gain_from_the_response(rng, ramp_e):
+    """3 % of response was taken for shot noise: 0.65 e- a DN, where 17 is true; a gradient made it no better."""
+    levels_e = SKY_E + ramp_e * np.linspace(-0.5, 0.5, SHAPE[1])
+    pixels = fitted(photographs(rng, [levels_e]))
+    assert pixels.gain_e_per_dn == GAIN
+    assert not pixels.gain_told
+    assert "gain_e_per_dn" not in pixels.sigma
+    assert any("do not tell the gain" in note for note in pixels.notes)
+    assert pixels.pattern.rms[0] == pytest.approx(PRNU, rel=0.02)
+    level_dn = np.array([SKY_E / GAIN])
+    true_dn2 = (SKY_E + READ_E**2) / GAIN**2 + (PRNU * SKY_E / GAIN) ** 2 + 1 / 12
+    assert pixels.variance_dn2(level_dn)[0] == pytest.approx(true_dn2, rel=0.02)
+
+
+def test_several_photographs_of_one_level_tell_the_gain_with_its_sigma(rng):
+    pixels = fitted(photographs(rng, [SKY_E] * 4), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E))
+    assert pixels.gain_told
+    sigma = pixels.sigma["gain_e_per_dn"]
+    assert sigma < 0.05 * GAIN
+    assert abs(pixels.gain_e_per_dn - GAIN) < SIGMAS * sigma
+
+
+def test_columns_are_no_share_of_the_response(rng):
+    """A column's mean has its pixels' response in it: 1.5 DN of columns were stated, where there are none."""
+    pixels = fitted(photographs(rng, [SKY_E] * 4))
+    assert pixels.pattern.rms[0] == pytest.approx(PRNU, rel=0.02)
+    assert pixels.pattern.rms[2:] == (0.0, 0.0)
+
+
+def test_one_photograph_of_levels_that_differ_widely_tells_the_gain(rng):
+    """From 200 to 30 000 e- shot noise and response part: the gain is the photograph's own."""
+    levels_e = np.geomspace(200.0, 30_000.0, SHAPE[1])
+    pixels = fitted(photographs(rng, [levels_e]), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E))
+    assert pixels.gain_told
+    assert abs(pixels.gain_e_per_dn - GAIN) < SIGMAS * pixels.sigma["gain_e_per_dn"]
+
+
+def test_a_gain_too_small_for_the_noise_is_named_with_the_least_that_is_possible(rng):
+    pixels = fitted(photographs(rng, [SKY_E], prnu=0.0), DetectorSettings(gain_e_per_dn=5, read_noise_e=READ_E))
+    assert pixels.gain_e_per_dn == 5
+    assert any("write [tracker.detector] gain_e_per_dn = 1" in note for note in pixels.notes)
+    assert pixels.pattern.rms[0] == 0

@@ -1,0 +1,174 @@
+"""Faults in the virtual tracker: the light of its exposures, and that it is the display's."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import hilstar
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.rotation import angle_between_rad
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.simulate.batch import faulty_exposure
+from hilstar.instruments.simulate.pictures import TrackerPictures
+from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.layers.fault_kinds import Now
+from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.cameras import bench_camera, tracker_camera
+from hilstar.server.bench.fault_views import faults_at
+from hilstar.server.bench.scenario import parse_scenario
+from tests.support.benches import ORION_Q, SMALL_BENCH
+
+EXPOSURE_S = 0.1  # the bench's default
+LIGHT_SHARE = 2e-6  # float32, and a footprint's cut
+PLACE_PX = 2e-3  # of the display's places on the detector: float32 fractions, and the slower star of a frame's middle
+
+HEAD = "seed = 5\n"
+GHOST = """
+[[fault]]
+kind = "false-star"
+name = "ghost"
+at_s = 1.0
+for_s = 1.0
+tracker_px = [480, 530]
+electrons = 4e4
+"""
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults")
+    with Simulator(bench_file_of(folder / "bench.toml", SMALL_BENCH)) as opened:
+        yield opened
+
+
+def exposed(simulator, text, at_s, rate=(0.0, 0.0, 0.0)):
+    scenario = parse_scenario(simulator.file.path.with_name("faults.toml"), HEAD + text)
+    view = simulator.view(np.array(ORION_Q), np.array(rate))
+    faults = faulty_exposure(simulator, view, scenario, round(at_s * NS_PER_S))
+    return simulator.expose(view, None, faults=faults), faults
+
+
+def light_e(exposure):
+    return exposure.mean_e.sum()
+
+
+def test_a_fault_that_is_not_on_leaves_the_exposure_as_it_is(simulator):
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
+    off, _ = exposed(simulator, GHOST, 5.0)
+    assert np.array_equal(off.mean_e, plain.mean_e) and off.faults == ()
+
+
+@pytest.mark.parametrize(("at_s", "share"), [(1.5, 1.0), (1.0, 0.5), (0.97, 0.2), (2.04, 0.1)])
+def test_an_exposure_has_a_fault_s_light_for_the_part_that_it_lasts(simulator, at_s, share):
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
+    seen, _ = exposed(simulator, GHOST, at_s)
+    assert light_e(seen) - light_e(plain) == pytest.approx(share * 4e4, rel=1e-3)
+    row = seen.truth[seen.truth["name"] == "ghost"][0]
+    assert row["electrons_per_s"] == pytest.approx(share * 4e4 / EXPOSURE_S, rel=1e-6)
+    assert (row["x_px"], row["y_px"]) == (pytest.approx(480, abs=1e-3), pytest.approx(530, abs=1e-3))
+
+
+def test_a_moving_false_star_leaves_a_streak_of_its_light(simulator):
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
+    seen, _ = exposed(simulator, GHOST.replace("[480, 530]", "[480, 530]\nrate_px_s = [300, 0]"), 1.5)
+    added = seen.mean_e - plain.mean_e
+    assert added.sum() == pytest.approx(4e4, rel=1e-3)
+    # From 1.45 to 1.55 s: 480 + 300 (0.45 to 0.55) is 615 to 645
+    columns = np.average(np.arange(1024), weights=added.sum(axis=0))
+    assert columns == pytest.approx(630, abs=0.05)
+    width = np.sqrt(np.average((np.arange(1024) - columns) ** 2, weights=added.sum(axis=0)))
+    assert width == pytest.approx(np.hypot(30 / np.sqrt(12), np.hypot(0.55, np.sqrt(1 / 12))), abs=0.1)
+
+
+def test_blank_freeze_and_step(simulator):
+    dark, _ = exposed(simulator, '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 1.0', 1.0)
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
+    assert light_e(dark) == pytest.approx(light_e(plain) / 2, rel=LIGHT_SHARE)
+    turning = (0.0, 0.02, 0.0)
+    _, stuck = exposed(simulator, '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 0.9\nfor_s = 1', 1.0, turning)
+    (piece,) = stuck.pieces
+    assert not piece.view.rate_cam_rad_s.any()
+    turned_rad = angle_between_rad(piece.view.q_icrs_to_cam, np.array(ORION_Q))
+    assert turned_rad == pytest.approx(0.02 * 0.1, rel=1e-6)  # as at 0.9 s
+    moved, _ = exposed(simulator, '[[fault]]\nkind = "attitude-step"\nname = "s"\nat_s = 0\nturn_arcsec = [0, 600, 0]', 1.0)
+    star = plain.truth[plain.truth["hip"] == 26727][0]
+    whole = moved.mean_e[: int(star["y_px"]) + 6, : int(star["x_px"]) + 40]
+    y, x = np.unravel_index(np.argmax(whole), whole.shape)
+    shift_px = 600 / ARCSEC_PER_RAD * 70 / 0.013
+    assert abs(x - star["x_px"]) == pytest.approx(shift_px, abs=1.0) and abs(y - star["y_px"]) < 1.0
+
+
+ALIKE = (
+    HEAD
+    + GHOST
+    + """
+[[fault]]
+kind = "cosmic-rays"
+name = "rays"
+at_s = 1.0
+for_s = 0.5
+number = 6
+electrons = 3e4
+length_px = 12
+[[fault]]
+kind = "flash"
+name = "flare"
+at_s = 1.0
+for_s = 0.5
+hip = 26727
+v_mag = 1.0
+"""
+)
+
+
+def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    scenario = parse_scenario(tmp_path / "faults.toml", ALIKE)
+    with hilstar.load(path) as bench:
+        shown = bench.frame(ORION_Q, faults=faults_at(bench, scenario, round(1.25 * NS_PER_S))).truth
+    view = simulator.view(np.array(ORION_Q), np.zeros(3))
+    seen = simulator.expose(view, None, faults=faulty_exposure(simulator, view, scenario, round(1.25 * NS_PER_S))).truth
+    config = simulator.config
+    monitor, tracker = bench_camera(config, tmp_path), tracker_camera(config.tracker, tmp_path)
+    ours = shown[np.isin(shown["name"], ["ghost", "rays", "flare"])]
+    x_px, y_px = tracker.project(monitor.rays(ours["x_px"], ours["y_px"]) @ tracker.cam_to_image.T)
+    theirs = seen[np.isin(seen["name"], ["ghost", "rays", "flare"])]
+    assert len(theirs) > 2
+    matched = 0
+    for x, y, row in zip(x_px, y_px, ours, strict=True):
+        off = np.hypot(theirs["x_px"] - x, theirs["y_px"] - y)
+        if 8 < x < 1015 and 8 < y < 1015:
+            nearest = theirs[np.argmin(off)]
+            matched += 1
+            assert off.min() < PLACE_PX and nearest["name"] == row["name"]
+            assert nearest["electrons_per_s"] == pytest.approx(row["electrons_per_s"], rel=1e-5) or row["name"] == "rays"
+    assert matched > 2
+
+
+def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    scenario = parse_scenario(tmp_path / "faults.toml", GHOST + '[[fault]]\nkind = "freeze"\nname = "stuck"')
+    ghost, stuck = (Now(k, fault, 0) for k, fault in enumerate(scenario.faults, start=1))
+    on = []
+    with hilstar.load(path) as bench:
+        pictures = TrackerPictures(bench, scenario, lambda: tuple(on))
+        here = AttitudeSample(0, np.array(ORION_Q))
+        away = AttitudeSample(0, np.array([0.7071068, 0.7071068, 0.0, 0.0]))
+        plain = dn_of(pictures(here))
+        on.append(ghost)
+        seen = dn_of(pictures(here))
+        on[:] = [stuck]
+        stands = dn_of(pictures(away))
+    spot = slice(528, 533), slice(478, 483)
+    assert seen[spot].sum() > plain[spot].sum() + 0.5 * 4e4 / 24  # e-/DN of the default detector
+    assert np.abs(stands.astype(float) - plain).max() < 0.2 * plain.max()  # the same stars, with other noise
+
+
+def dn_of(png):
+    return np.asarray(Image.open(io.BytesIO(png)), dtype=np.uint16) >> 4

@@ -1,0 +1,40 @@
+"""Angles between heads, solved from what their trackers would see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
+from hilstar.instruments.simulate.heads import rotation_between, verify_heads
+from hilstar.server.bench.bench_file import read_heads
+from tests.support.heads import heads_file
+
+# The README's bench at half the pixels of a side: fewer stars, so half as near.
+BENCH = {
+    "tracker": {"resolution_px": [512, 512], "transmission": None},
+    "monitor": {"resolution_px": [640, 480]},
+    "collimator": {"focal_length_mm": 175},
+    "render": {"quantisation": "exact"},
+}
+LINEAR_ARCSEC, CODES_ARCSEC = 0.5, 10.0
+SVD_RAD = 1e-12
+
+
+def test_a_planted_rotation_is_found(rng):
+    before = rng.normal(size=(20, 3))
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    turn = to_matrix(from_rotation_vector(np.array([1e-3, -2e-3, 5e-4])))
+    found = rotation_between(before, before @ turn.T, rng.uniform(1, 1e4, 20))
+    assert np.abs(found - turn).max() < SVD_RAD
+
+
+@pytest.mark.gpu
+def test_heads_agree_on_the_body_from_linear_light_and_nearly_from_codes(tmp_path, rng):
+    pairs = verify_heads(read_heads(heads_file(tmp_path, 5599, BENCH)), 2, rng)
+    assert [(pair.first, pair.second) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
+    for pair in pairs:
+        told = pair.summary()
+        assert told["fields"] == 2
+        assert told["linear_arcsec"]["max"] < LINEAR_ARCSEC
+        assert told["linear_arcsec"]["max"] < told["codes_arcsec"]["max"] < CODES_ARCSEC

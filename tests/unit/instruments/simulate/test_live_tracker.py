@@ -1,0 +1,108 @@
+"""The tracker before a running display: what an exposure has of its frames, its clock, and the errors that are planted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.packet import AnswerPacket, decode, encode
+from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
+from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.simulate.answer_link import answer_packet, json_answer
+from hilstar.instruments.simulate.live_exposure import WatchedFrames, _levels_of
+from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
+from hilstar.server.answers.answer import Answer, ReportedStar
+
+PERIOD_NS = 100
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def frame(number, lit, light, q=IDENTITY, lit_ns=None):
+    head = FrameHead(number, number * PERIOD_NS if lit_ns is None else lit_ns, 8, 8, 8, None if q is None else tuple(q))
+    return ShownFrame(head, np.array(lit, dtype=np.uint32), np.array(light, dtype=np.uint8))
+
+
+def watched(*frames):
+    kept = WatchedFrames(lambda frame: frame.codes.astype(np.float64)[:, None])
+    for each in frames:
+        kept.add(each)
+    return kept
+
+
+def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
+    turned = from_rotation_vector(np.array([0.0, 0.0, 0.01]))
+    kept = watched(frame(1, [3], [8]), frame(2, [3, 5], [4, 40], turned), frame(4, [], [], None))
+    exposed = kept.exposed(150, 550)  # half of frame 1, all of frame 2 and, as 3 never came, of its time too; and of 4
+    assert exposed.lit.tolist() == [3, 5]
+    assert exposed.light_e_per_s[:, 0] == pytest.approx([8 / 8 + 4 / 2, 40 / 2])
+    assert (exposed.frames, exposed.shown_share) == (3, pytest.approx(5 / 8))
+    assert to_rotation_vector(exposed.q_icrs_to_cam)[2] == pytest.approx(0.01 * 4 / 5)
+    assert kept.missing == 1
+    assert kept.exposed(50, 150) is None  # nobody saw its beginning
+
+
+def test_a_run_that_begins_anew_forgets_the_one_before():
+    kept = watched(frame(7, [1], [1]), frame(1, [2], [2], lit_ns=800), frame(2, [2], [2], lit_ns=900))
+    assert kept.exposed(700, 850) is None
+    assert kept.exposed(800, 900).lit.tolist() == [2]
+    assert kept.missing == 0
+
+
+def test_triples_of_codes_are_the_levels_that_made_them():
+    rgb = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 1], [2, 1, 1]], dtype=np.uint16)
+    assert _levels_of(rgb[[4, 0, 2, 3, 1]], rgb).tolist() == [4, 0, 2, 3, 1]
+    assert _levels_of(np.array([[9, 9, 9]]), rgb).tolist() == [0]
+
+
+def test_its_own_clock_is_off_and_drifts_and_is_turned_back():
+    clock = OwnClock(Planted(drift_ppm=50.0, offset_s=2.0), 10**12)
+    assert clock.of_host(10**12) == 10**12 + 2 * 10**9
+    assert clock.of_host(10**12 + 10**9) - clock.of_host(10**12) == 10**9 + 50_000
+    assert clock.to_host(clock.of_host(10**12 + 123_456_789)) == pytest.approx(10**12 + 123_456_789, abs=1)
+
+
+def test_planted_errors_have_their_mean_and_their_sigma_over_a_scan(rng):
+    planted = Planted((20.0, -10.0, 40.0), fov_arcsec=2.0, pixel_arcsec=0.5)
+    errors = PlantedErrors(planted, 5384.6, rng)
+    found = []
+    for x, y in rng.uniform(-400 / 5384.6, 400 / 5384.6, (1500, 2)):  # two waves each way
+        q = from_rotation_vector(np.array([x, y, 0.0]))
+        reported, wrong = errors.reported(q)
+        assert not wrong
+        found.append(ARCSEC_PER_RAD * to_rotation_vector(multiply(reported, conjugate(q))))
+    sigma = np.hypot(2.0, 0.5)  # of 1500 places: a third of a sigma of their mean is 0.05
+    assert np.array(found).mean(axis=0) == pytest.approx([20, -10, 40], abs=0.5)
+    assert np.array(found).std(axis=0) == pytest.approx([sigma, sigma, 4 * sigma], rel=0.05)
+
+
+def test_wrong_answers_come_at_their_share_and_are_far_off(rng):
+    errors = PlantedErrors(Planted(wrong=0.1), 5384.6, rng)
+    told = [errors.reported(IDENTITY) for _ in range(1000)]
+    wild = [q for q, wrong in told if wrong]
+    assert 60 < len(wild) < 140
+    assert np.median([np.linalg.norm(to_rotation_vector(q)) for q in wild]) > 1
+    assert all(np.array_equal(q, IDENTITY) for q, wrong in told if not wrong)
+
+
+def test_json_says_what_is_known_and_nothing_else():
+    whole = Answer(
+        0, b"", 5, IDENTITY, np.zeros(3), True, "tracking", 9, 1.5, (ReportedStar(1, 2, 3.00001, 7), ReportedStar(1, 2, 3))
+    )
+    assert json_answer(whole) == (
+        b'{"t_ns":5,"valid":true,"mode":"tracking","stars":9,"q":[1.0,0.0,0.0,0.0],"rate":[0.0,0.0,0.0],"rms_arcsec":1.5,'
+        b'"centroids":[[1,2,3.0,7],[1,2,3]]}'
+    )
+    assert json_answer(Answer(0, b"", 5, valid=False, mode="lost", star_count=0)) == (
+        b'{"t_ns":5,"valid":false,"mode":"lost","stars":0,"centroids":[]}'
+    )
+
+
+def test_a_packet_has_the_flags_of_its_mode_and_of_what_is_known():
+    whole = Answer(0, b"", 5, IDENTITY, np.ones(3), True, "tracking", 9)
+    found = decode(encode(answer_packet(whole, 3)))
+    flags = protocol.ANSWER_VALID + protocol.ANSWER_RATE_VALID + protocol.ANSWER_TRACKING
+    assert found == AnswerPacket(3, flags, 5, (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
+    none = decode(encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4)))
+    assert (none.flags, none.stars) == (protocol.ANSWER_TOO_FEW_STARS, 2)

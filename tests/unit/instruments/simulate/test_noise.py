@@ -1,0 +1,336 @@
+"""The noise of a star and its bounds: against closed form, a maximum-likelihood fit, and simulated exposures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from scipy.spatial.transform import Rotation
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.simulate.noise import (
+    NoiseBudget,
+    NoisyStar,
+    Table,
+    between,
+    measured_px,
+    nea_arcsec,
+    noise_lines,
+    noisy_star,
+    turns_of,
+)
+from hilstar.optics.camera import Camera
+from hilstar.optics.psf import GaussianPsf, SampledPsf
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.mosaic import in_pixels, luminance
+from hilstar.tracker.settings import DetectorSettings
+from tests.support.benches import bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.figures import assert_legible
+from tests.support.psfs import coma, sampled
+from tests.support.psfs import gaussian as gaussian_light
+
+QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # rounding: 0.0075 e-^2
+NOISY = DetectorSettings(
+    gain_e_per_dn=1.0, bits=16, offset_dn=200.0, read_noise_e=8.0, dark_e_per_s=60.0, dsnu_e_per_s=6.0, prnu=0.01
+)
+# A Gaussian integrated over pixels is nearly one of variance sigma^2 + 1/12 (a square is no Gaussian): 1e-3 at 2 px and more.
+CLOSED_FORM = 2e-3
+STARS = 1600
+ERROR = 1 / math.sqrt(2 * 2 * STARS)  # of an rms of x and y of so many stars
+REACHED = 1.05
+
+
+def one(star: NoisyStar, star_e: float, sky_e: float = 0.0, finder: CentroidSettings | None = None) -> Table:
+    return star.noise(np.array([star_e]), np.array([sky_e]), finder or CentroidSettings())
+
+
+def gaussian(sigma_px: float, detector: DetectorSettings = QUIET, phases: int = 6) -> NoisyStar:
+    return NoisyStar(GaussianPsf((sigma_px, sigma_px)), detector, 1.0, phases)
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 3.0])
+def test_the_photons_limit_is_sigma_over_the_root_of_their_number(sigma_px):
+    found = one(gaussian(sigma_px), 5e5)
+    wide = math.sqrt(sigma_px**2 + 1 / 12)
+    assert found["bound_px"][0] == pytest.approx(wide / math.sqrt(5e5), rel=CLOSED_FORM)
+    assert found["shot_e"][0] == pytest.approx(math.sqrt(5e5), rel=CLOSED_FORM)
+    assert found["bound_flux_e"][0] == pytest.approx(math.sqrt(5e5), rel=CLOSED_FORM)
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 3.0])
+def test_the_background_s_limit_is_that_of_a_gaussian_in_even_noise(sigma_px):
+    # Winick 1986: var x = 8 pi sigma^4 V / N^2; var N = 4 pi sigma^2 V, the noise-equivalent area of King 1983.
+    found = one(gaussian(sigma_px), 100.0, 10_000.0)
+    wide2, variance = sigma_px**2 + 1 / 12, 10_000 + 0.3**2 / 12
+    assert found["bound_px"][0] == pytest.approx(math.sqrt(8 * math.pi * variance) * wide2 / 100, rel=CLOSED_FORM)
+    assert found["total_e"][0] == pytest.approx(math.sqrt(4 * math.pi * wide2 * variance), rel=CLOSED_FORM)
+    assert found["effective_px"][0] == pytest.approx(4 * math.pi * wide2, rel=CLOSED_FORM)
+
+
+def test_the_sources_add_up_to_the_total_each_as_table_4_1_has_it():
+    star = gaussian(0.85, NOISY)
+    found = one(star, 3000.0, 40.0)
+    pixels = found["effective_px"]
+    for name, e2 in (("background_e", 40), ("dark_e", 60), ("read_e", 64), ("quantisation_e", 1 / 12), ("dsnu_e", 36)):
+        np.testing.assert_allclose(found[name], np.sqrt(pixels * e2), rtol=1e-12)
+    # Shot noise is between that of all photons and, under the weights of even noise, sqrt(4/3) as much.
+    assert math.sqrt(3000) < found["shot_e"][0] < math.sqrt(4 / 3 * 3000)
+    names = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
+    np.testing.assert_allclose(sum(found[f"{name}_e"] ** 2 for name in names), found["total_e"] ** 2, rtol=1e-12)
+    np.testing.assert_allclose(found["snr"], 3000 / found["total_e"])
+    assert found["total_e"][0] <= found["bound_flux_e"][0] * (1 + 1e-12) <= found["bound_flux_sky_e"][0]
+
+
+def exposed(star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Frames [e-] of single stars (n, side, side) through the detector, and their places (2, n) from the middle."""
+    count, side = math.isqrt(STARS), star.side_px
+    place = rng.uniform(-0.5, 0.5, (2, STARS))
+    tiles = (star_e * star.stamps(*place) + sky_e).reshape(count, count, side, side).swapaxes(1, 2)
+    image = tiles.reshape(count * side, count * side)
+    dn = Detector(star.detector, image.shape[::-1]).expose(image, 1.0, rng)
+    seen = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - star.detector.dark_e_per_s
+    return seen.reshape(count, side, count, side).swapaxes(1, 2).reshape(-1, side, side), place
+
+
+def most_likely(star: NoisyStar, seen: FloatArray, start: FloatArray, star_e: float, sky_e: float) -> FloatArray:
+    """Places (2, n) by Fisher's scoring for x, y and flux, from the true place: the fit that the bound is of."""
+    x, y, flux, step = *start.copy(), np.full(len(seen), star_e), 1e-3
+    for _ in range(12):
+        shares = star.stamps(x, y)
+        by_x = (star.stamps(x + step, y) - star.stamps(x - step, y)) / (2 * step)
+        by_y = (star.stamps(x, y + step) - star.stamps(x, y - step)) / (2 * step)
+        size = flux[:, None, None]
+        slopes = np.stack([size * by_x, size * by_y, shares]).reshape(3, len(seen), -1)
+        light = (size * shares + sky_e).reshape(len(seen), -1)
+        weight = 1 / star.detector.noise(light, 1.0).total_e2
+        information = np.einsum("ins,jns,ns->nij", slopes, slopes, weight)
+        left = np.einsum("ins,ns->ni", slopes, weight * (seen.reshape(len(seen), -1) - light))
+        dx, dy, more = np.linalg.solve(information, left[..., None])[..., 0].T
+        x, y = (np.clip(one + np.clip(by, -0.3, 0.3), -2, 2) for one, by in ((x, dx), (y, dy)))
+        flux = np.maximum(flux + more, star_e / 10)
+    return np.stack([x, y])
+
+
+def beyond_bound(sigma_px: float, star_e: float, detector: DetectorSettings = NOISY, sky_e: float = 20.0) -> float:
+    """The rms of most likely places over the bound."""
+    star = gaussian(sigma_px, detector, 16)
+    seen, place = exposed(star, star_e, sky_e, np.random.default_rng(5))
+    off = most_likely(star, seen, place, star_e, sky_e) - place
+    return float(np.sqrt(np.mean(off**2)) / one(star, star_e, sky_e)["bound_px"][0])
+
+
+@pytest.mark.parametrize(("sigma_px", "star_e"), [(0.5, 2000.0), (0.55, 20_000.0), (0.85, 4000.0), (1.2, 20_000.0)])
+def test_the_most_likely_place_reaches_the_bound_and_nothing_beats_it(sigma_px, star_e):
+    ratio = beyond_bound(sigma_px, star_e)
+    assert 1 - 4 * ERROR < ratio < REACHED
+
+
+def test_where_a_star_is_one_pixel_wide_at_low_signal_the_bound_is_no_bound():
+    # Its share of the middle pixel hardly changes with the place, and a fit that cannot leave the pixel does better.
+    assert beyond_bound(0.25, 150.0) < 0.9
+    assert beyond_bound(0.85, 150.0) > 1.15  # SNR 3.3: the fit wanders
+
+
+def test_the_variance_alone_tells_what_counts_do_but_for_single_electrons():
+    """Exact information of a Poisson count with normal read noise, times its variance: 1 where the variance is all."""
+
+    def ratio(mean_e: float, read_e: float) -> float:
+        from scipy.stats import norm, poisson
+
+        count = np.arange(int(mean_e + 12 * math.sqrt(mean_e) + 30))
+        seen = np.arange(-8 * read_e, count[-1] + 8 * read_e, read_e / 12)
+        share = norm.pdf(seen[:, None] - count, scale=read_e) @ np.stack(
+            [poisson.pmf(count, mean_e), poisson.pmf(count, mean_e) * (count / mean_e - 1)], axis=-1
+        )
+        kept = share[:, 0] > 1e-300
+        return float((share[kept, 1] ** 2 / share[kept, 0]).sum() * read_e / 12 * (mean_e + read_e**2))
+
+    assert all(1 - 1e-6 < ratio(mean_e, read_e) < 1.025 for mean_e, read_e in ((3, 0.3), (3, 2), (0.1, 5), (30, 1)))
+    assert ratio(0.1, 0.3) > 1.5
+
+
+def test_a_star_whose_pixels_all_clip_has_no_bound_and_one_that_clips_in_part_has_that_of_the_rest():
+    star = gaussian(0.55, replace(QUIET, full_well_e=1e4))
+    part, whole = one(star, 2e5), one(star, 1e28)
+    narrow = gaussian(0.05, replace(QUIET, full_well_e=1e4)).noise(10.0 ** np.arange(9), np.zeros(9), CentroidSettings())
+    assert not (narrow["bound_px"] < 1e3).any()
+    assert 0 < part["clipped_px"][0] < 9 < whole["clipped_px"][0]
+    assert np.isnan([whole["total_e"], whole["snr"], whole["bound_px"]]).all() and whole["detection"][0] == 1
+    assert part["bound_px"][0] > 1.3 * one(gaussian(0.55, replace(QUIET, gain_e_per_dn=9.0)), 2e5)["bound_px"][0]
+
+
+TILE_PX, TILES = 40, 30
+SAMPLED = 5e-3  # the table of a sampled PSF is linear between its steps
+SHARE_ERROR = 4 * 0.5 / TILES  # of a share of TILES^2 stars, to four of its sigmas
+
+
+@pytest.mark.parametrize(("sigma_px", "gain_e_per_dn", "pixels"), [(0.55, 24.0, 1), (0.85, 1.0, 1), (0.85, 24.0, 3)])
+def test_the_tracker_finds_as_many_simulated_stars_as_the_threshold_s_model_says(sigma_px, gain_e_per_dn, pixels):
+    star = gaussian(sigma_px, replace(NOISY, gain_e_per_dn=gain_e_per_dn))
+    finder = CentroidSettings(minimum_pixels=pixels)
+    offered = np.geomspace(50.0, 5000.0, 200)
+    chances = star.noise(offered, np.full(200, 20.0), finder)["detection"]
+    rng = np.random.default_rng(1)
+    for wanted in (0.25, 0.8):
+        star_e = float(np.interp(wanted, chances, offered))
+        place = rng.uniform(-0.5, 0.5, (2, TILES**2))
+        image = np.full((TILES, TILE_PX, TILES, TILE_PX), 20.0)
+        stamps = (star_e * star.stamps(*place)).reshape(TILES, TILES, star.side_px, star.side_px)
+        image[:, : star.side_px, :, : star.side_px] += stamps.swapaxes(1, 2)
+        image = image.reshape(TILES * TILE_PX, -1)
+        found = find_stars(Detector(star.detector, image.shape).expose(image, 1.0, rng), finder)
+        assert len(found) / TILES**2 == pytest.approx(wanted, abs=SHARE_ERROR)
+
+
+def test_stars_between_rows_have_the_bounds_of_their_own():
+    star = gaussian(0.85, NOISY)
+    grid = np.geomspace(1e6, 200.0, 94)  # a tenth of a magnitude apart
+    off = np.sqrt(grid[:-1] * grid[1:])
+    coarse, exact = (star.noise(one, np.full(len(one), 20.0), CentroidSettings()) for one in (grid, off))
+    x, _, seen = between(coarse, off)
+    fine = exact["clipped_px"] == 0  # the bound steps by some per cent where a pixel begins to clip
+    np.testing.assert_allclose(x[fine], exact["bound_x_px"][fine], rtol=2e-3)
+    np.testing.assert_allclose(x, exact["bound_x_px"], rtol=0.15)
+    np.testing.assert_allclose(seen, exact["detection"], atol=0.03)
+
+
+def test_a_sampled_psf_has_the_bounds_of_the_gaussian_that_it_samples():
+    sampled_psf = SampledPsf(sampled(gaussian_light(0.8, 0.6), 4, 8), per_px=4)
+    closed, fine = (NoisyStar(psf, NOISY, 1.0) for psf in (GaussianPsf((0.8, 0.6)), sampled_psf))
+    for star_e in (300.0, 30_000.0):
+        a, b = (one(star, star_e, 20.0) for star in (closed, fine))
+        for name in ("bound_x_px", "bound_y_px", "bound_flux_e", "total_e", "detection"):
+            np.testing.assert_allclose(a[name], b[name], rtol=SAMPLED)
+        assert a["bound_y_px"] < a["bound_px"] < a["bound_x_px"]
+
+
+def test_a_star_with_coma_is_found_beside_its_chief_ray_which_is_no_error_of_its_place():
+    star = NoisyStar(SampledPsf(sampled(coma(0.6), 4, 8), per_px=4), NOISY, 1.0)
+    found = measured_px(star, 10_000.0, 20.0, CentroidSettings(), np.random.default_rng(4))
+    bound_px = one(star, 10_000.0, 20.0)["bound_px"][0]
+    assert 0.9 * bound_px < found.min() < 2 * bound_px  # the middle of its light is 0.45 px, forty bounds, off
+
+
+def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
+    """Against Wahba's problem (SciPy), star by star with its own weight."""
+    camera = Camera((1024, 1024), 2000.0, (511.5, 511.5), np.eye(3))
+    rng = np.random.default_rng(2)
+    count, trials = 12, 1500
+    place = rng.uniform(0, 1023, (2, count))
+    sigma_px = rng.uniform(0.02, 0.2, count)
+    rays = camera.rays(*place)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    turned = []
+    for _ in range(trials):
+        seen = camera.rays(*(place + sigma_px * rng.standard_normal((2, count))))
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        turned.append(Rotation.align_vectors(seen, rays, weights=sigma_px**-2)[0].as_rotvec())
+    turns = turns_of(camera, *place)
+    across, about = nea_arcsec(turns, np.stack([sigma_px] * 2), np.ones(count))
+    x, y, z = 206264.806 * np.std(turned, axis=0)
+    assert across[-1] == pytest.approx(math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials))
+    assert about[-1] == pytest.approx(z, rel=4 / math.sqrt(2 * trials))
+    lost = np.stack([np.where(np.arange(count) < 2, (np.nan, 1e6) * (count // 2), sigma_px)] * 2)
+    assert np.isinf(nea_arcsec(turns, lost, np.ones(count))[:, :3]).all()  # stars without a place are none
+    twice = nea_arcsec(turns[[0, 0]], np.full((2, 2), 0.1), np.ones(2))
+    assert np.isfinite(twice[:, 1]).all() and twice[1, 1] > 1000 * about[1]
+    assert np.isinf([across[0], about[0]]).all() and (np.diff(across[1:]) < 0).all()
+
+
+CONTRACT = ["v_mag", "shot_e", "background_e", "dark_e", "read_e", "reset_e", "quantisation_e", "prnu_e", "dsnu_e"]
+CONTRACT += ["total_e", "snr", "detection", "bound_px"]
+
+
+@pytest.fixture
+def bench_file(tmp_path):
+    path = tmp_path / "bench.toml"
+    detector = {"read_noise_e": 12, "dark_e_per_s": 50, "dsnu_e_per_s": 5, "prnu": 0.01, "offset_dn": 20}
+    changes = {"tracker.detector": detector, "background": {"electrons_per_px": 30}, "sky": {"faintest_v_mag": 6.5}}
+    path.write_text(bench_text(changes))
+    return path
+
+
+def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_field(bench_file, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
+    ran = run_hilstar_here("budget", bench_file, "--noise", "--radec", "84.057,-1.2,0", "-o", tmp_path / "out", "--json")
+    assert ran.returncode == 0, ran.stderr
+    found = json.loads(ran.stdout)
+    tables = {}
+    for name in ("noise", "stars", "nea"):
+        with (tmp_path / "out" / f"{name}.csv").open() as file:
+            tables[name] = list(csv.DictReader(file))
+    assert list(tables["noise"][0])[: len(CONTRACT)] == CONTRACT
+    assert list(tables["stars"][0])[:5] == ["hip", "name", "x_px", "y_px", "v_mag"]
+    for name, rows in (("noise", found["rows"]), ("stars", found["stars"]), ("nea", found["nea"])):
+        written = [[float(value or "nan") for key, value in row.items() if key != "name"] for row in tables[name]]
+        told = [[math.nan if v is None else v for key, v in row.items() if key != "name"] for row in rows]
+        np.testing.assert_allclose(written, told, rtol=1e-12)
+    v_mag = [row["v_mag"] for row in found["rows"]]
+    assert v_mag == (v_mag[0] + 0.5 * np.arange(len(v_mag))).tolist() and found["stars"][0]["v_mag"] >= v_mag[0]
+    assert found["rows"][0]["detection"] == 1 and found["rows"][-1]["detection"] < 0.01 < found["rows"][-2]["detection"]
+    usual = [row for row in found["rows"] if row["clipped_px"] == 0 and row["snr"] > 30]
+    assert len(usual) >= 4 and all(row[f"{kind}_px"] > 0.9 * row["bound_px"] for row in usual for kind in ("fit", "window"))
+    limit = found["nea_arcsec"].pop("limit")
+    assert all(one[way] > limit[way] for one in found["nea_arcsec"].values() for way in ("across", "about"))
+    assert found["nea"][-1]["stars"] == len(found["stars"]) and found["fields"] == 1
+    for figure in drawn:
+        assert_legible(figure)
+    assert len(drawn) == 1
+
+
+def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(bench_file):
+    spoken = run_hilstar_here("budget", bench_file, "--noise")
+    assert spoken.returncode == 0 and "NEA, limit" in spoken.stdout and "1 px above 5 sigma" in spoken.stdout
+    assert spoken.stdout == run_hilstar_here("budget", bench_file, "--noise").stdout
+
+
+def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_they_do(tmp_path):
+    """Information adds up: the squares of the channels' SNR are that of all. Shares are Gaussians' of width 0.55 px."""
+    nm, peaks = np.arange(400.0, 721.0, 20.0), {"r": 620.0, "g": 540.0, "b": 460.0}
+    for name, peak in peaks.items():
+        rows = "".join(f"{at:g},{math.exp(-(((at - peak) / 60) ** 2)):.6f}\n" for at in nm)
+        (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
+    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks}
+    detector = {"bayer": "rggb", "read_noise_e": 9, "dark_e_per_s": 50, "offset_dn": 20, "gain_e_per_dn": 1.0}
+    changes = {
+        "tracker": keys | {"psf_sigma_px": [1.0, 1.0]},
+        "tracker.detector": detector,
+        "background": {"electrons_per_px": 30},
+    }
+    (tmp_path / "bench.toml").write_text(bench_text(changes, {"sky": {"faintest_v_mag": 5.0}}))
+    found = json.loads(run_hilstar_here("budget", tmp_path / "bench.toml", "--noise", "--radec", "84,-1,0", "--json").stdout)
+    assert any("SNR r   SNR g   SNR b" in line for line in noise_lines(NoiseBudget(**found)))
+    assert sum(one["star_share"] for one in found["channels"].values()) == pytest.approx(1)
+    assert {one["background_e_per_px"] for one in found["channels"].values()} == {30.0}
+    for row in found["rows"][4:]:
+        assert sum(row[f"snr_{name}"] ** 2 for name in peaks) == pytest.approx(row["snr"] ** 2, rel=0.02)
+    row = next(one for one in found["rows"] if one["detection"] < 0.97)
+    star = noisy_star(read_bench_file(tmp_path / "bench.toml"), np.full((4, 4), 30.0))
+    place, side = np.random.default_rng(1).uniform(-0.5, 0.5, (2, TILES**2)), star.side_px
+    image = np.zeros((TILES, TILE_PX + 1, TILES, TILE_PX + 1))
+    image[:, :side, :, :side] = (row["star_e"] * star.stamps(*place)).reshape(TILES, TILES, side, side).swapaxes(1, 2)
+    image = image.reshape(TILES * (TILE_PX + 1), -1)
+    light = 30.0 + in_pixels([image * one["star_share"] for one in found["channels"].values()], "rggb")
+    dn = Detector(star.detector, image.shape).expose(light, star.exposure_s, np.random.default_rng(2))
+    assert len(find_stars(luminance(dn), CentroidSettings())) / TILES**2 == pytest.approx(row["detection"], abs=0.1)
+
+
+def test_a_field_without_stars_says_so(bench_file, tmp_path):
+    bench_file.write_text(bench_file.read_text().replace("faintest_v_mag = 6.5", "faintest_v_mag = 1.0"))
+    ran = run_hilstar_here("budget", bench_file, "--noise", "--radec", "190,27,0", "-o", tmp_path / "out")
+    assert ran.returncode == 0 and "none: fewer than 2 stars with a place" in ran.stdout
+    assert (tmp_path / "out" / "nea.csv").exists() and not (tmp_path / "out" / "nea.png").exists()
+
+
+def test_what_budget_has_no_use_for_is_refused(bench_file):
+    assert_refused(run_hilstar_here("budget", bench_file, "--radec", "84,-1,0"), 2, "--radec", "add --noise")
+    assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--centroider", "fit"), 2, "leave out --centroider")
+    assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--radec", "84"), 2, "--radec")

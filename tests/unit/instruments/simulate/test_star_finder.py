@@ -1,0 +1,61 @@
+"""Which stars the twin compares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.instruments.simulate.star_finder import StarFinder, crowded, nearest, shared
+from hilstar.instruments.verify.verdict import median
+from hilstar.optics.psf import GaussianPsf
+from hilstar.tracker.centroiders import FAMILY
+from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
+
+# Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
+BIAS_PX = {"moment": 1e-3, "window": 0.03, "wide": 0.03, "fit": 1e-3, "box3": 0.3, "box5": 0.1}
+
+
+def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
+    """Window of 9 px, sigma 1: a neighbour at the window's edge brings half of its light, one 3 px past it a thousandth."""
+    place = [100.0, 104.5, 200.0, 207.5, 300.0, 307.5, np.nan]
+    flux = [1.0, 1.0, 1.0, 1.0, 1.0, 1000.0, 1.0]
+    assert crowded(np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_two_stars_that_are_found_as_one_are_no_two():
+    assert shared(np.array([-1, 0, 1, 1, -1])).tolist() == [False, False, True, True, False]
+    nothing = np.empty(0)
+    found = Centroids(nothing, nothing, nothing, nothing, np.empty(0, dtype=np.intp), np.empty(0, dtype=np.bool_))
+    assert nearest(found, np.array([1.0, np.nan]), np.array([2.0, 2.0])).tolist() == [-1, -1]
+
+
+def test_nothing_measured_has_no_zero_point():
+    assert median([math.nan, 2.0, math.inf, 4.0]) == 3.0
+    assert median([]) == 0.0
+
+
+@pytest.mark.parametrize("kind", FAMILY)
+def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(kind):
+    """One star where it should be, one 2 px aside, one cut by the image's edge; nothing at the fourth place."""
+    finder = StarFinder(CentroidSettings(window_sigma_px=1.0), GaussianPsf((1.0, 1.0)), LocalBackground(0.0, 0.01), kind)
+    x_px, y_px = np.array([20.3, 42.1, 0.4, 60.0]), np.array([21.8, 40.0, 30.2, 15.0])
+    places = [(20.3, 21.8), (40.1, 40.0), (0.4, 30.2)]
+    share = [[np.diff(ndtr(np.arange(65) - 0.5 - at)) for at in place] for place in places]
+    image = 1e4 * sum(np.outer(down, across) for across, down in share)
+    matched = finder.match(image, x_px, y_px)
+    assert (matched.index[:3] >= 0).all() and matched.index[3] == -1
+    found = np.stack([matched.found.x_px, matched.found.y_px])[:, matched.index[:3]]
+    assert np.isfinite(found).all()
+    assert np.abs(found[:, :2] - np.array(places[:2]).T).max() < BIAS_PX[kind]
+    assert 0 <= found[0, 2] < 1.5 and abs(found[1, 2] - 30.2) < BIAS_PX[kind]

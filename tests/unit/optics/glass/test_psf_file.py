@@ -1,0 +1,147 @@
+"""The file of a glass: what is written is read, a small basis keeps what it says, and what is wrong is one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.ndimage import uniform_filter
+
+from hilstar.basics.errors import InputError
+from hilstar.optics.camera import Lens
+from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of, read_glass, write_glass
+from hilstar.optics.psf import SampledPsf
+from hilstar.sky.spectrum import Curve
+from tests.support.glass import stack
+
+FLOAT32 = 1e-6  # of the largest sample: the basis is float32
+
+
+@pytest.fixture(scope="module")
+def glass():
+    lens, curve = Lens((0.01, -0.002, 0.0), (1e-4, 0.0)), Curve(np.array([400.0, 700.0]), np.array([0.8, 0.9]))
+    return glass_of(stack(3, (450.0, 650.0), (0.0, 5.0)), 1e-3, lens, curve, ("made by a test",))
+
+
+def test_what_is_written_is_read(glass, tmp_path):
+    write_glass(tmp_path / "psf.fits", glass)
+    found = read_glass(tmp_path / "psf.fits")
+    assert isinstance(found, Glass)
+    for name in ("places_px", "wavelengths_nm", "focuses_um", "basis", "weights", "illumination", "outside", "lateral_px"):
+        assert (getattr(found, name) == getattr(glass, name)).all(), name
+    assert (found.lens, found.per_px, found.pixel_integrated, found.history) == (glass.lens, 4, False, glass.history)
+    assert found.transmission is not None
+    assert (found.transmission.value == [0.8, 0.9]).all()
+    assert read_glass(tmp_path / "psf.fits") is found  # again without reading it anew
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 0.0])
+def test_the_basis_keeps_each_psf_to_its_tolerance_and_its_moments_exactly(tolerance):
+    given = stack(3)
+    found = glass_of(given, tolerance)
+    images = given.images / given.images.sum(axis=(1, 2), keepdims=True)
+    kept = found.images.reshape(images.shape)
+    by_pixels = uniform_filter(np.pad(kept - images, ((0, 0), (4, 4), (4, 4))), (0, 4, 4))  # 4 samples a pixel
+    assert 0.5 * np.abs(by_pixels).sum(axis=(1, 2)).max() == pytest.approx(found.residual, abs=1e-5)
+    assert found.residual <= max(tolerance, 1e-6)
+    y, x = (np.indices(images.shape[1:]) - images.shape[1] // 2) / 4
+    for term in (x * 0 + 1, x, y, x * x, x * y, y * y):
+        assert (kept * term).sum(axis=(1, 2)) == pytest.approx((images * term).sum(axis=(1, 2)), abs=1e-5)
+
+
+def test_a_looser_tolerance_needs_fewer_components():
+    counts = [len(glass_of(stack(3), tolerance).basis) for tolerance in (3e-2, 3e-3, 3e-4)]
+    assert counts == sorted(set(counts))
+
+
+def test_one_image_is_what_it_was(tmp_path):
+    image = np.exp(-(np.arange(-5, 6)[None] ** 2 + np.arange(-5, 6)[:, None] ** 2) / 4)
+    fits.writeto(tmp_path / "one.fits", image, fits.Header({"OVERSAMP": 3}))
+    found = read_glass(tmp_path / "one.fits")
+    assert isinstance(found, SampledPsf)
+    assert found.per_px == 3
+
+
+def spoilt(**changes):
+    return lambda given: replace(given, **{name: change(getattr(given, name).copy()) for name, change in changes.items()})
+
+
+def put(place, value):
+    def change(array):
+        array[place] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [
+        (lambda s: replace(s, images=s.images[:, :-1]), "write images (n, height, width) of odd sides"),
+        (spoilt(images=put((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
+        (spoilt(images=put(1, 0.0)), "image 2 has samples that are not finite, or no light"),
+        (lambda s: replace(s, at=s.at[:-1]), "write one point for each image"),
+        (spoilt(at=put((0, 2), 999.0)), "give each point one image of each wavelength"),
+        (spoilt(images=lambda i: np.roll(i, 26, axis=2)), "put the chief ray there"),
+        (spoilt(images=lambda i: i - 0.3 * i.mean()), "subtract its background"),
+        (spoilt(facts=put((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
+        (spoilt(facts=put((0, 1), 1.0)), "outside_share is not within 0 to 1"),
+        (spoilt(at=lambda at: at * [1, 1, -1, 1]), "write wavelengths over 0 nm"),
+        (lambda s: replace(s, per_px=0), "0 samples a pixel; write 1 or more"),
+    ],
+)
+def test_what_is_no_glass_is_one_line(change, advice):
+    with pytest.raises(InputError) as said:
+        glass_of(change(stack(2, (450.0, 650.0))))
+    assert advice in str(said.value)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "table", "advice"),
+    [
+        ({"PSFVERS": 2}, {}, "PSFVERS is 2"),
+        ({"OVERSAMP": 1.5}, {}, "write a whole number, and T or F"),
+        ({}, {"focus_um": None}, "no column focus_um"),
+        ({}, {"weights": np.ones((8, 3))}, "write one weight for each"),
+        ({}, {"outside_share": np.full(8, 2.0)}, "outside_share"),
+        ({}, {"x_px": np.full(8, np.nan)}, "x_px, y_px or focus_um is not finite"),
+    ],
+)
+def test_a_file_that_another_program_spoilt_is_one_line(tmp_path, header, table, advice):
+    write_glass(tmp_path / "psf.fits", glass_of(stack(2, (450.0, 650.0))))
+    with fits.open(tmp_path / "psf.fits") as hdus:
+        hdus[0].header.update(header)
+        columns = [fits.Column(c.name, c.format, array=hdus[1].data[c.name]) for c in hdus[1].columns if c.name not in table]
+        columns += [fits.Column(name, f"{value[0].size}D", array=value) for name, value in table.items() if value is not None]
+        spoilt_table = fits.BinTableHDU.from_columns(columns, name="POINTS")
+        fits.HDUList([hdus[0], spoilt_table]).writeto(tmp_path / "bad.fits")
+    with pytest.raises(InputError) as said:
+        read_glass(tmp_path / "bad.fits")
+    assert advice in str(said.value)
+    assert "bad.fits" in str(said.value)
+
+
+def test_a_cube_of_images_without_points_is_refused_as_before(tmp_path):
+    fits.writeto(tmp_path / "cube.fits", np.ones((3, 5, 5)))
+    with pytest.raises(InputError, match="holds 3 images"):
+        read_glass(tmp_path / "cube.fits")
+
+
+def test_images_without_wavelengths_count_for_all_light():
+    given = stack(2, (550.0,))
+    given.at[:, 2] = np.nan
+    found = glass_of(Stack(given.images, given.at, facts_of(len(given.images)), 4))
+    assert np.isnan(found.wavelengths_nm).all()
+    assert found.weights.shape[:3] == (4, 1, 1)
+
+
+def test_detail_finer_than_a_pixel_asks_for_no_component(rng):
+    given = stack(3)
+    grain = np.where(np.indices(given.images.shape[1:]).sum(axis=0) % 2, 1.0, -1.0) * rng.uniform(
+        -0.5, 0.5, (len(given.images), 1, 1)
+    )
+    grained = replace(given, images=given.images * (1 + grain))
+    assert len(glass_of(grained).basis) < len(glass_of(given).basis) + 5  # by samples there would be 37

@@ -1,0 +1,86 @@
+"""Only the stars near the image are turned and projected, and none that is on it is lost; who clips is asked near by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import normalise, to_matrix
+from hilstar.display.geometry import monitor_camera
+from hilstar.optics.camera import Camera
+from hilstar.optics.psf import GaussianPsf, pixel_shares
+from hilstar.optics.sprites import CLIP_TOLERANCE, clipped_sprites, make_sprites, pack_sprites
+from hilstar.sky.stars import cell_grid
+from tests.support.stars import stars_at
+
+IDENTITY = np.array([1.0, 0, 0, 0])
+SIGMA = (0.85, 0.85)
+FOOTPRINT = GaussianPsf(SIGMA).footprint_px
+SIZE = (1920, 1080)
+STARS = 30_000
+FAST_KM_S = np.array([12_000.0, -9_000.0, 4_000.0])  # a twentieth of light: stars are seen up to 3 degrees away
+COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return stars_at(np.random.default_rng(3).normal(size=(STARS, 3)), np.ones(STARS))
+
+
+def seen_by_all(stars, icrs_to_image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Every star whose footprint touches the image, by projecting all of them."""
+    x_px, y_px = camera.project(stars.directions(np.arange(len(stars))) @ icrs_to_image.T)
+    return pack_sprites(x_px, y_px, stars.electrons_per_s, np.arange(len(stars)), SIZE, FOOTPRINT).star
+
+
+def in_cells_of(stars, cell_deg: float):
+    grid = cell_grid(stars.vectors, cell_deg)
+    columns = {name: getattr(stars, name)[grid.order] for name in COLUMNS}
+    return replace(stars, vectors=stars.vectors[grid.order], grid=grid, **columns)
+
+
+@pytest.mark.parametrize("focal_mm", [2000.0, 350.0, 60.0, 12.0, 3.0])  # fields of 3 to 174 degrees
+@pytest.mark.parametrize("cell_deg", [4.0, 45.0, 170.0])
+def test_no_star_on_the_image_is_lost(sky, focal_mm, cell_deg, rng):
+    camera = monitor_camera(SIZE, 57.65, focal_mm, IDENTITY)
+    stars = in_cells_of(sky, cell_deg)
+    for q in normalise(rng.normal(size=(6, 4))):
+        for velocity in (None, FAST_KM_S):
+            seen = stars.seen_at(velocity)
+            found = make_sprites(seen, to_matrix(q), camera, FOOTPRINT).star
+            assert np.array_equal(found, seen_by_all(seen, to_matrix(q), camera))
+
+
+def test_the_sides_of_a_wide_image_are_left_out_of_its_circle(sky, rng):
+    """A circle around 16:9 has 1.85 times the image's area; with cells of 4 degrees about it, two thirds remain."""
+    camera = monitor_camera(SIZE, 57.65, 200.0, IDENTITY)
+    turn = to_matrix(normalise(rng.normal(size=4)))
+    edges, radius_rad = camera.edges(6.0) @ turn, camera.field_radius_rad(6.0)
+    circle, image = sky.near(turn[2], radius_rad), sky.near(turn[2], radius_rad, edges)
+    assert np.isin(image, circle).all()
+    assert len(image) < 0.75 * len(circle)
+
+
+def test_bodies_that_have_no_place_yet_are_not_found(sky):
+    nowhere = replace(sky.grid, centre=np.full_like(sky.grid.centre, np.nan))
+    assert len(nowhere.near(np.array([0.0, 0.0, 1.0]), 1.0, np.eye(3))) == 0
+
+
+@pytest.mark.parametrize("count", [3, 450])
+def test_a_crowd_clips_where_the_light_of_all_is_over_white(count, rng):
+    """Asked of every star together, without looking for neighbours."""
+    size = (200, 120)
+    x, y = rng.uniform(-8, 207, count), rng.uniform(-8, 127, count)
+    light = rng.uniform(0.3, 1.2, count) / GaussianPsf(SIGMA).peak_share
+    sprites = pack_sprites(x, y, light, np.arange(count), size, FOOTPRINT)
+    column, row = np.rint(sprites.x_px), np.rint(sprites.y_px)
+    shares = [pixel_shares(place - own[:, None], SIGMA[0]) for place, own in ((column, sprites.x_px), (row, sprites.y_px))]
+    total = sprites.data["electrons_per_s"] @ (shares[0] * shares[1])
+    on_image = (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
+    bright = sprites.data["electrons_per_s"] > 0.5 / GaussianPsf(SIGMA).peak_share
+    over = total > 1 + CLIP_TOLERANCE
+    sure = np.abs(total - 1) > 1e-5  # of white: footprints cut 1e-6 of a star
+    clipped = np.isin(np.arange(len(sprites)), clipped_sprites(sprites, GaussianPsf(SIGMA), 1.0, size))
+    assert np.array_equal(clipped[sure], (over & on_image & bright)[sure])

@@ -1,0 +1,181 @@
+"""A sampled PSF: its light in pixels against brute force at 121 places in a pixel, and where it fails."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from hilstar.basics.errors import InputError
+from hilstar.optics.psf import MAX_SAMPLED_CUT, GaussianPsf, SampledPsf, read_psf
+from tests.support.psfs import airy, coma, gaussian, in_pixels, sampled
+
+PHASES = np.linspace(-0.5, 0.5, 11, endpoint=False) + 0.013  # beside the table's own places
+FLUX_LIMIT = 1e-7  # float32's rounding of a table whose phases sum to 1
+CENTRE_PX = 5  # within which a centroid is taken: further out the wings' end, a footprint's edge, is that of the samples
+CENTROID_LIMIT_PX = 2e-4  # the cut wings' share, of 1e-4, times how unevenly they lie
+
+
+def centroid_px(share: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """The centroid (x, y) of the pixels within CENTRE_PX."""
+    near = np.abs(pixel) <= CENTRE_PX
+    part, at = share[np.ix_(near, near)], pixel[near]
+    return np.array([(part.sum(axis=0) * at).sum(), (part.sum(axis=1) * at).sum()]) / part.sum()
+
+
+def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
+    """The largest errors of a star's flux (relative), centroid (px) and pixel (relative to its flux) over all phases."""
+    nodes = 5 if psf.footprint_px > 15 else 8
+    pixel = np.arange(psf.footprint_px) - psf.footprint_px // 2
+    found = []
+    for x, y in product(PHASES, PHASES):
+        share, true = psf.shares(pixel - x, (pixel - y)[:, None]), in_pixels(profile, pixel - x, pixel - y, nodes)
+        true /= true.sum()  # as the cut light is shared out
+        places = [centroid_px(part, pixel) for part in (share, true)]
+        found.append((abs(share.sum() - 1), np.hypot(*(places[0] - places[1])), np.abs(share - true).max()))
+    return tuple(np.max(found, axis=0).tolist())
+
+
+# Limits of a pixel: the table's step and the spline; of an Airy pattern, whose rings go on, also the light beyond its samples.
+# Measured, in this order: 1.2e-4, 6.9e-5, 2.1e-5, 1.4e-5, 1.5e-6; 7.5e-5, 5.8e-5; 8.4e-4, 5.7e-4. Centroids: 1.1e-4 px at most.
+@pytest.mark.parametrize(
+    ("profile", "per_px", "half_px", "limit"),
+    [
+        (gaussian(0.4, 0.4), 4, 4, 2e-4),
+        (gaussian(0.55, 0.55), 3, 4, 1e-4),
+        (gaussian(0.55, 1.1), 4, 7, 6e-5),
+        (gaussian(0.85, 0.85), 5, 6, 3e-5),
+        (gaussian(3.0, 3.0), 1, 18, 1e-5),
+        (coma(), 3, 7, 1.5e-4),
+        (coma(), 7, 7, 1e-4),
+        (airy(1.5), 3, 10, 1e-3),
+        (airy(2.5), 2, 10, 1e-3),
+    ],
+    ids=["0.4", "0.55", "0.55 x 1.1", "0.85", "3.0", "coma", "fine coma", "airy", "wide airy"],
+)
+def test_a_sampled_psf_has_its_light_in_the_right_pixels_at_every_phase(profile, per_px, half_px, limit):
+    flux, centroid, pixel = errors(SampledPsf(sampled(profile, per_px, half_px), per_px), profile)
+    assert flux < FLUX_LIMIT
+    assert centroid < CENTROID_LIMIT_PX
+    assert pixel < limit
+
+
+def test_an_image_that_reaches_far_keeps_its_core():
+    """A table of 99 px has coarser steps: measured 3.1e-4, and 1.2e-3 were they not doubled there."""
+    psf, light = SampledPsf(sampled(airy(1.5), 3, 48), 3), sampled(airy(1.5), 3, 48).sum() / 9
+    assert psf.footprint_px > 90
+    pixel = np.arange(-3.0, 4.0)
+    for x, y in zip(PHASES, PHASES[::-1], strict=True):
+        true = in_pixels(airy(1.5), pixel - x, pixel - y, 5) / light
+        assert np.abs(psf.shares(pixel - x, (pixel - y)[:, None]) - true).max() < 5e-4
+
+
+def test_an_image_that_is_pixel_integrated_is_interpolated_alone():
+    at = np.arange(-28, 29) / 4
+    psf = SampledPsf(in_pixels(coma(), at, at), 4, pixel_integrated=True)
+    flux, centroid, pixel = errors(psf, coma())
+    assert (flux < FLUX_LIMIT, centroid < CENTROID_LIMIT_PX, pixel < 1.5e-4) == (True, True, True)
+
+
+def test_a_sampled_gaussian_is_the_gaussian():
+    """To the cut, which is a hundred times the Gaussian's own, and the table's step."""
+    sigma = (0.6, 0.9)
+    psf, exact = SampledPsf(sampled(gaussian(*sigma), 5, 6), 5), GaussianPsf(sigma)
+    rng, pixel = np.random.default_rng(1), np.arange(-6.0, 7.0)
+    fraction, light = rng.uniform(-0.5, 0.5, (2, 100)), rng.uniform(1, 2, 100)
+    apart = np.abs(psf.stamps(fraction, light, 9) - exact.stamps(fraction, light, 9))
+    assert apart.max() < 2e-4
+    x, y = rng.uniform(-9, 9, (2, 100))
+    region = (-5, -4, 13, 10)
+    assert np.abs(psf.spread(x, y, light, region) - exact.spread(x, y, light, region)).max() < 5e-4
+    assert psf.shares(pixel, pixel[:, None]).shape == (13, 13)
+    assert psf.peak_share == pytest.approx(exact.peak_share, abs=1e-4)
+    # A Gaussian and a pixel together are not quite a Gaussian, which adaptive moments weigh by: 1.4 % at a sigma of 0.55 px.
+    assert psf.width_px == pytest.approx(sigma, rel=0.015)
+    assert psf.cut_share(5) == pytest.approx(exact.cut_share(5), rel=1e-3)
+    assert psf.outside_share(5) == pytest.approx(exact.outside_share(5), rel=2e-3)
+    assert psf.cut_share(99) == 0
+    wider, exactly = psf.blurred(0.3), exact.blurred(0.3)
+    assert np.abs(wider.stamps(fraction, light, 11) - exactly.stamps(fraction, light, 11)).max() < 2e-4
+
+
+@pytest.mark.parametrize(("profile", "half_px"), [(coma(), 7), (airy(1.5), 15), (gaussian(0.3, 1.5), 9)])
+def test_footprint_and_reach_hold_what_they_say(profile, half_px):
+    psf = SampledPsf(sampled(profile, 4, half_px), 4)
+    assert psf.footprint_px % 2 == 1
+    assert psf.cut_share(psf.footprint_px) <= MAX_SAMPLED_CUT < psf.cut_share(psf.footprint_px - 2)
+    (x2, y2), factor = psf.reach
+    pixel = np.arange(psf.footprint_px) - psf.footprint_px // 2
+    for x, y in product(PHASES[::3], PHASES[::3]):
+        share, away = psf.shares(pixel - x, (pixel - y)[:, None]), (pixel - x) ** 2 / x2 + (pixel - y)[:, None] ** 2 / y2
+        assert (share <= factor * np.exp(-away)).all()
+        assert share.max() <= psf.peak_share
+    # A star that lights its first pixel at 1 % of its light is drawn in an ellipse, not in a whole square.
+    assert np.pi * np.sqrt(x2 * y2) * np.log(100 * factor) < psf.footprint_px**2
+
+
+def test_the_chief_ray_stays_in_the_middle():
+    """The centroid of a coma is its own, and so not at the star's place."""
+    psf = SampledPsf(sampled(coma(), 5, 7), 5)
+    pixel = np.arange(-8.0, 9.0)
+    share = psf.shares(pixel, pixel[:, None])
+    truly = 0.45 * (0.28 * np.array([1.2, 0.5]) + 0.12 * np.array([3.0, 1.3]))
+    assert [float((share.sum(axis=axis) * pixel).sum()) for axis in (0, 1)] == pytest.approx(truly, abs=1e-3)
+    assert share[9, 9] > 2 * share[7, 7]  # right and down, not left and up
+
+
+def test_the_same_file_is_the_same_psf_and_another_is_not(tmp_path):
+    """A tracker that changes its bench asks by that whether its optics have changed."""
+    path = tmp_path / "psf.fits"
+    fits.writeto(path, sampled(coma(), 3, 7), fits.Header({"OVERSAMP": 3}))
+    first = read_psf(path)
+    assert (first.per_px, first.pixel_integrated) == (3, False)
+    assert read_psf(path) is first
+    fits.writeto(path, sampled(airy(1.5), 3, 7), fits.Header({"OVERSAMP": 3}), overwrite=True)
+    assert read_psf(path) != first
+
+
+def test_fewer_samples_than_two_a_sigma_are_off_by_percents():
+    """Where it fails: the spline cannot know what lies between its samples."""
+    *_, narrow = errors(SampledPsf(sampled(gaussian(0.3, 0.3), 2, 4), 2), gaussian(0.3, 0.3))
+    *_, finer = errors(SampledPsf(sampled(gaussian(0.3, 0.3), 4, 4), 4), gaussian(0.3, 0.3))
+    *_, coarse = errors(SampledPsf(sampled(gaussian(0.7, 0.7), 1, 5), 1), gaussian(0.7, 0.7))
+    assert 1e-2 < narrow < 5e-2
+    assert finer < 5e-4
+    assert 1e-4 < coarse < 5e-3
+
+
+def test_an_undersampled_psf_is_refused():
+    with pytest.raises(InputError, match=r"negative; .* more finely than 1 a pixel"):
+        SampledPsf(sampled(gaussian(0.4, 0.4), 1, 4), 1)
+
+
+def test_negative_lobes_become_black_and_many_are_refused():
+    rng, samples = np.random.default_rng(2), sampled(gaussian(0.6, 0.6), 4, 5)
+    noisy = samples + rng.normal(0, 1e-4, samples.shape) * samples.max()
+    assert noisy.min() < 0
+    psf = SampledPsf(noisy, 4)
+    flux, _, pixel = errors(psf, gaussian(0.6, 0.6))
+    assert flux < FLUX_LIMIT
+    assert pixel < 2e-3  # the noise in a pixel's 16 samples, and what its sum does to all
+    assert psf.shares(PHASES * 10, PHASES[:, None] * 10).min() >= 0
+    with pytest.raises(InputError, match="negative; subtract its background"):
+        SampledPsf(samples - 0.02 * samples.max(), 4)
+
+
+@pytest.mark.parametrize(
+    ("samples", "per_px", "integrated", "match"),
+    [
+        (np.ones((4, 5)), 1, False, "5 x 4 samples has no middle"),
+        (np.ones(5), 1, False, "no middle"),
+        (np.zeros((5, 5)), 1, False, "no light"),
+        (np.full((5, 5), np.nan), 1, False, "not finite"),
+        (np.ones((5, 5)), 0, False, "0 samples a pixel; write 1 or more"),
+        (sampled(gaussian(0.2, 0.2), 8, 3), 8, True, "write PIXINT = F"),
+    ],
+)
+def test_what_is_no_psf_is_refused(samples, per_px, integrated, match):
+    with pytest.raises(InputError, match=match):
+        SampledPsf(samples, per_px, integrated)

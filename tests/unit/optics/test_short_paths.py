@@ -1,0 +1,175 @@
+"""Short paths against exact ones: through a pinhole and a strong lens with a field of degree 6, over the whole screen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.display.geometry import monitor_camera
+from hilstar.optics import frame_motion
+from hilstar.optics.camera import Lens, ResidualField, bounded
+from hilstar.optics.frame_motion import CameraTurn, Scan, swept_sprites
+from hilstar.optics.paths import LIMIT_PX, LIMIT_SHARE, TABLE_PX, Paths, ShortPaths, _lens_table, _mapping, points_within
+from hilstar.optics.psf import GaussianPsf
+from tests.support.stars import stars_at
+
+SIZE = (1920, 1080)
+FRAME_S = 1 / 60
+HALF = 0.6  # of a frame, to both sides: a row holds its light for one, and the row is known to a tenth
+FOOTPRINT, SIGMA = 10, (0.85, 0.85)
+MARGIN_PX = FOOTPRINT / 2 + 1
+AXES = ((0.3, 0.9, 0.2), (-0.8, 0.4, 0.1), (0.9, -0.3, 0.4), (0.1, -0.1, 1.0))
+SCREEN = (0.5 * (np.array(SIZE) - 1))[:, None]
+# The grid on which a camera is tried is coarser than this screen's.
+BETWEEN_THE_TRIED = 1.2
+
+
+def lens_camera(focal_mm: float, degree: int = 6):
+    """The lens of tests/benchmarks/bench_lens.py."""
+    camera = monitor_camera(SIZE, 57.65, focal_mm, np.array([1.0, 0.0, 0.0, 0.0]))
+    x, y = np.random.default_rng(2).normal(0, 0.3, (2, (degree + 1) * (degree + 2) // 2))
+    field = ResidualField.of_terms(x, y, degree, SIZE)
+    lens = Lens((0.6, -1.0, 2.0), (1e-3, -1e-3), (0.017, -0.01), field)
+    return bounded(replace(camera, lens=lens), MARGIN_PX)
+
+
+def pinhole(focal_mm: float):
+    return replace(lens_camera(focal_mm), lens=None)
+
+
+CAMERAS = {"pinhole": pinhole(200.0), "wide": lens_camera(200.0), "narrow": lens_camera(350.0)}
+
+
+def off_px(camera, axis, half_turn_rad, points):
+    """Paths that begin all over the screen: their error (moments, stars), exact x and y (2, moments, stars), and lengths."""
+    x, y = np.meshgrid(np.linspace(-0.5, SIZE[0] - 0.5, 49), np.linspace(-0.5, SIZE[1] - 0.5, 33))
+    seen = camera.rays(x.ravel(), y.ravel()) @ camera.cam_to_image.T
+    exact = Paths(seen / np.linalg.norm(seen, axis=1, keepdims=True), np.array(axis), camera)
+    half_s = half_turn_rad / exact.speed_rad_s
+    short = ShortPaths(exact, np.full(len(seen), half_s), half_s, points)
+    moments = np.linspace(0.0, 2 * half_s, 15)
+    places = np.stack(exact.all_places_px(moments[:, None]))
+    found = np.stack([short.places_px(slice(None), np.full(len(seen), moment)) for moment in moments], axis=1)
+    return np.hypot(*(found - places)), places, np.hypot(*(places[:, -1] - places[:, 0]))
+
+
+def on_screen(places):
+    return (np.abs(places - SCREEN[:, None]) <= SCREEN[:, None] + 0.5).all(axis=0)
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("rate_deg_s", [1.0, 3.0, 10.0, 20.0, 30.0])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_a_place_is_off_by_no_more_than_the_limit_over_the_whole_screen(camera, rate_deg_s, axis):
+    half_turn_rad = np.radians(rate_deg_s) * FRAME_S * HALF
+    points = points_within(camera, half_turn_rad)
+    if points is None:
+        assert (camera, rate_deg_s) == (CAMERAS["narrow"], 30.0)  # its stars come from beyond the field's end: see below
+        return
+    off, places, length = off_px(camera, axis, half_turn_rad, points)
+    seen = on_screen(places)
+    assert seen.any(axis=0).mean() > 0.95
+    assert (off[seen] <= BETWEEN_THE_TRIED * np.maximum(LIMIT_PX, LIMIT_SHARE * length[np.nonzero(seen)[1]])).all()
+
+
+@pytest.mark.parametrize(
+    "camera", [CAMERAS["wide"], CAMERAS["narrow"], lens_camera(200.0, degree=10)], ids=["wide", "narrow", "wild"]
+)
+def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
+    """At 40 000 places, a half of them within 8 px of the image's border, where the field is steepest."""
+    size = np.array(SIZE)[:, None]
+    px = rng.uniform(-0.5, size - 0.5, (2, 40_000))
+    px[:, ::4] = np.where(px[:, ::4] < size / 2, rng.uniform(-0.5, 7.5), size - 0.5 - rng.uniform(0, 8))
+    px[0, 1::4] = rng.choice([-0.5, SIZE[0] - 0.5], 10_000)
+    table = _lens_table(*_mapping(camera))
+    found = table.along(np.stack(camera.tangents(*px)), *np.zeros((2, 2, 1)))[0]
+    off_px = np.hypot(*(found - px)).max()
+    assert 0.8 * table.off_px < off_px < 1.2 * table.off_px
+    assert (off_px < TABLE_PX) == (points_within(camera, 1e-6) == 1)
+
+
+@pytest.mark.parametrize(("points", "camera"), [(1, CAMERAS["narrow"]), (2, CAMERAS["pinhole"]), (3, CAMERAS["narrow"])])
+def test_the_limit_is_where_it_fails(points, camera):
+    """A turn that is twice the longest for its points is off by more than it may be: the limit is no mere caution."""
+    turns = np.geomspace(1e-5, 0.1, 400)
+    longest = max(turn for turn in turns if (points_within(camera, turn) or 9) <= points)
+    worst = 0.0
+    for axis in AXES:
+        off, places, length = off_px(camera, axis, 2 * longest, points)
+        allowed = np.maximum(LIMIT_PX, LIMIT_SHARE * length)
+        worst = max(worst, float((off / allowed)[on_screen(places)].max()))
+    assert worst > 1
+
+
+def test_a_turn_too_long_for_a_few_points_has_exact_paths():
+    """Of 350 mm at 30 deg/s a star of the border comes from 60 px outside: past FIELD_EDGE, where the field stands still."""
+    camera = CAMERAS["narrow"]
+    half_turn_rad = np.radians(30.0) * FRAME_S
+    assert points_within(camera, half_turn_rad) is None
+    worst = []
+    for axis in AXES:
+        off, places, length = off_px(camera, axis, half_turn_rad, 3)
+        worst.append((off / np.maximum(LIMIT_PX, LIMIT_SHARE * length))[on_screen(places)].max())
+    assert max(worst) > 1
+    assert points_within(camera, 0.0) is None
+
+
+@pytest.mark.parametrize("rate_deg_s", [0.5, 5.0, 25.0])
+@pytest.mark.parametrize("camera", [pinhole(350.0), lens_camera(350.0)], ids=["pinhole", "lens"])
+def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng, monkeypatch):
+    """The same stars and light: also of those that cross the border, or the end of the lens beyond its corner."""
+    q, axis = from_radec_roll_deg(84.0, -1.0, 20.0), np.array([0.4, -0.7, 0.3])
+    turn = CameraTurn(q, np.radians(rate_deg_s) * axis / np.linalg.norm(axis))
+    reach = camera.field_radius_rad(MARGIN_PX) * 1.3
+    u, v = rng.uniform(-np.tan(reach), np.tan(reach), (2, 3000))
+    image = np.column_stack([u, v, np.ones(3000)])
+    stars = stars_at(image @ (camera.cam_to_image @ to_matrix(q)), np.ones(3000))
+    scan = Scan((0, 1), FRAME_S, FRAME_S)
+    short = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
+    monkeypatch.setattr(frame_motion, "points_within", lambda camera, half_turn_rad: None)
+    monkeypatch.setattr(type(camera), "in_view", lambda self, seen, margin_px, reach_rad: np.arange(len(seen)))
+    exact = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
+    places = [_means(sprites) for sprites in (short, exact)]
+    (light, *of_short), (true, *of_exact) = places
+    assert np.abs(light - true).max() < 0.02  # a path that ends at the border may have a node more or less there
+    whole = (light > 0.999) & (true > 0.999)
+    assert whole.sum() > 500
+    path_px = np.radians(rate_deg_s) * FRAME_S * camera.scales_px_rad()[1]
+    # The row's moment is found from short places too: twice their error.
+    limit_px = 2 * max(LIMIT_PX, 2 * LIMIT_SHARE * path_px)
+    assert np.hypot(*(a[whole] - b[whole] for a, b in zip(of_short, of_exact, strict=True))).max() < limit_px
+
+
+def _means(sprites):
+    """The light of each of 3000 stars, and its mean x and y."""
+    light = np.bincount(sprites.star, sprites.data["electrons_per_s"], 3000)
+    sums = (np.bincount(sprites.star, sprites.data["electrons_per_s"] * at, 3000) for at in (sprites.x_px, sprites.y_px))
+    return light, *(total / np.maximum(light, 1e-9) for total in sums)
+
+
+@pytest.mark.parametrize("reach_deg", [0.0, 0.3, 20.0])
+@pytest.mark.parametrize("camera", [pinhole(200.0), lens_camera(200.0)], ids=["pinhole", "lens"])
+def test_no_direction_in_view_is_culled(camera, reach_deg, rng):
+    """Random places on the image and its margin, turned away by up to the reach."""
+    x, y = (rng.uniform(-0.5 - MARGIN_PX, size - 0.5 + MARGIN_PX, 4000) for size in SIZE)
+    seen = camera.rays(x, y) @ camera.cam_to_image.T
+    seen = seen[np.isfinite(seen[:, 0])]
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    aside = np.cross(seen, rng.normal(size=seen.shape))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    angle = np.radians(reach_deg) * rng.uniform(0.9, 1.0, (len(seen), 1))
+    away = seen * np.cos(angle) + aside * np.sin(angle)
+    assert len(camera.in_view(away, MARGIN_PX, np.radians(reach_deg))) == len(away)
+
+
+def test_directions_beside_the_image_are_culled(rng):
+    camera = lens_camera(200.0)
+    around = rng.normal(size=(20_000, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    kept = camera.in_view(around, MARGIN_PX, 0.0)
+    x, y = camera.project(around)
+    seen = (np.abs(x - SCREEN[0]) < 960) & (np.abs(y - SCREEN[1]) < 540)
+    assert 0 < seen.sum() <= len(kept) < 1.3 * seen.sum()

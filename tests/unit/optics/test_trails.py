@@ -1,0 +1,171 @@
+"""Streaks of satellites against light that is summed up moment by moment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.psf import GaussianPsf, pixel_shares
+from hilstar.optics.sprites import Sprites
+from hilstar.optics.trails import Brush, Lit, Trails, TrailView, trails, with_trails
+from hilstar.sky.bodies.passes import Cone
+from tests.support.satellites import element_set, satellite_sky
+from tests.support.stars import sprites_at
+
+SIGMA_PX = (0.7, 0.9)
+SIZE_PX = (160, 120)
+BRUSH = Brush(GaussianPsf(SIGMA_PX), 2000)
+CAMERA = Camera(SIZE_PX, 3000.0, (79.5, 59.5), np.eye(3))
+MOMENTS = 400
+# Measured 4e-4 of a satellite's light; 1e-3 is what stars' paths may be off.
+PIXEL_LIMIT = 1e-3
+FLUX_LIMIT = 1e-5  # the midpoints of 400 moments, where the light changes; float32
+# One over the poles, which crosses the station's path
+LIST = "OTHER\n" + element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
+NORTH = np.array([0.0, 0.0, 1.0])
+
+
+def looking_at(direction: np.ndarray) -> np.ndarray:
+    """The quaternion of a camera with its axis there."""
+    half = np.array([0.0, 0.0, 1.0]) + direction
+    half /= np.linalg.norm(half)
+    # Half a turn about the middle of both takes one to the other.
+    return np.array([0.0, *half])
+
+
+def lit_moment(text: str, table: str = "norad\n") -> tuple[object, int]:
+    """A sky, and a moment at which its satellite is lit and within 2000 km."""
+    sky = satellite_sky(text, table=table)
+    for seconds in range(0, 86_400, 20):
+        seen = sky.passing(Cone(NORTH, np.pi, 0.0), seconds * 10**9)
+        if seen is not None and np.linalg.norm(seen.seen_km[0, 0]) < 2000 and rate_now(seen) > 0:
+            return sky, seconds * 10**9
+    raise AssertionError("it never is")
+
+
+def rate_now(seen) -> float:
+    zero = np.zeros(1)
+    return float(seen.rates_e_per_s(np.array([0]), zero, zero)[0])
+
+
+def is_lit(sky, seconds: int) -> bool:
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), seconds * 10**9)
+    return seen is not None and rate_now(seen) > 0
+
+
+def image_of(sprites: Sprites) -> np.ndarray:
+    """Sprites as exact Gaussians, (h, w)."""
+    return gaussians(sprites.x_px, sprites.y_px, sprites.data["electrons_per_s"].astype(np.float64))
+
+
+def gaussians(x_px: np.ndarray, y_px: np.ndarray, light: np.ndarray) -> np.ndarray:
+    across = pixel_shares(np.arange(SIZE_PX[0]) - x_px[:, None], SIGMA_PX[0])
+    down = pixel_shares(np.arange(SIZE_PX[1]) - y_px[:, None], SIGMA_PX[1])
+    return (down * light[:, None]).T @ across
+
+
+def moment_by_moment(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float) -> np.ndarray:
+    """The mean image, each moment from a pass of its own and an attitude of its own."""
+    places, light = [], []
+    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * exposure_s:
+        seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + round(seconds * 1e9))
+        if seen is None:
+            continue
+        direction = seen.directions(slice(None), np.zeros(1)) @ to_matrix(propagate(q, rate, seconds)).T
+        places.append([float(place[0]) for place in CAMERA.project(direction)])
+        half = np.array([exposure_s / MOMENTS / 2])
+        light.append(float(seen.rates_e_per_s(np.array([0]), -half, half)[0]) / MOMENTS)
+    return gaussians(*np.array(places).T, np.array(light)) if places else np.zeros(SIZE_PX[::-1])
+
+
+def streak(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float) -> Trails:
+    seen = sky.passing(Cone(to_matrix(q)[2], 0.5, exposure_s / 2), t_ns)
+    view = TrailView(CAMERA, to_matrix(q), rate)
+    return trails(seen, view, Lit(np.full(len(seen), -exposure_s / 2), exposure_s), BRUSH)
+
+
+@pytest.mark.parametrize("rate_deg_s", [(0.0, 0.0, 0.0), (1.5, -2.0, 10.0)])
+@pytest.mark.parametrize("exposure_s", [0.02, 0.4, 2.0])
+def test_a_streak_is_the_light_of_all_its_moments(rate_deg_s, exposure_s):
+    sky, t_ns = lit_moment(LIST)
+    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    found = streak(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
+    wanted = moment_by_moment(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
+    total = wanted.sum()
+    assert found.electrons_per_s[0] == pytest.approx(total, rel=5e-4) or exposure_s == 2.0  # part of it is off the image
+    assert image_of(found.sprites).sum() == pytest.approx(total, rel=5e-4)
+    assert np.abs(image_of(found.sprites) - wanted).max() < PIXEL_LIMIT * total
+    assert np.allclose(to_matrix(q) @ found.middle[0], [0, 0, 1], atol=1e-6)
+
+
+def test_its_length_is_its_own_rate_against_the_camera_s():
+    """Seen by a camera at rest: the angle between the directions at both ends."""
+    sky, t_ns = lit_moment(LIST)
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns)
+    q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
+    at_rest = Cone(NORTH, np.pi, 0.0)
+    ends = [sky.passing(at_rest, t_ns + k).directions(slice(None), np.zeros(1))[0] for k in (-500_000_000, 500_000_000)]
+    length_px = 3000 * np.linalg.norm(ends[1] - ends[0])
+    found = streak(sky, t_ns, q, np.zeros(3), 1.0).sprites
+    wide_px = np.hypot(np.ptp(found.x_px), np.ptp(found.y_px))
+    assert length_px > 1
+    assert wide_px == pytest.approx(length_px * (1 - 1 / len(found)), rel=1e-3)  # from the first sprite to the last
+
+
+def test_a_flash_shines_where_the_satellite_is_at_its_time():
+    sky, t_ns = lit_moment(LIST)
+    at_s = t_ns / 1e9 + 0.3
+    table = f"norad,period_s,amplitude_mag,flash_s,flash_at_s\n7,10,5,0.01,{at_s}\n"
+    flashing, _ = lit_moment(LIST, table)
+    q = looking_at(flashing.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    rate = np.radians([0.0, 1.0, 0.0])
+    found, plain = (streak(one, t_ns, q, rate, 1.0) for one in (flashing, sky))
+    bright = found.sprites.data["electrons_per_s"] / plain.sprites.data["electrons_per_s"]
+    # 99 times the steady light for 0.01 s at half height
+    extra = 99 * 0.01 * np.sqrt(np.pi / (4 * np.log(2)))
+    assert found.electrons_per_s[0] / plain.electrons_per_s[0] == pytest.approx(1 + extra, rel=0.01)
+    there = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + 300_000_000).directions(slice(None), np.zeros(1))
+    x_px, y_px = CAMERA.project(there @ to_matrix(propagate(q, rate, 0.3)).T)
+    k = int(np.argmax(bright))
+    assert np.hypot(found.sprites.x_px[k] - x_px[0], found.sprites.y_px[k] - y_px[0]) < 0.3 * max(SIGMA_PX)
+
+
+def test_a_path_into_the_shadow_ends_there():
+    sky, _ = lit_moment(LIST)
+    seconds = 0
+    for step in (60, 4, 1):
+        while not is_lit(sky, seconds):
+            seconds += step
+        while is_lit(sky, seconds):
+            seconds += step
+        seconds -= step
+    t_ns = (seconds - 3) * 10**9
+    seen = sky.passing(Cone(NORTH, np.pi, 5.0), t_ns)
+    q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
+    found = streak(sky, t_ns, q, np.zeros(3), 10.0)
+    wanted = moment_by_moment(sky, t_ns, q, np.zeros(3), 10.0)
+    assert wanted.sum() > 0
+    assert image_of(found.sprites).sum() == pytest.approx(wanted.sum(), rel=0.01)  # a sprite each 0.25 s; measured 0.3 %
+
+
+def test_streaks_follow_the_stars_of_an_image():
+    sky, t_ns = lit_moment(LIST)
+    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    found = streak(sky, t_ns, q, np.zeros(3), 0.5)
+    stars = sprites_at(np.array([[5.0, 6.0], [7.0, 8.0]]), np.array([1.0, 2.0]), BRUSH.psf.footprint_px)
+    both = with_trails(stars, found, 100)
+    assert both.star.tolist() == [0, 1] + [100] * len(found.sprites)
+    assert both.per_star == len(found.sprites) > 1
+    assert both.star_count == 3
+
+
+def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
+    sky, t_ns = lit_moment(LIST)
+    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    seen = sky.passing(Cone(to_matrix(q)[2], 0.5, 1.0), t_ns)
+    lit, view = Lit(np.array([-1.0]), 2.0), TrailView(CAMERA, to_matrix(q), np.zeros(3))
+    fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))
+    assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
+    assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)

@@ -1,0 +1,280 @@
+"""Trackers' bytes to answers: each framing in closed form, however it is cut, and never by a damaged frame."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from cobs import cobs
+
+from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import angle_between_rad, conjugate, from_radec_roll_deg, multiply
+from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.explain import lines_of, under_conventions
+from hilstar.server.answers.formats import MAX_KEPT_BYTES, AnswerDecoder, RefusedAnswer
+from hilstar.server.bench.config.answers import AnswersSettings, check_answers
+
+Q = from_radec_roll_deg(283.021, 35.349, 30.0)
+SCALE = 2.0**-31
+ROUNDED_RAD = 4 * SCALE  # a quaternion of int32
+FIELDS: list[dict[str, Any]] = [
+    {"name": "t_s", "at": 4, "type": "u32be"},
+    {"name": "t_sub", "at": 8, "type": "u16be", "scale": 2.0**-16},
+    *({"name": name, "at": 10 + 4 * k, "type": "i32be", "scale": SCALE} for k, name in enumerate(("qx", "qy", "qz", "qw"))),
+    {"name": "valid", "at": 26, "type": "u8", "mask": 1},
+    {"name": "mode", "at": 26, "type": "u8", "mask": 0x30},
+    {"name": "stars", "at": 27, "type": "u8"},
+    {"name": "wx", "at": 28, "type": "i24be", "scale": 1e-6},
+    {"name": "wy", "at": 31, "type": "i24be", "scale": 1e-6},
+    {"name": "wz", "at": 34, "type": "i24be", "scale": 1e-6},
+]
+BODY_BYTES = 37
+# The check values of 123456789 in the catalogue of parametrised CRC algorithms, and by hand.
+CHECKS = {"crc16-ccitt-false": 0x29B1, "crc16-xmodem": 0x31C3, "crc32": 0xCBF43926, "sum8": 0xDD, "xor8": 0x31}
+
+
+def settings_of(**keys: Any) -> AnswersSettings:
+    settings = msgspec.convert({"source": "udp", "format": "frame", "fields": FIELDS, **keys}, AnswersSettings)
+    check_answers(settings)
+    return settings
+
+
+def decoder_of(*, messages: bool = False, mounted: Any = None, **keys: Any) -> AnswerDecoder:
+    return AnswerDecoder(settings_of(**keys), mounted, messages)
+
+
+def crc16(data: bytes, value: int = 0xFFFF) -> int:
+    """CRC-16 of the polynomial 0x1021, bit by bit."""
+    for byte in data:
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1 ^ (0x1021 if value & 0x8000 else 0)) & 0xFFFF
+    return value
+
+
+def body_of(q: np.ndarray = Q, seconds: int = 1000, valid: int = 1) -> bytes:
+    numbers = struct.pack(">4i", *(round(part / SCALE) for part in (*q[1:], q[0])))
+    rates = b"".join(int(rate).to_bytes(3, "big", signed=True) for rate in (1, -2, 300_000))
+    return b"\x1a\xcf\x21\x27" + struct.pack(">IH", seconds, 0x8000) + numbers + bytes([valid | 0x20, 12]) + rates
+
+
+def sealed(body: bytes) -> bytes:
+    return body + struct.pack(">H", crc16(body))
+
+
+def slip(body: bytes) -> bytes:
+    return body.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+
+
+def ccsds(body: bytes) -> bytes:
+    packet = struct.pack(">HHH", 0x0812, 0xC000, len(body) + 2 - 1) + body
+    return packet + struct.pack(">H", crc16(packet))
+
+
+SYNC = {"framing": "sync", "sync_hex": "1A CF", "length": {"at": 3, "type": "u8"}, "checksum": "crc16-ccitt-false"}
+CCSDS_FIELDS = [{**field, "at": field["at"] + 6} for field in FIELDS]
+FRAMINGS: dict[str, tuple[dict[str, Any], Any]] = {
+    "sync": (SYNC, sealed),
+    "slip": ({"framing": "slip", "checksum": "crc16-ccitt-false"}, lambda body: slip(sealed(body))),
+    "cobs": ({"framing": "cobs", "checksum": "crc16-ccitt-false"}, lambda body: cobs.encode(sealed(body)) + b"\0"),
+    "fixed": ({"framing": "fixed", "length": BODY_BYTES + 2, "checksum": "crc16-ccitt-false"}, sealed),
+    "ccsds": ({"framing": "ccsds", "checksum": "crc16-ccitt-false", "fields": CCSDS_FIELDS}, ccsds),
+}
+
+
+def answers(found: list[Answer | RefusedAnswer]) -> list[Answer]:
+    return [each for each in found if isinstance(each, Answer)]
+
+
+@pytest.mark.parametrize("name", FRAMINGS)
+def test_a_declared_frame_gives_every_field(name):
+    keys, framed_as = FRAMINGS[name]
+    (found,) = answers(decoder_of(**keys).feed(5, framed_as(body_of())))
+    assert found.q_icrs_to_cam is not None
+    assert found.rate_cam_rad_s is not None
+    assert angle_between_rad(found.q_icrs_to_cam, Q) < ROUNDED_RAD
+    assert found.rate_cam_rad_s == pytest.approx([1e-6, -2e-6, 0.3], rel=1e-12)
+    assert (found.host_ns, found.t_ns, found.valid, found.mode, found.star_count) == (5, 1_000_500_000_000, True, "2", 12)
+
+
+@pytest.mark.parametrize("name", FRAMINGS)
+def test_however_a_stream_is_cut_the_answers_are_the_same(name, rng):
+    keys, framed_as = FRAMINGS[name]
+    frames = [framed_as(body_of(seconds=k)) for k in range(20)]
+    stream = b"\0" + b"".join(frame + rng.bytes(4 * (k % 3 == 0)) for k, frame in enumerate(frames))
+    whole = [answer.t_ns for answer in answers(decoder_of(**keys).feed(0, stream))]
+    assert len(whole) >= 4  # garbage that looks like a header, or hides a delimiter, takes frames after it along
+    bits, decoder = [], decoder_of(**keys)
+    for byte in stream:
+        bits += answers(decoder.feed(0, bytes([byte])))
+    assert [answer.t_ns for answer in bits] == whole
+
+
+@pytest.mark.parametrize("name", FRAMINGS)
+def test_no_damaged_frame_is_taken_for_an_answer(name, rng):
+    """Some 100 000 mutated bytes of each framing: a wrong answer would need a CRC-16 that is right by chance, 1 in 65 536."""
+    keys, framed_as = FRAMINGS[name]
+    decoder, good, taken = decoder_of(**keys), framed_as(body_of()), 0
+    for _ in range(2500):
+        mutant = bytearray(good)
+        for _ in range(int(rng.integers(1, 5))):
+            place = int(rng.integers(len(mutant)))
+            mutant[place] ^= int(rng.integers(1, 256))
+        if rng.random() < 0.3:
+            mutant[int(rng.integers(len(mutant))) :] = rng.bytes(int(rng.integers(20)))
+        for found in answers(decoder.feed(0, bytes(mutant))):
+            taken += 1
+            assert found.t_ns == 1_000_500_000_000  # the frame as it was, of changes that undid each other
+    kept: bytearray = decoder._cutter._kept  # type: ignore[union-attr]
+    assert taken < 250
+    assert len(kept) <= MAX_KEPT_BYTES
+    late = decoder.feed(10**9, b"\0\xc0" + 60 * b"\0" + good * 3) + decoder.feed(2 * 10**9, good)
+    # What looks like a header waits for a pause; what stands before a delimiter goes with the garbage.
+    assert [found.t_ns for found in answers(late)][-3:] == [1_000_500_000_000] * 3
+
+
+@pytest.mark.parametrize("checksum", CHECKS)
+def test_each_checksum_has_its_check_value(checksum):
+    keys = {"framing": "fixed", "length": 60, "checksum": checksum, "checksum_at": 9}
+    decoder = decoder_of(**keys)
+    size = {"crc32": 4, "sum8": 1, "xor8": 1}.get(checksum, 2)
+    right = CHECKS[checksum].to_bytes(size, "big")
+    assert decoder.frames.fault(b"123456789" + right) == ""
+    assert decoder.frames.fault(b"123456788" + right)
+    assert zlib.crc32(b"123456789") == CHECKS["crc32"]
+
+
+def test_conventions_are_undone():
+    body_to_cam = np.array([0.5, 0.5, 0.5, 0.5])
+    for scalar in ("first", "last"):
+        for direction in ("icrs_to_cam", "cam_to_icrs"):
+            for frame in ("cam", "body"):
+                sent = Q if frame == "cam" else multiply(conjugate(body_to_cam), Q)
+                sent = sent if direction == "icrs_to_cam" else conjugate(sent)
+                sent = sent if scalar == "first" else np.roll(sent, -1)
+                convention = {"scalar": scalar, "direction": direction, "frame": frame}
+                decoder = AnswerDecoder(
+                    settings_of(format="json", fields=[], convention=convention), tuple(body_to_cam.tolist()), True
+                )
+                (found,) = answers(decoder.feed(0, msgspec.json.encode({"t_ns": 1, "q": sent.tolist()})))
+                assert found.q_icrs_to_cam is not None
+                assert angle_between_rad(found.q_icrs_to_cam, Q) < 1e-7
+                marked = [each.convention for each in under_conventions(found, decoder, Q) if each.matches]
+                assert [msgspec.to_builtins(each) for each in marked] == [convention]
+
+
+def test_a_wrong_convention_is_named_with_what_to_write():
+    decoder = decoder_of(format="json", fields=[])
+    (found,) = decoder.feed(0, msgspec.json.encode({"q": np.roll(Q, -1).tolist()}) + b"\n")
+    said = "\n".join(lines_of(found, decoder, Q))
+    assert 'write [answers] convention = { scalar = "last", direction = "icrs_to_cam", frame = "cam" }' in said
+    assert "no convention matches" in "\n".join(lines_of(found, decoder, from_radec_roll_deg(10.0, 80.0, 5.0)))
+
+
+def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
+    packet = AnswerPacket(7, 1 | 2 | 8, 42, tuple(Q.tolist()), (0.0, 0.25, 0.0), 9)
+    for messages, sent in ((True, encode(packet)), (False, b"\0" + framed(encode(packet)))):
+        (found,) = answers(decoder_of(messages=messages, format="packet", fields=[]).feed(0, sent))
+        assert (found.t_ns, found.star_count, found.mode, found.valid) == (42, 9, "tracking", True)
+    (lost,) = answers(
+        decoder_of(messages=True, format="packet", fields=[]).feed(0, encode(AnswerPacket(8, 4, 43, (0.0, 0.0, 0.0, 0.0))))
+    )
+    assert (lost.valid, lost.q_icrs_to_cam, lost.mode) == (False, None, "lost in space")
+
+
+REFUSED_JSON = {
+    b'{"q": [1, 0, 0]}': "format",
+    b'{"q": [2, 0, 0, 0]}': "norm",
+    b'{"q": [NaN, 0, 0, 0]}': "nan",
+    b'{"q": [1, 0, 0, 0], "t_ns": 1e300}': "format",
+    b"[" * 5000: "format",
+    b"\xff\xfe": "format",
+}
+
+
+@pytest.mark.parametrize("line", REFUSED_JSON)
+def test_a_wrong_json_answer_is_refused_with_its_reason(line):
+    (found,) = decoder_of(format="json", fields=[]).feed(0, line + b"\n")
+    assert isinstance(found, RefusedAnswer)
+    assert found.reason == REFUSED_JSON[line]
+
+
+def test_centroids_that_are_none_are_left_out():
+    said = b'{"q":[1,0,0,0],"centroids":[[1.5,2.5,300,11767],[null,1],[3],[4,5]]}\n'
+    (found,) = answers(decoder_of(format="json", fields=[]).feed(0, said))
+    assert [tuple(star) for star in found.centroids] == [(1.5, 2.5, 300.0, 11767), (4.0, 5.0, None, None)]
+
+
+def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
+    (tmp_path / "my_tracker.py").write_text(
+        "def decode(data):\n"
+        "    if data == b'boom':\n"
+        "        raise KeyError('x')\n"
+        "    yield {'t_ns': len(data), 'q': [0, 1, 0, 0], 'stars': 4}\n"
+        "    yield {'q': 'none'}\n"
+    )
+    decoder = AnswerDecoder(settings_of(format="python:my_tracker:decode", fields=[]), None, False, tmp_path)
+    good, bad = decoder.feed(0, b"abc")
+    assert isinstance(good, Answer)
+    assert (good.t_ns, good.star_count) == (3, 4)
+    (raised,) = decoder.feed(0, b"boom")
+    assert [getattr(each, "reason", "") for each in (bad, raised)] == ["format", "python"]
+    sys.modules.pop("my_tracker")
+    with pytest.raises(InputError, match="name a module beside the bench file"):
+        AnswerDecoder(settings_of(format="python:no_such_module:decode", fields=[]), None, False, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["os:system", "subprocess:run", "numpy:load", "os.path:join", "json:loads", "builtins:exec"])
+def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(tmp_path: Path, name: str):
+    module, _, _ = name.partition(":")
+    with pytest.raises(InputError, match="stands in"):
+        AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
+    (tmp_path / f"{module.partition('.')[0]}.py").write_text("")  # nor does a file of that name let it in
+    with pytest.raises(InputError, match="is the name of a module of Python or of hilstar"):
+        AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
+
+
+def test_a_package_that_is_trusted_may_be_named_and_only_that(tmp_path: Path):
+    AnswerDecoder(settings_of(format="python:json:loads", fields=[], trust=["json"]), None, False, tmp_path)
+    with pytest.raises(InputError, match="stands in"):
+        AnswerDecoder(settings_of(format="python:os:system", fields=[], trust=["json"]), None, False, tmp_path)
+
+
+def test_modules_of_one_name_in_two_folders_are_two(tmp_path: Path):
+    for k in range(2):
+        (folder := tmp_path / str(k)).mkdir()
+        (folder / "same_name.py").write_text("import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]")
+        (folder / "beside.py").write_text("T = 7")
+        decoder = AnswerDecoder(settings_of(format="python:same_name:decode", fields=[]), None, False, folder)
+        assert [each.t_ns for each in decoder.feed(0, b"")] == [7]
+
+
+WRONG = {
+    "needs framing": {},
+    "needs sync_hex": {"framing": "sync", "length": 39},
+    "needs length": {"framing": "fixed"},
+    "ends with byte 36": {"framing": "fixed", "length": 36},
+    "lacks qw": {"framing": "slip", "fields": [{"name": "qx", "at": 0, "type": "f32"}]},
+    "twice": {"framing": "slip", "fields": [*FIELDS, FIELDS[0]]},
+    "u8, i8, u16": {"framing": "slip", "fields": [{**FIELDS[0], "type": "f16"}, *FIELDS[1:]]},
+    'port is for source = "serial" or "udp"': {"framing": "slip", "source": "file", "port": "/dev/x", "path": "x"},
+    "needs connect": {"framing": "slip", "poll_hex": "00"},
+    "one of them": {"framing": "slip", "source": "tcp"},
+    'is for format = "frame"': {"format": "json"},
+    "python:MODULE:FUNCTION": {"format": "xml", "fields": []},
+    "allow does not say": {"framing": "slip", "bind": "0.0.0.0:7000"},
+}
+
+
+@pytest.mark.parametrize("said", WRONG)
+def test_a_wrong_declaration_is_refused_with_what_to_write(said):
+    with pytest.raises(InputError) as refused:
+        settings_of(**WRONG[said])
+    assert said in str(refused.value)

@@ -1,0 +1,302 @@
+"""A tracker's answers against the frames that were lit while it looked."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilstar.basics.process.scheduling import UnixOffset
+from hilstar.basics.rotation import from_rotation_vector, multiply, propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.server.answers import judge as judge_module
+from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.judge import VERDICTS, AnswerJudge, AnswerRules, AnswerTimes, fitted_delay
+from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
+
+PERIOD_NS = NS_PER_S // 60
+EXPOSURE_S, ANSWER_HZ = 0.1, 10.0
+START = np.array([0.5, 0.5, -0.5, 0.5])
+
+
+def attitude(t_s: float) -> np.ndarray:
+    """A turn about two axes, whose rate changes by 0.6 deg/s."""
+    turn = np.radians(0.3) * np.array([2.0 * np.sin(0.5 * t_s), 1.5 * np.sin(0.8 * t_s), t_s])
+    return multiply(from_rotation_vector(turn), START)
+
+
+def lit_until(t_s: float, **keys) -> LitFrames:
+    frames = LitFrames(PERIOD_NS, **keys)
+    for k in range(int(t_s * 60)):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude(k * PERIOD_NS / NS_PER_S)))
+    return frames
+
+
+def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn():
+    frames, rate = LitFrames(PERIOD_NS), np.radians([0.2, -0.4, 1.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+    lit = frames.over(round(1.0 * NS_PER_S), round(1.2 * NS_PER_S))
+    truth = propagate(START, rate, 1.1)
+    # Frames stand for the time about their moment, and ends of the exposure cut two of them: within 0.01 of a frame's turn.
+    assert np.abs(residual_arcsec(truth, lit.q)).max() < 0.01 * 3600 / 60
+    assert lit.rate_rad_s == pytest.approx(rate, rel=1e-3, abs=1e-7)
+    assert lit.light_ns == round(1.1 * NS_PER_S) + 7
+    assert (lit.first, lit.last) == (60, 72)
+
+
+def test_a_screen_that_holds_still_frames_shows_them_half_a_frame_late():
+    frames, rate = LitFrames(PERIOD_NS, centred=False), np.radians([0.0, 1.0, 0.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
+    assert np.abs(residual_arcsec(propagate(START, rate, 1.1 - 0.5 / 60), lit.q)).max() < 0.01 * 3600 / 60
+
+
+def test_frames_drawn_in_motion_have_the_attitude_of_the_middle_of_their_light():
+    frames, rate = LitFrames(PERIOD_NS, hold_s=1 / 60, centred=True), np.radians([0.0, 1.0, 0.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S), rate))
+    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
+    assert np.abs(residual_arcsec(propagate(START, rate, 1.1), lit.q)).max() < 0.01 * 3600 / 60
+
+
+def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
+    dark, jumping = LitFrames(PERIOD_NS), LitFrames(PERIOD_NS)
+    away = from_rotation_vector(np.radians([0.0, 30.0, 0.0]))
+    for k in range(60):
+        dark.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
+        jumping.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START if k < 30 else multiply(away, START)))
+    assert dark.over(0, NS_PER_S // 4) is not None
+    assert dark.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is None
+    assert dark.dark_ns == 28 * PERIOD_NS
+    assert jumping.over(round(0.4 * NS_PER_S), round(0.6 * NS_PER_S)) is None
+    assert jumping.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is not None
+    assert jumping.over(-NS_PER_S, 0) is None
+
+
+BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20.0])
+LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
+
+
+def judged(clock: str, seconds: float = 60.0, wild: float = 0.01, **rules) -> tuple[AnswerJudge, list]:
+    """A minute of a planted tracker: bias, noise, a clock that runs fast, late by LATENCY_S and more, and wild answers."""
+    rng = np.random.default_rng(3)
+    frames = LitFrames(PERIOD_NS)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock, **rules), frames)
+    found, k = [], 0
+    for i in range(int(seconds * ANSWER_HZ)):
+        middle_s = 0.2 + i / ANSWER_HZ
+        host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
+        while k * PERIOD_NS < host_ns:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            k += 1
+        error = (BIAS_ARCSEC + NOISE_ARCSEC * rng.standard_normal(3)) / ARCSEC_PER_RAD
+        if rng.random() < wild:
+            error = rng.uniform(0.1, 1.0, 3)
+        q = multiply(from_rotation_vector(error), attitude(middle_s))
+        middle_ns = round(middle_s * NS_PER_S)
+        t_ns = middle_ns if clock == "host" else round(middle_ns * (1 + DRIFT)) + EPOCH_NS
+        found.append((judge.judge(Answer(host_ns, b"", t_ns, q)), np.linalg.norm(error) > 0.1))
+    return judge, found
+
+
+@pytest.mark.parametrize("clock", ["host", "own"])
+def test_the_last_minutes_residual_is_the_planted_error(clock):
+    judge, found = judged(clock)
+    figures = judge.figures(found[-1][0].answer.host_ns + NS_PER_S // 20, {"checksum": 3})
+    wild = [is_wild for _, is_wild in found]
+    assert [each.verdict == "wrong" for each, _ in found] == wild
+    assert figures.wrong == sum(wild) > 0
+    # The mean of n answers within four of its sigmas, and of the rate (0.3 deg/s rms) times the time's 2 ms.
+    sigma = 4 * NOISE_ARCSEC / np.sqrt(600) + 1080 * 0.002
+    assert np.abs(np.array(figures.mean_arcsec) - BIAS_ARCSEC).max() < sigma.max()
+    assert np.array(figures.sigma3_arcsec) == pytest.approx(3 * NOISE_ARCSEC, rel=0.2)
+    assert figures.latency_ms / 1e3 == pytest.approx(LATENCY_S, abs=0.02 if clock == "own" else 4 * JITTER_S)
+    assert figures.availability == pytest.approx(1 - sum(wild) / len(wild), abs=0.004)
+    assert figures.rate_hz == pytest.approx(ANSWER_HZ, rel=0.01)
+    assert figures.refused == {"checksum": 3}
+    assert figures.silent == ""
+    assert judge.figures(found[-1][0].answer.host_ns + 3 * NS_PER_S, {}).silent.endswith("has not answered for 3.0 s")
+
+
+def test_a_stated_latency_is_taken_and_not_fitted():
+    judge, _ = judged("own", 5.0, latency_s=0.1)
+    assert judge.times.delay_s == 0.1 and not judge.times.fits
+
+
+def test_an_answer_without_attitude_or_of_a_dark_sky_is_neither_right_nor_wrong():
+    frames = lit_until(1.0)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    at_ns = NS_PER_S // 2
+    assert judge.judge(Answer(at_ns, b"", at_ns, START, valid=False)).verdict == "invalid"
+    assert judge.judge(Answer(at_ns, b"", at_ns)).verdict == "invalid"
+    assert judge.judge(Answer(at_ns, b"", 30 * NS_PER_S, START)).verdict == "unpaired"
+    assert judge.judge(Answer(at_ns, b"", at_ns, attitude(0.5))).verdict == "right"
+    assert judge.judge(Answer(at_ns, b"", at_ns, -attitude(0.5))).verdict == "right"
+    figures = judge.figures(at_ns, {})
+    assert (figures.answers, figures.right, figures.invalid, figures.unpaired) == (5, 2, 2, 1)
+
+
+def test_a_silent_tracker_is_told_before_its_first_answer():
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), LitFrames(PERIOD_NS))
+    assert judge.figures(0, {}).silent == ""
+    assert judge.figures(4 * NS_PER_S, {}).silent == "the tracker has not answered yet"
+
+
+def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
+    monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 100)
+    frames = LitFrames(PERIOD_NS)
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for k in range(250):
+        error_rad = (1.0 if k < 150 else 2.0) / ARCSEC_PER_RAD
+        turned = multiply(from_rotation_vector(np.array([error_rad, 0.0, 0.0])), START)
+        judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, turned))
+    figures = judge.figures(2 * NS_PER_S, {})
+    assert figures.right == 250 and figures.rate_hz == pytest.approx(1000)
+    assert figures.mean_arcsec == pytest.approx([2.0, 0.0, 0.0], abs=1e-3)
+
+
+def test_unix_stamps_are_taken_with_the_hosts_stated_error():
+    times = AnswerTimes(AnswerRules(EXPOSURE_S, "end", "unix"), lambda: UnixOffset(-(10**18), 3_000_000))
+    # The stamp is the exposure's end: its middle is half an exposure earlier.
+    assert times.middle(Answer(7 * NS_PER_S, b"", 10**18 + 5 * NS_PER_S)) == (5 * NS_PER_S - NS_PER_S // 20, 0.003)
+
+
+def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
+    frames = LitFrames(PERIOD_NS)
+    judge, verdicts, k = AnswerJudge(AnswerRules(EXPOSURE_S), frames), [], 0
+    for i in range(200):
+        middle_ns = NS_PER_S + i * NS_PER_S // 10
+        while k * PERIOD_NS < middle_ns + NS_PER_S // 5:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+            k += 1
+        set_ns = 10**18 if 60 <= i < 120 else 0  # forward by thirty years, and back
+        verdicts.append(judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict)
+    assert verdicts.count("right") >= 197 and "wrong" not in verdicts
+    assert set(verdicts[:120] + verdicts[124:]) == {"right"}
+
+
+ROLL_RATIO, CROSS_ARCSEC = 40.0, 2.0
+OUTLIER_ARCSEC, OFF_ARCSEC, OFF_SHARE = 1000.0, 60.0, 0.3
+
+
+def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
+    """Half a minute of a turning tracker on its own clock, whose roll is ROLL_RATIO times as noisy as its cross axes."""
+    rng = np.random.default_rng(seed)
+    frames = LitFrames(PERIOD_NS)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), frames)
+    found, k = [], 0
+    for i in range(int(30 * ANSWER_HZ)):
+        middle_s = 0.2 + i / ANSWER_HZ
+        host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
+        while k * PERIOD_NS < host_ns:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            k += 1
+        error_arcsec = CROSS_ARCSEC * rng.standard_normal(3) * [1.0, 1.0, ROLL_RATIO]
+        if kind == "early outlier" and i == 4:
+            error_arcsec = np.array([OUTLIER_ARCSEC, 0.0, 0.0])
+        if kind == "some off" and rng.random() < OFF_SHARE:
+            error_arcsec[0] += OFF_ARCSEC
+        q = multiply(from_rotation_vector(error_arcsec / ARCSEC_PER_RAD), attitude(middle_s))
+        found.append(judge.judge(Answer(host_ns, b"", round(middle_s * NS_PER_S) + EPOCH_NS, q)))
+    return judge, found
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["noisy roll", "early outlier", "some off"])
+def test_a_noisy_roll_and_odd_answers_leave_every_answer_judged_and_the_delay_found(kind, seed):
+    judge, found = spoilt(kind, seed)
+    assert {each.verdict for each in found} == {"right"}
+    # The noise of 300 answers at 0.3 deg/s leaves 0.1 ms; shortest arrivals of JITTER_S and answers that are off a few ms more.
+    assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
+    assert judge.times.sigma_s < 0.01
+    assert all_finite(judge, found[-1].answer.host_ns)
+
+
+def all_finite(judge: AnswerJudge, now_ns: int) -> bool:
+    figures = judge.figures(now_ns, {})
+    lists = [figures.residual_arcsec, figures.mean_arcsec, figures.rms_arcsec, figures.sigma3_arcsec]
+    numbers = [figures.latency_ms, figures.latency_sigma_ms, figures.age_s, figures.availability, figures.rate_hz]
+    numbers += [judge.times.delay_s, judge.times.sigma_s]
+    for each in lists:
+        numbers += each or []
+    known = [number for number in numbers if number is not None]
+    return all(map(math.isfinite, known)) and bool(np.isfinite(judge._rows).all())
+
+
+NEAR = st.tuples(*[st.floats(-4000.0, 4000.0)] * 3)  # arcsec from what was lit: right, and a little wrong
+ANY_Q = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
+ODD_NS = st.one_of(st.just(0), st.integers(-(10**9), 10**9), st.integers(-(2**62), 2**62))
+ONE = st.tuples(st.one_of(NEAR, ANY_Q), ODD_NS, st.booleans())
+MANY = st.lists(ONE, min_size=12, max_size=60)
+EXAMPLES = 100  # a fixed budget: three seconds
+
+
+@settings(max_examples=EXAMPLES, deadline=None, derandomize=True)
+@given(st.sampled_from(["own", "host", "unix"]), MANY, st.integers(0, 2**32))
+def test_no_finite_answers_in_any_order_end_the_judging(clock, many, seed):
+    """Attitudes near and far, stamps right, odd and wild, arrivals in order and shuffled: each answer is judged."""
+    frames = lit_until(8.0)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock), frames)
+    arrivals_s = 0.5 + 0.11 * np.arange(len(many))
+    if seed % 2:
+        np.random.default_rng(seed).shuffle(arrivals_s)
+    for (error, odd_ns, stamped), at_s in zip(many, arrivals_s.tolist(), strict=True):
+        q = np.array(error)
+        if len(error) == 3:
+            q = multiply(from_rotation_vector(q / ARCSEC_PER_RAD), attitude(at_s - 0.15))
+        t_ns = round((at_s - 0.15) * NS_PER_S) + odd_ns
+        answer = Answer(round(at_s * NS_PER_S), b"", t_ns if stamped else None, q / np.linalg.norm(q))
+        judged_one = judge.judge(answer)
+        assert judged_one.verdict in VERDICTS and judged_one.verdict != "unjudged"
+        assert all_finite(judge, answer.host_ns)
+    assert judge.figures(9 * NS_PER_S, {}).answers == len(many)
+
+
+def test_a_fit_that_keeps_no_answer_or_is_not_finite_is_none():
+    rng = np.random.default_rng(4)
+    rate, error = rng.normal(0, 1000.0, (40, 3)), rng.normal(0, 2.0, (40, 3))
+    assert fitted_delay(error, rate, 0.0).shift_s == pytest.approx(0.0, abs=1e-3)
+    assert fitted_delay(error[:5], rate[:5], 0.0) is None
+    # Each axis has its own third of the rows far off: the medians hold, and no row is near in all three.
+    apart = np.zeros((39, 3))
+    apart[np.arange(39), np.arange(39) % 3] = 1e4
+    assert fitted_delay(apart, np.zeros((39, 3)), 0.0) is None
+    assert fitted_delay(error, np.full((40, 3), 1e200), 0.0) is None
+
+
+def test_a_delay_under_which_no_answer_is_right_is_given_up():
+    judge, found = judged("own", 20.0, wild=0.0)
+    judge.times.delay_s, judge.times.sigma_s = 4.0, 1e-4
+    host_ns = found[-1][0].answer.host_ns
+    again = []
+    for k in range(1, 800):  # the right answers before are forgotten after a minute
+        at_ns = host_ns + k * NS_PER_S // 10
+        for number in range(6):
+            lit_ns = at_ns - NS_PER_S // 10 + number * PERIOD_NS
+            judge._frames.add(LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude(lit_ns / NS_PER_S)))
+        middle_ns = at_ns - round(LATENCY_S * NS_PER_S)
+        own_ns = round(middle_ns * (1 + DRIFT)) + EPOCH_NS
+        again.append(judge.judge(Answer(at_ns, b"", own_ns, attitude(middle_ns / NS_PER_S))).verdict)
+    assert again[0] == "wrong" and set(again[-100:]) == {"right"}
+    assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
+
+
+def test_answers_that_were_overtaken_are_counted_and_judged_and_a_clock_that_is_set_is_not_one():
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), lit_until(30.0))
+    order = np.arange(100)
+    order[[20, 21, 50, 51, 52]] = order[[21, 20, 52, 50, 51]]
+    for k, number in enumerate(order.tolist()):
+        middle_ns = NS_PER_S + number * NS_PER_S // 10
+        host_ns = NS_PER_S + k * NS_PER_S // 10 + NS_PER_S // 4
+        set_ns = -(10**15) if k >= 80 else 0
+        answer = Answer(host_ns, b"", middle_ns + set_ns, attitude(middle_ns / NS_PER_S))
+        judge.judge(answer)
+    figures = judge.figures(host_ns, {})
+    assert figures.out_of_order == 3 and figures.wrong == 0

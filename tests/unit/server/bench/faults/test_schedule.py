@@ -1,0 +1,134 @@
+"""The schedule: which faults are on in which frame, by the file's times and by whoever asks."""
+
+from __future__ import annotations
+
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.optics.layers.fault_kinds import fault_of
+from hilstar.server.bench.scenario import MAX_ON, FaultSchedule, Scenario
+
+FRAME_NS = 10_000_000  # 100 Hz
+
+
+def blank(name, **keys):
+    return fault_of({"kind": "blank", "name": name, **keys})
+
+
+def star(name, **keys):
+    return fault_of({"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys})
+
+
+def schedule_of(*faults):
+    heard = []
+    scenario = Scenario("faults.toml", "", 0, faults)
+    return FaultSchedule(scenario, FRAME_NS / 1e9, listen=heard.append), heard
+
+
+def frames(schedule, count, first=0):
+    """What is on in frames in a row: names and shares."""
+    return [[(now.fault.name, now.share) for now in schedule.at(k * FRAME_NS)] for k in range(first, first + count)]
+
+
+def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
+    schedule, heard = schedule_of(blank("cover", at_s=0.02, for_s=0.03))
+    assert [bool(on) for on in frames(schedule, 7)] == [False, False, True, True, True, False, False]
+    assert [(c.what, c.number, c.t_ns, c.who) for c in heard] == [
+        ("start", 1, 2 * FRAME_NS, "file"),
+        ("end", 1, 5 * FRAME_NS, "file"),
+    ]
+
+
+def test_light_between_two_frames_is_divided_among_them_in_proportion():
+    schedule, _ = schedule_of(star("flash", at_s=0.014, for_s=0.02))
+    on = frames(schedule, 5)
+    assert on == [[], [("flash", 0.6)], [("flash", 1.0)], [("flash", 0.4)], []]
+    assert sum(share for row in on for _, share in row) * FRAME_NS == 0.02e9
+
+
+def test_what_is_shorter_than_a_frame_is_on_for_one():
+    schedule, _ = schedule_of(blank("short", at_s=0.021, for_s=0.001))
+    assert [bool(on) for on in frames(schedule, 5)] == [False, False, True, False, False]
+
+
+def test_the_first_frame_is_the_zero_unless_it_is_said():
+    schedule, _ = schedule_of(blank("cover", at_s=0.02))
+    assert not schedule.at(7_000_000_000)
+    assert schedule.at(7_020_000_000)
+    said, _ = schedule_of(blank("cover", at_s=0.02))
+    said.begin(6_980_000_000)
+    assert said.at(7_000_000_000)
+
+
+def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
+    schedule, heard = schedule_of(blank("cover"), star("ghost"))
+    assert schedule.names() == ["cover", "ghost"]
+    assert frames(schedule, 2) == [[], []]
+    schedule.start("ghost", "console")
+    assert schedule.on() == ["ghost"]
+    assert frames(schedule, 2, 2) == [[("ghost", 1.0)]] * 2
+    schedule.stop("ghost", "console")
+    assert frames(schedule, 1, 4) == [[]]
+    assert [(c.what, c.fault.name, c.who, c.t_ns) for c in heard] == [
+        ("start", "ghost", "console", 2 * FRAME_NS),
+        ("end", "ghost", "console", 4 * FRAME_NS),
+    ]
+    schedule.start("ghost", "console")
+    assert frames(schedule, 1, 5) == [[("ghost", 1.0)]]
+    assert heard[-1].number == 2  # the second start of the run
+
+
+def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
+    schedule, _ = schedule_of(blank("cover"))
+    with pytest.raises(InputError, match=r"no fault is called 'covre'; did you mean cover\? known are cover"):
+        schedule.start("covre", "console")
+    with pytest.raises(InputError, match="'cover' is not on; none is"):
+        schedule.stop("cover")
+    schedule.start("cover", "console")
+    with pytest.raises(InputError, match="on already"):
+        schedule.start("cover", "stream")
+
+
+def test_the_stream_asks_for_faults_of_its_own_now_or_later():
+    schedule, _ = schedule_of()
+    schedule.at(0)
+    schedule.ask(star("now", for_s=0.02), "stream")
+    schedule.ask(blank("later", at_s=0.04, for_s=0.01), "stream")
+    schedule.ask(blank("past", at_s=0.001, for_s=0.01), "stream")  # a time that has passed means now
+    assert frames(schedule, 5, 1) == [
+        [("now", 1.0), ("past", 1.0)],
+        [("now", 1.0)],
+        [],
+        [("later", 1.0)],
+        [],
+    ]
+
+
+def test_memory_is_bounded_whoever_asks():
+    schedule, _ = schedule_of()
+    refused = 0
+    for number in range(5000):
+        try:
+            schedule.ask(blank(f"fault {number}"), "stream")
+        except InputError:
+            refused += 1
+        if number % 50 == 0:
+            schedule.at(number * FRAME_NS)
+    assert refused > 4000
+    assert len(schedule.at(10**12)) <= MAX_ON
+
+
+def test_only_some_stray_light_is_on_at_once_whoever_asks():
+    schedule, _ = schedule_of()
+    for number in range(8):
+        schedule.ask(fault_of({"kind": "gradient", "name": f"{number}", "electrons": 5}), "stream")
+    with pytest.raises(InputError, match="8 gradients, glows and maps are on or wait"):
+        schedule.ask(fault_of({"kind": "glow", "name": "sun", "tracker_px": [0, 0], "electrons": 5}), "stream")
+    schedule.ask(blank("cover"), "stream")
+
+
+def test_a_fault_between_two_frames_of_a_slow_run_is_reported_as_missed():
+    schedule, heard = schedule_of(blank("short", at_s=1.0, for_s=0.1))
+    schedule.at(0)
+    assert schedule.at(2_000_000_000) == ()
+    assert [change.what for change in heard] == ["missed"]

@@ -1,0 +1,75 @@
+"""What is drawn over a picture lies where the picture's own stars are, and lines of the grid are where their labels say."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.server.console.overlay import overlay_of
+from tests.support.benches import ORION_Q
+
+ROUNDED_PX = 0.006  # places are sent with two decimals
+# Lines of the grid have one: a step of 0.05 px under the small bench's 200 arcsec/px.
+LINE_DEG = 0.05 * 200 / 3600 * 1.5
+
+pytestmark = pytest.mark.gpu
+
+
+@pytest.fixture
+def bench(bench_with):
+    return bench_with()
+
+
+def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
+    frame = bench.frame(ORION_Q)
+    told = msgspec.to_builtins(overlay_of(bench).truth(0, np.array(ORION_Q), (26311,)))["stars"]
+    drawn = frame.truth[frame.truth["drawn"]]
+    places = {int(row["hip"]): (row["x_px"], row["y_px"]) for row in drawn}
+    inside = {hip for hip, (x, y) in places.items() if abs(x - 159.5) < 159 and abs(y - 119.5) < 119}
+    assert inside <= {star[3] for star in told} <= set(places)
+    for x, y, v_mag, hip, label, clipped, _ in told:
+        assert places[hip] == pytest.approx((x, y), abs=ROUNDED_PX)
+        assert label == {26311: "ε Ori", 25930: "δ Ori", 26727: "ζ Ori"}.get(hip, label)
+        assert clipped == (hip == 26311)
+        assert v_mag >= told[0][2]
+    assert told[0][4] == "ε Ori"
+
+
+def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(bench):
+    """1024 pixels of 13 um at 70 mm, on a screen with 57.65 um at 60 mm: 1024 * 13 / 70 * 60 / 57.65 px."""
+    outline = np.array(overlay_of(bench).truth(0, np.array(ORION_Q)).tracker_px)
+    wanted_px = 1024 * 13 / 70 * 60 / 57.65
+    assert np.ptp(outline, axis=0) == pytest.approx([wanted_px, wanted_px], abs=2 * ROUNDED_PX)
+    assert (outline.min(axis=0) + outline.max(axis=0)) / 2 == pytest.approx([159.5, 119.5], abs=ROUNDED_PX)
+
+
+@pytest.mark.parametrize(
+    ("ra_deg", "dec_deg", "roll_deg"), [(84.057, -1.2, 0.0), (0.1, 60.0, 40.0), (200.0, 89.5, 10.0), (359.9, -90.0, 5.0)]
+)
+def test_each_line_of_the_grid_is_where_its_label_says(bench, ra_deg, dec_deg, roll_deg):
+    q = from_radec_roll_deg(ra_deg, dec_deg, roll_deg)
+    lines = msgspec.to_builtins(overlay_of(bench).truth(0, q))["grid"]
+    kinds = {line["label"].split()[0] for line in lines}
+    assert kinds == {"RA", "Dec"} and 6 <= len(lines) <= 80
+    for line in lines:
+        kind, text = line["label"].replace("\N{MINUS SIGN}", "-").rstrip("\N{DEGREE SIGN}").split()
+        x, y, z = (bench.camera.rays(*np.array(line["px"]).T) @ to_matrix(q)).T
+        if kind == "Dec":
+            off_deg = np.degrees(np.arctan2(z, np.hypot(x, y))) - float(text)
+        else:
+            off_deg = (np.degrees(np.arctan2(y, x)) - float(text) + 180) % 360 - 180
+            from_pole_deg = np.degrees(np.hypot(x, y) / np.sqrt(x * x + y * y + z * z))
+            # At right angles to the meridian; on the pole itself every right ascension is right.
+            off_deg = np.where(np.abs(off_deg) < 90, np.sin(np.radians(off_deg)), 1.0) * from_pole_deg
+        assert np.abs(off_deg).max() < LINE_DEG
+
+
+def test_the_sky_has_the_brightest_star_first_and_the_screen_s_corners(bench):
+    told = msgspec.to_builtins(overlay_of(bench).sky())
+    assert told["stars"][0][2:] == [-1.44, "α CMa"]  # Hipparcos' V of Sirius
+    assert len(told["stars"]) > 2500  # Hipparcos has 2850 stars over V = 5.5
+    corners = np.array(told["screen_cam"])
+    half = np.arctan(np.hypot(160, 120) * 57.65e-6 / 60e-3)
+    assert np.arccos(corners[:, 2]) == pytest.approx(half, abs=1e-5)

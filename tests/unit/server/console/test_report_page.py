@@ -1,0 +1,173 @@
+"""A run's page: one file that needs no other, and figures that keep each extreme however long the run was."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+
+import numpy as np
+import pytest
+
+from hilstar.server.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
+from hilstar.server.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
+from hilstar.server.record.report import BLOCK, MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
+from tests.support.run_page import run_data_of
+
+PERIOD_NS = 16_666_667
+MAX_PAGE_BYTES = 3_000_000  # "a few MB", without pictures
+FRAMES = 32_000  # nearly as many spans as there may be, of 4 frames each
+
+
+def frame(k: int, **more: object) -> FrameRecord:
+    swap_ns = 10**12 + k * PERIOD_NS
+    turn = 1e-4 * k
+    q = (np.cos(turn), 0.0, np.sin(turn), 0.0)
+    known = {"frame": k, "t_ns": swap_ns, "light_ns": swap_ns, "draw_ns": swap_ns - 5_000_000, "swap_ns": swap_ns, "q": q}
+    return FrameRecord(**(known | {"age_ns": 7_000_000 + 1000 * (k % 997), "stars_drawn": 200} | more))
+
+
+@pytest.fixture(scope="module")
+def run() -> RunFigures:
+    figures = RunFigures({"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12), "bench_text": "</script>"})
+    for begin in range(0, FRAMES, BLOCK):
+        block = range(begin, min(begin + BLOCK, FRAMES))
+        late = {31_415: {"age_ns": 900_000_000, "stale": True, "missed_before": 3}}
+        figures.add(*(frame(k, **late.get(k, {})) for k in block))
+        figures.add(*(PacketForm(True, None, 10**12 + k * PERIOD_NS) for k in block))
+    figures.add(CountRecord(host_ns=10**12 + 500 * 10**9, kind="packet", reason="crc", count=77))
+    figures.add(EventRecord(host_ns=10**12 + 90 * 10**9, kind="mark", detail="<b>cover off</b>"))
+    return figures
+
+
+def test_the_page_stands_alone_and_lets_nothing_else_in(run):
+    page = report_page(run_data("run.mcap", run, summarise(run)))
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
+    script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL)
+    style = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
+    assert policy is not None and script is not None and style is not None
+    assert "default-src 'none'" in policy[1]
+    for kind, text in (("script", script[1]), ("style", style[1])):
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy[1]
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    assert not re.search(r"https?://(?!www\.w3\.org)", page.replace(script[1], "")) and "fetch(" not in script[1]
+    assert run_data_of(page)["bench_text"] == "</script>"
+
+
+def test_every_module_of_the_page_can_be_taken_into_it():
+    for path in PAGE_DIR.glob("*.js"):
+        assert not re.search(r"^(?:import|export)\b", one_script(path.stem), re.MULTILINE)
+
+
+def test_a_long_run_keeps_its_worst_frame_and_stays_small(run):
+    page = report_page(run_data("run.mcap", run, summarise(run)))
+    assert len(page) < MAX_PAGE_BYTES
+    told = run_data_of(page)
+    spans = told["spans"]
+    low, high = (np.array(part, dtype=float) for part in spans["age"])
+    worst = int(np.argmax(high))
+    assert high[worst] == 900.0 and low.min() == 7.0
+    begins = np.array(spans["t_s"])
+    assert begins[worst] <= 31_415 * PERIOD_NS / 1e9 < begins[worst + 1]
+    assert sum(spans["missed"]) == 3 and spans["missed"][worst] == 3 and sum(spans["stale"]) == 1
+    assert told["events"] == [{"t_s": 90.0, "utc": "2027-01-15T08:01:30.000+00:00", "kind": "mark", "line": "<b>cover off</b>"}]
+
+
+def test_packets_are_counted_at_their_time(run):
+    told = run_data("run.mcap", run, summarise(run))["packets"]
+    *accepted, last = told["accepted_hz"]
+    assert last is None  # the run ended before this bin did
+    rate_hz = FRAMES / (told["t_s"][-1] + told["width_s"])
+    assert sum(accepted) * told["width_s"] == pytest.approx(FRAMES, abs=2 * rate_hz * told["width_s"])
+    refused = {at: rate * told["width_s"] for at, rate in zip(told["t_s"], told["refused_hz"], strict=True) if rate}
+    assert refused == {500.0: pytest.approx(77)}
+
+
+def test_the_verdict_names_everything_that_was_wrong():
+    figures = RunFigures({})
+    for k, more in enumerate(
+        [{}, {"stale": True}, {"q": None, "stale": True}, {"missed_before": 2, "missed": 2}, {"hidden": "covered", "missed": 2}]
+    ):
+        figures.add(frame(k, **more))
+    told = verdict(summarise(figures), figures.counted["late"])
+    assert not told["ok"]
+    assert told["reasons"] == [
+        "1 of 5 frames without an attitude",
+        "1 of 5 frames with a stale attitude",
+        "1 of 5 frames not seen on the screen",
+        "2 refresh periods without a frame of their own",
+    ]
+    assert (
+        told["headline"] == "Sky was not right throughout" and told["share"] == "28.5 %"
+    )  # 2 of 5 frames and 2 periods without one
+    well = RunFigures({})
+    well.add(frame(0))
+    assert verdict(summarise(well), 0)["ok"]
+
+
+def event(k: int, kind: str, since: int | None = None) -> EventRecord:
+    since_ns = None if since is None else 10**12 + since * PERIOD_NS
+    return EventRecord(host_ns=10**12 + k * PERIOD_NS, kind=kind, detail="by a factor of 1.5", since_ns=since_ns)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+def test_frames_of_a_wrong_sky_are_wrong_from_when_it_began(block):
+    """It is found at frame 50, and began at 20; the frames between are in blocks before it."""
+    records = [frame(k, stale=k == 30) for k in range(100)]
+    records[51:51] = [event(50, "rates-wrong", 20)]
+    records[71:71] = [event(70, "rates-right")]
+    figures = RunFigures({})
+    for begin in range(0, len(records), block):
+        figures.add(*records[begin : begin + block])
+    found = summarise(figures)
+    assert (found.wrong_frames, found.right_frames) == (50, 50)
+    assert found.wrong_sky.seconds == pytest.approx(50 * PERIOD_NS / 1e9, abs=1e-3)
+    told = verdict(found, figures.counted["late"])
+    assert "50 of 100 frames of a wrong sky" in told["reasons"]
+    assert any("by a factor of 1.5" in reason for reason in told["reasons"])
+
+
+def test_lost_packets_are_a_figure_of_their_own():
+    figures = RunFigures({})
+    figures.add(frame(0), CountRecord(host_ns=10**12, kind="lost", reason="sequence", count=3))
+    found = summarise(figures)
+    assert found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
+
+
+def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
+    rng = np.random.default_rng(5)
+    for count in (1, 7, 1023, 1024, 5000, 20_001):
+        values = rng.normal(size=(count, 2))
+        values[rng.random(count) < 0.2, 1] = np.nan
+        spans = SpanTable(2, capacity=16)
+        rows = np.column_stack([np.arange(count), values])
+        for at in range(0, count, 300):
+            spans.add(rows[at : at + 300])
+        begin, length = spans.begin, spans.length
+        assert len(begin) <= 16 and begin.tolist() == list(range(0, count, length))
+        for column in range(2):
+            low, high, total = spans.column(column)
+            parts = [values[at : at + length, column] for at in range(0, count, length)]
+            assert np.array_equal(low, [np.fmin.reduce(part) for part in parts], equal_nan=True)
+            assert np.array_equal(high, [np.fmax.reduce(part) for part in parts], equal_nan=True)
+            assert total == pytest.approx([np.nansum(part) for part in parts])
+
+
+def test_bins_keep_every_count_whatever_the_times():
+    bins = TimeBins(1, capacity=8)
+    for at_ns in (5 * 10**9, 0, 6 * 10**9, 2**62, 40 * 10**9):
+        bins.add(np.array([at_ns]), np.array([0]))
+    begin_s, rates_hz = bins.rates_hz(0)
+    assert begin_s[0] == 5.0 and len(begin_s) <= 8
+    assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(5)
+
+
+def test_of_a_flood_of_events_the_first_and_the_last_are_told():
+    figures = RunFigures({})
+    figures.add(frame(0))
+    for k in range(3 * MAX_EVENTS):
+        figures.add(EventRecord(host_ns=k, kind="stale", detail="x" * 10_000))
+    told = run_data("run.mcap", figures, summarise(figures))
+    assert len(told["events"]) == 2 * MAX_EVENTS and told["events_total"] == 3 * MAX_EVENTS
+    assert max(len(event["line"]) for event in told["events"]) <= 400

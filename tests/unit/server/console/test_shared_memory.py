@@ -1,0 +1,85 @@
+"""The memory between a run and its page: whole records only, whoever is faster, and none of it left behind."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import numpy as np
+
+from hilstar.server.console.messages import EVENTS, FRAMES, PictureRequest, Ring, SharedMemory
+
+SLOTS, SLOT_BYTES = 4, 100
+
+
+def ring() -> Ring:
+    return Ring(memoryview(bytearray(Ring.size(SLOTS, SLOT_BYTES))), SLOTS, SLOT_BYTES)
+
+
+def test_records_are_read_in_order_and_old_ones_are_gone():
+    records = ring()
+    assert records.last() is None and list(records.after(0)) == []
+    for k in range(1, 8):
+        records.put(b"%d" % k)
+        assert records.last() == (k, b"%d" % k)
+    kept = list(records.after(0))
+    assert kept == [(5, b"5"), (6, b"6"), (7, b"7")]  # the slot that is written next is never read
+    assert list(records.after(6)) == [(7, b"7")]
+    assert records.read(1) is None and records.read(8) is None
+
+
+def test_a_record_that_is_being_written_is_not_read():
+    records = ring()
+    records.put(b"whole")
+    records.begin()
+    records.room(5)[:] = b"torn!"
+    assert records.last() == (1, b"whole")
+    assert records.read(2) is None
+    records.end(5, 0)
+    assert records.last() == (2, b"torn!")
+
+
+def test_a_record_that_was_changed_is_not_taken_for_whole():
+    memory = bytearray(Ring.size(SLOTS, SLOT_BYTES))
+    records = Ring(memoryview(memory), SLOTS, SLOT_BYTES)
+    records.put(b"A" * 50)
+    memory[memory.index(b"A") + 7] ^= 1
+    assert records.read(1) is None
+
+
+def test_a_reader_beside_a_writer_sees_whole_records_alone():
+    records = ring()
+    stop, torn, seen = threading.Event(), [], []
+
+    def read() -> None:
+        while not stop.is_set():
+            found = records.last()
+            if found is not None:
+                seen.append(found[0])
+                torn.extend([found] if len(set(found[1])) != 1 else [])
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for k in range(20_000):
+        records.put(bytes([k % 251]) * SLOT_BYTES)
+    stop.set()
+    reader.join()
+    assert not torn and seen == sorted(seen) and seen
+
+
+def test_a_board_is_seen_by_whoever_has_its_descriptor():
+    memory = SharedMemory.make(320 * 240)
+    other = SharedMemory(os.dup(memory.fd), 320 * 240)
+    memory.frames.put(b"frame")
+    memory.events.put(b"event")
+    other.want = PictureRequest(125_000_000, 7)
+    assert other.frames.last() == (1, b"frame") and other.events.last() == (1, b"event")
+    other.wrong_since_s = 12.5
+    assert memory.want == PictureRequest(125_000_000, 7) and memory.wrong_since_s == 12.5
+    picture = np.arange(320 * 240, dtype=np.uint8)
+    memory.pictures.begin()
+    np.copyto(np.frombuffer(memory.pictures.room(picture.nbytes), dtype=np.uint8), picture)
+    memory.pictures.end(picture.nbytes, 0)
+    found = other.pictures.last()
+    assert found is not None and found[1] == picture.tobytes()
+    assert FRAMES >= 60 and EVENTS >= 100  # a page that comes back has a second of frames and the newest events

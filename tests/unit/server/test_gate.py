@@ -1,0 +1,144 @@
+"""The start-up gate: which displays it refuses, by the intervals between their swaps and by what the system says of them."""
+
+from __future__ import annotations
+
+import datetime
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import MachineError
+from hilstar.display.window.output_settings import OutputState
+from hilstar.display.window.x11 import BackBuffer
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.config import parse_config
+from hilstar.server.screen import gate
+from hilstar.server.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
+from tests.support.benches import SMALL_BENCH
+from tests.support.model_display import model_screen, plain_window
+
+PERIOD_MS = 1000 / 60
+GOOD = Timing(PERIOD_MS, 0, True)
+
+
+@pytest.fixture
+def monitor(tmp_path):
+    return parse_config(tmp_path / "bench.toml", SMALL_BENCH).monitor
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "known_hz", "by_screen", "waits"),
+    [
+        (PERIOD_MS, 60.0, True, True),
+        (PERIOD_MS * 1.05, 60.0, True, True),  # another refresh, which is a fault of its own
+        (0.4, 60.0, False, False),  # swaps that do not wait
+        (PERIOD_MS, 0.0, True, True),
+        (0.4, 0.0, False, True),  # no refresh at all, as a virtual screen's
+    ],
+)
+def test_the_screen_keeps_time_where_its_swaps_wait(monitor, period_ms, known_hz, by_screen, waits):
+    timing = timing_of(np.full(GATE_FRAMES, period_ms), monitor, known_hz)
+    assert (timing.paced_by_screen, timing.waits) == (by_screen, waits)
+
+
+def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
+    periods_ms = np.full(GATE_FRAMES, PERIOD_MS)
+    periods_ms[[5, 50, 90]] = 2 * PERIOD_MS
+    timing = timing_of(periods_ms, monitor, 60.0)
+    assert timing.dropped == 3
+    assert timing.period_ms == pytest.approx(PERIOD_MS)
+    assert [fault for fault in faults(plain_window(), monitor, timing) if "dropped 3 of 120" in fault]
+
+
+def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
+    assert list(faults(plain_window(), monitor, GOOD)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "timing", "words"),
+    [
+        ({"size_px": (640, 480)}, GOOD, "640 x 480 px and the bench file says 320 x 240"),
+        ({"composited": True}, GOOD, "compositing manager"),
+        ({"mirrored": "HDMI-2"}, GOOD, "HDMI-2 mirrors this one"),
+        ({"scaled": True}, GOOD, "set its scale to 100 %"),
+        ({"by_wayland": True}, GOOD, "use an Xorg session"),
+        ({"ramp_refused": True}, GOOD, "gamma ramp that is not straight"),
+        ({"back_buffer": BackBuffer(6, 0)}, GOOD, "6 bits per colour and the bench file says 8"),
+        ({"back_buffer": BackBuffer(10, 0)}, GOOD, "10 bits per colour and the bench file says 8"),
+        ({"screen_bits": 10}, GOOD, "the X screen has 10 bits per colour and the window 8, so that X converts codes"),
+        ({"back_buffer": BackBuffer(8, 4)}, GOOD, "4 samples a pixel"),
+        ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
+        ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
+    ],
+)
+def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timing, words):
+    (fault,) = faults(plain_window(**changes), monitor, timing)
+    assert words in fault
+
+
+@pytest.mark.parametrize("buffers", [2, 3])
+@pytest.mark.parametrize("hz", [60, 120])
+def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, buffers, hz):
+    screen, display = model_screen(tmp_path, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000)
+    assert not pass_gate(screen, force=False, clock=display.clock).variable
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 200_000])
+def test_a_variable_refresh_is_recognised_and_refused(tmp_path, stamp_ns):
+    screen, display = model_screen(tmp_path, variable=True, stamp_ns=stamp_ns)
+    with pytest.raises(MachineError, match=r"variable refresh.*VariableRefresh.*or add --force"):
+        pass_gate(screen, force=False, clock=display.clock)
+    assert pass_gate(screen, force=True, clock=display.clock).variable
+
+
+def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, caplog):
+    output = OutputState("DP-1", (320, 240), properties={"Broadcast RGB": "Limited 16:235", "TearFree": "on"})
+    screen, display = model_screen(tmp_path, output=output)
+    with pytest.raises(MachineError, match=r"Broadcast RGB of DP-1.*xrandr --output DP-1 --set.*or add --force"):
+        pass_gate(screen, force=False, clock=display.clock)
+    assert "TearFree of DP-1 is on" in caplog.text
+    pass_gate(screen, force=True, clock=display.clock)
+    assert screen.output is output
+
+
+def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path):
+    screen, display = model_screen(tmp_path)
+    timing = pass_gate(screen, force=False, clock=display.clock)
+    assert timing.period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and timing.paced_by_screen
+    periods = (screen.clock.next_after(display.clock.ns) - display.flips_ns[-1]) / display.period_ns
+    assert periods == pytest.approx(round(periods), abs=1e-4)
+
+
+def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, caplog):
+    screen, display = model_screen(tmp_path, composited=True)
+    with pytest.raises(MachineError, match=r"compositing.*or add --force"):
+        pass_gate(screen, force=False, clock=display.clock)
+    pass_gate(screen, force=True, clock=display.clock)
+    assert "shown anyway (--force)" in caplog.text
+
+
+def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path):
+    screen, display = model_screen(tmp_path, gone="its display was unplugged")
+    with pytest.raises(MachineError, match="unplugged"):
+        pass_gate(screen, force=True, clock=display.clock)
+
+
+def test_a_wrong_size_is_said_before_the_bench_is_opened_or_a_frame_drawn(tmp_path, monkeypatch):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    file = read_bench_file(path)
+    opened = []
+
+    @contextmanager
+    def window_of(settings):
+        yield plain_window(size_px=(1, 2))
+
+    monkeypatch.setattr(gate, "Window", window_of)
+    monkeypatch.setattr(gate, "open_bench", lambda *arguments, **named: opened.append(arguments))
+    with (
+        pytest.raises(MachineError, match="the display is 1 x 2 px and the bench file says"),
+        gate.open_screen(file, datetime.date(2024, 1, 1), windowed=True, force=False, timed=False),
+    ):
+        raise AssertionError("a display of another size is refused")
+    assert opened == []

@@ -1,0 +1,340 @@
+"""The ledger's own rules, and what reading an MCAP file may cost."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import resource
+import shutil
+import time
+import zlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Header
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from hilstar.attitude.logs.log_file import read_log
+from hilstar.attitude.logs.mcap_log import parts_of, read_chunks
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.cli.options import parse_split
+from hilstar.server.bench.config import AttitudeSettings
+from hilstar.server.record.ledger import (
+    MAX_WAITING_BYTES,
+    Ledger,
+    LedgerQueue,
+    LedgerSwitch,
+    QueueEntry,
+    SplitLimits,
+)
+from hilstar.server.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord, drawable_frames
+from hilstar.server.record.report import RunFigures, figures_of, summarise
+from tests.support.full_disk import files_of_at_most
+from tests.support.waiting import wait_for
+
+UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def bench(small_bench_file):
+    return SimpleNamespace(
+        file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64, config=UNCERTIFIED),
+        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
+        output={},
+        renderer=SimpleNamespace(
+            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+        ),
+        config=SimpleNamespace(
+            render=SimpleNamespace(codes_ms=None),
+            attitude=AttitudeSettings(),
+            tracker=SimpleNamespace(q_body_to_cam=None),
+        ),
+    )
+
+
+def keep(ledger: Ledger, first: int, last: int) -> None:
+    for k in range(first, last):
+        sample = AttitudeSample(k, UPRIGHT, None, k)
+        ledger.packet(1000 + k, encode(sample), sample, None)
+        ledger.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k + 1, q=(1, 0, 0, 0)))
+
+
+def read_topics(path):
+    return [(topics[channel], data) for topics, messages in read_chunks(path) for channel, data in messages]
+
+
+def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
+    path = tmp_path / "run.mcap"
+    with Ledger(path, bench, split=SplitLimits(bytes=1)) as ledger:
+        keep(ledger, 0, 50)
+        wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
+        keep(ledger, 50, 100)
+    assert len(parts_of(path)) >= 2
+    assert [sample.sequence for sample in read_log(path)] == list(range(100))
+    assert [frame.frame for frame in drawable_frames(path)] == list(range(100))
+    assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(parts_of(path)) > 2
+
+
+def test_a_split_is_a_size_or_a_time():
+    assert (parse_split("1GB").bytes, parse_split("30min").seconds, parse_split("1.5h").seconds) == (1e9, 1800, 5400)
+    for wrong in ("1", "GB", "1kB", "5s", "-1h", "1e3GB", "1 fortnight"):
+        with pytest.raises(InputError, match="--ledger-split"):
+            parse_split(wrong)
+
+
+def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(tmp_path, bench):
+    notices = Notices()
+    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
+            keep(ledger, 10, 20)
+            wait_for(lambda: "ledger-failed" in notices.active)
+        wait_for(lambda: "ledger-failed" not in notices.active)
+    assert ledger.failure == "File too large"
+    assert ledger.summary()["unrecorded"] == 10
+    assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
+    assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
+
+
+def delete(path, _):
+    path.unlink()
+
+
+def replace_by_another(path, folder):
+    (folder / "other").write_bytes(b"another file")
+    (folder / "other").replace(path)
+
+
+def cut(path, _):
+    os.truncate(path, 300)
+
+
+def write_anew(path, _):
+    path.write_bytes(b"x" * 10)
+
+
+def write_longer(path, _):
+    path.write_bytes(b"x" * 1_000_000)
+
+
+def write_over(path, _):
+    time.sleep(0.05)  # a later tick of the clock by which a file system dates changes
+    with path.open("r+b") as file:
+        file.seek(100)
+        file.write(b"over what was there")
+
+
+def harm_until_said(path, harm, notices):
+    """The harmed file and its bytes. The newest file is harmed, and the next one where the ledger had just gone on to that."""
+    seen, harmed, left = set(), None, None
+
+    def said():
+        nonlocal harmed, left
+        if "ledger-lost" in notices.active:
+            return True
+        parts = sorted(path.parent.glob("run.[0-9]*.mcap")) or [path]
+        if parts[-1] not in seen:
+            seen.update(parts, [path])
+            harmed = parts[-1]
+            harm(harmed, path.parent)
+            left = harmed.read_bytes() if harmed.exists() else None
+        return False
+
+    wait_for(said)
+    return harmed, left
+
+
+@pytest.mark.parametrize("split", [SplitLimits(), SplitLimits(bytes=1)])
+@pytest.mark.parametrize("harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over])
+def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
+    notices, path = Notices(), tmp_path / "run.mcap"
+    with Ledger(path, bench, notices, split=split) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
+        if split.bytes == 1:
+            wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
+        harmed, left = harm_until_said(path, harm, notices)
+        keep(ledger, 10, 20)
+    assert ledger.path == tmp_path / "run.next1.mcap"
+    assert [frame.frame for frame in drawable_frames(ledger.path)] == list(range(10, 20))
+    assert (harmed.read_bytes() if harmed.exists() else None) == left
+    assert ledger.failure.startswith(f"{harmed} was ")
+    assert ledger.failure.split(" was ")[1].split()[0] in {"deleted", "truncated", "overwritten"}
+    assert ledger.summary()["failure"] == ledger.failure
+    assert notices.counts()["ledger-lost"] == 1
+
+
+def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, bench):
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        (tmp_path / "run.mcap").unlink()
+    assert ledger.failure.endswith("run.mcap was deleted while it was written")
+    assert ledger.summary()["unrecorded"] >= 20
+
+
+def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, bench):
+    notices, folder = Notices(), tmp_path / "runs"
+    folder.mkdir()
+    with Ledger(folder / "run.mcap", bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        shutil.rmtree(folder)
+        wait_for(lambda: "ledger-lost" in notices.active)
+        folder.mkdir()
+        wait_for((folder / "run.next1.mcap").exists, "another file, once there is a place for it")
+        keep(ledger, 10, 20)
+    assert [frame.frame for frame in drawable_frames(folder / "run.next1.mcap")][-1] == 19
+    assert ledger.failure.endswith("run.mcap was deleted while it was written")
+
+
+def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, bench):
+    notices = Notices()
+    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        (tmp_path / "link.mcap").hardlink_to(tmp_path / "run.mcap")
+        (tmp_path / "run.mcap").touch()
+        (tmp_path / "run.mcap").rename(tmp_path / "moved.mcap")
+        wait_for(lambda: notices.counts().get("ledger-moved"))
+        keep(ledger, 10, 20)
+    assert ledger.failure is None
+    assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
+
+
+def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, bench):
+    notices, path = Notices(), tmp_path / "run.mcap"
+    with LedgerSwitch(Ledger(path, bench, notices)) as switch:
+        for number, event in ((9, "scenario"), (0, "start"), (1, "start"), (0, "end")):
+            record = {"name": f"f{number}", "kind": "blank", "who": "file", "t_ns": 0, "table": "{}"}
+            switch.fault(FaultRecord(host_ns=1, event=event, number=number, **record))
+        wait_for(lambda: sum(topic == FAULT_TOPIC for topic, _ in read_topics(path)) == 4, "the faults on the disk")
+        path.unlink()
+        wait_for(lambda: "ledger-lost" in notices.active)
+    found = [json.loads(data) for topic, data in read_topics(switch.last.path) if topic == FAULT_TOPIC]
+    assert [(each["event"], each["number"]) for each in found] == [("scenario", 9), ("start", 1)]
+
+
+def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
+    backlog = LedgerQueue()
+    frames = sum(backlog.put(QueueEntry("frame", 0, 0, bytes)) for _ in range(50_000))
+    packets = sum(backlog.put(QueueEntry("packet", 0, 0, bytes, 1000)) for _ in range(50_000))
+    assert 0 < frames < 50_000 and 0 < packets < 50_000
+    assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
+    assert backlog.put(QueueEntry("frame", 0, 0, bytes))
+
+
+def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        try:
+            keep(ledger, 0, 10)
+            time.sleep(1.5)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert ledger.failure is None
+    assert len([topic for topic, _ in read_topics(tmp_path / "run.mcap") if topic == "/process"]) >= 2
+
+
+def bomb(claimed: int, size: int) -> bytes:
+    data = bytes(size)
+    builder = RecordBuilder()
+    Header("", "x").write(builder)
+    Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), claimed).write(builder)
+    return MCAP0_MAGIC + builder.end() + b"  "
+
+
+@pytest.mark.parametrize(
+    ("claimed", "word"), [(100_000_000, "at most 64 MB are unpacked"), (1000, "more than the 1000"), (50_000_000, "times")]
+)
+def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, claimed, word):
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(claimed, 100_000_000 if claimed != 50_000_000 else 50_000_000))
+    assert path.stat().st_size < 33_000
+    with pytest.raises(InputError, match=word):
+        read_log(path)
+
+
+def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(library="test")
+    for topic in ("/imu", "/gps"):
+        writer.add_message(writer.register_channel(topic, "json", 0), 1, b"{}", 1)
+    writer.finish()
+    (tmp_path / "other.mcap").write_bytes(file.getvalue())
+    with pytest.raises(InputError, match="its topics are /gps, /imu"):
+        read_log(tmp_path / "other.mcap")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"q": [2, 0, 0, 0]}, "norm"),
+        ({"rate": [1e9, 0, 0]}, "rate"),
+        ({"swap_ns": -5}, "Expected"),
+        ({"t_ns": 2**70}, "Expected|range"),
+    ],
+)
+def test_a_frame_that_the_wire_would_refuse_is_refused_with_its_number(tmp_path, wrong, word):
+    form = {"frame": 1, "t_ns": 1, "light_ns": 1, "draw_ns": 1, "swap_ns": 2, "q": [1, 0, 0, 0]}
+    path = frames_file(tmp_path, [form, form | wrong])
+    with pytest.raises(InputError, match=f"run.mcap: message 2.*{word}"):
+        list(drawable_frames(path))
+
+
+def frames_file(tmp_path, forms):
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(library="test")
+    channel = writer.register_channel("/frame", "json", 0)
+    for form in forms:
+        writer.add_message(channel, 1, json.dumps(form).encode(), 1)
+    writer.finish()
+    (tmp_path / "run.mcap").write_bytes(file.getvalue())
+    return tmp_path / "run.mcap"
+
+
+def test_a_report_of_absurd_times_is_a_report(tmp_path):
+    form = {"light_ns": 1, "draw_ns": 1, "q": [1, 0, 0, 0]}
+    times = (0, 10**18, 5, 2**62, 7)
+    path = frames_file(
+        tmp_path, [form | {"frame": k, "t_ns": -(2**63) if k % 2 else t, "swap_ns": t} for k, t in enumerate(times)]
+    )
+    assert summarise(figures_of(path)).frames == 5
+
+
+def test_a_report_s_memory_does_not_grow_with_the_run():
+    figures, known = RunFigures({}), {"light_ns": 1, "draw_ns": 0, "q": (1.0, 0.0, 0.0, 0.0)}
+    for begin in range(0, 140_000, 7000):
+        figures.add(
+            *(
+                FrameRecord(frame=k, t_ns=k, swap_ns=16_666_667 * k, missed_before=int(k == 70_000), **known)
+                for k in range(begin, begin + 7000)
+            )
+        )
+    assert figures.counted["frames"] == 140_000
+    assert len(figures.samples.rows) <= 1 << 16 and figures.samples.stride == 4
+    assert figures.spreads["interval"].percentile(50) == pytest.approx(16.667, rel=2e-3)
+    begin, (_, _, lost) = figures.spans.begin, figures.spans.column(6)
+    assert begin[lost > 0] == pytest.approx(70_000 / 60, abs=1.1)
+
+
+def test_refused_packets_are_counted_by_reason(tmp_path, bench):
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        for k in range(500):
+            ledger.packet(1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000))
+    figures_messages = [(topic, json.loads(data)) for topic, data in read_topics(tmp_path / "run.mcap")]
+    whole = [each for topic, each in figures_messages if topic == "/attitude"]
+    counted = {each["reason"]: each["count"] for topic, each in figures_messages if topic == "/not_kept"}
+    assert len(whole) == 40
+    assert counted == {"crc": 380, "norm": 80}
+    assert max(len(each["raw"]) for each in whole) == 2048

@@ -1,0 +1,152 @@
+"""The tracker in the loop of a run: what is recorded, told and counted of its answers."""
+
+from __future__ import annotations
+
+from collections import deque
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.basics.notices import Notices
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.answers.answer import Answer, ReportedStar
+from hilstar.server.answers.judge import AnswerRules
+from hilstar.server.live_answers import MAX_JUDGED_HZ, LiveAnswers
+from hilstar.server.operator import OnScreen
+from hilstar.server.pacer import Shown
+from hilstar.server.record.ledger_records import AnswerRecord, schema_of
+from tests.support.fake_clock import FakeClock
+from tests.support.waiting import wait_for
+
+Q = np.array([1.0, 0.0, 0.0, 0.0])
+AWAY = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])  # 11 degrees
+BENCH = SimpleNamespace(config=SimpleNamespace(monitor=SimpleNamespace(refresh_hz=60.0)), scan=SimpleNamespace(hold_s=0.0))
+RULES = AnswerRules(0.1, clock="host")
+DRAWN = SimpleNamespace(rate_cam_rad_s=None)
+
+
+class Queued:
+    """Answers that wait, and what was refused; `unread` says why nothing is read."""
+
+    unread = ""
+
+    def __init__(self) -> None:
+        self.waiting: deque[Answer] = deque()
+        self.refused: dict[str, int] = {}
+
+    def take(self) -> list[Answer]:
+        return [self.waiting.popleft() for _ in range(len(self.waiting))]
+
+    def refusals(self) -> dict[str, int]:
+        return self.refused
+
+    def trouble(self) -> str:
+        return ""
+
+    def close(self) -> None:
+        pass
+
+
+class Kept:
+    """What a ledger would keep."""
+
+    def __init__(self) -> None:
+        self.on, self.records = True, []
+
+    def answer(self, record: AnswerRecord) -> None:
+        self.records.append(record)
+
+
+def second_of_frames(answers: LiveAnswers, **more) -> None:
+    for k in range(60):
+        at_ns = k * NS_PER_S // 60
+        attitude = Attitude(Q, 0, False)
+        answers.frame(Shown(k, at_ns, attitude, DRAWN, draw_ns=at_ns, **more), at_ns + 5)
+
+
+def test_answers_are_judged_recorded_and_told_beside_the_frames():
+    source, kept, notices, clock = Queued(), Kept(), Notices(), FakeClock(NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=clock)
+    heard = []
+    answers.heard = lambda live: heard.append(live.figures)
+    at_ns = NS_PER_S // 2
+    with answers.running():
+        assert answers.figures.answers == 0 and answers.figures.silent == ""
+        second_of_frames(answers)
+        star = ReportedStar(1.5, 2.0, 300.0, 26311)
+        source.waiting.append(Answer(at_ns + 9, b"\x01\xff", at_ns, Q, np.zeros(3), True, "track", 7, 1.2, (star,)))
+        source.waiting.append(Answer(at_ns + 9, b"\x02", at_ns, AWAY, mode="x" * 99))
+        source.waiting.append(Answer(at_ns + 9, b"\x03", at_ns, None, valid=False))
+        source.refused = {"checksum": 2}
+        wait_for(lambda: heard)
+        clock.work(4 * NS_PER_S)
+        wait_for(lambda: answers.figures.silent)
+    assert (heard[0].right, heard[0].wrong, heard[0].invalid, heard[0].refused) == (1, 1, 1, {"checksum": 2})
+    assert notices.counts() == {"wrong-answer": 1, "tracker-silent": 1}
+    right, wrong, invalid = kept.records
+    assert (right.raw, right.verdict, right.stars, right.centroids) == ("01ff", "right", 7, ((1.5, 2.0, 300.0, 26311),))
+    assert (right.middle_ns, right.light_ns, right.q_lit, right.residual_arcsec) == (at_ns, at_ns + 5, tuple(Q), (0, 0, 0))
+    assert (right.first_frame, right.last_frame) == (27, 33)
+    assert wrong.verdict == "wrong" and abs(wrong.residual_arcsec[1] - np.degrees(0.2) * 3600) < 1e-3
+    assert len(wrong.mode) == 40
+    assert (invalid.verdict, invalid.q, invalid.q_lit) == ("invalid", None, None)
+    for record in kept.records:  # as the ledger writes and reads it, with a schema that readers of MCAP know
+        assert msgspec.json.decode(msgspec.json.encode(record), type=AnswerRecord) == record
+    types = {field["type"] for field in msgspec.json.decode(schema_of(AnswerRecord, "x"))["properties"].values()}
+    assert types == {"integer", "string", "array", "boolean", "number"}
+
+
+def test_frames_that_an_operator_changed_are_no_sky_to_compare_with():
+    source = Queued()
+    answers = LiveAnswers(BENCH, RULES, source, Notices(), Kept(), clock=FakeClock(NS_PER_S))
+    second_of_frames(answers, on_screen=OnScreen(operator="grid"))
+    source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
+    with answers.running():
+        wait_for(lambda: answers.figures.answers)
+    assert answers.figures.unpaired == 1
+
+
+def test_a_flood_of_answers_is_judged_up_to_a_rate_and_counted_beyond():
+    source, kept, clock = Queued(), Kept(), FakeClock(2 * NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, Notices(), kept, clock=clock)
+    second_of_frames(answers)
+    source.waiting.extend(Answer(NS_PER_S + k, b"", NS_PER_S // 2, Q) for k in range(5000))
+    with answers.running():
+        wait_for(lambda: answers.figures.answers)
+    assert answers.figures.answers == MAX_JUDGED_HZ
+    judged = [record for record in kept.records if record.verdict != "unjudged"]
+    assert len(judged) == MAX_JUDGED_HZ and len(kept.records) == 5000
+    assert answers.figures.refused == {"too many": 5000 - MAX_JUDGED_HZ}
+
+
+def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
+    source, notices, kept = Queued(), Notices(), Kept()
+    answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=FakeClock(NS_PER_S))
+    second_of_frames(answers)
+    source.waiting.append(Answer(NS_PER_S // 2, b"\x07", NS_PER_S // 2, np.ones(3)))
+    source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
+    with answers.running():
+        wait_for(lambda: answers.figures.right)
+    assert notices.counts() == {"answers-failed": 1}
+    # The one that could not be judged is counted and recorded all the same.
+    assert (answers.figures.answers, answers.figures.unjudged) == (2, 1)
+    assert [(record.raw, record.verdict) for record in kept.records] == [("07", "unjudged"), ("", "right")]
+
+
+def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
+    source, notices, clock = Queued(), Notices(), FakeClock(NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, notices, Kept(), clock=clock)
+
+    def told(words: str) -> bool:
+        clock.work(NS_PER_S // 5)
+        return words in answers.figures.silent
+
+    with answers.running():
+        second_of_frames(answers)
+        source.unread = "the reader (python:a:b) does not return"
+        wait_for(lambda: told("no answer is read: the reader (python:a:b) does not return"))
+        source.unread = ""
+        wait_for(lambda: told("the tracker has not answered"))
+    assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}

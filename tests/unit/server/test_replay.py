@@ -1,0 +1,167 @@
+"""What of a log, or of an earlier run, is replayed: which frames, at which times, with which attitudes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.packet import AttitudeSample, encode
+from hilstar.basics.errors import InputError
+from hilstar.display.quantisers import QUANTISERS
+from hilstar.server.bench.config import AttitudeSettings, parse_config
+from hilstar.server.record.ledger import Ledger
+from hilstar.server.record.ledger_records import FrameRecord
+from hilstar.server.replay import OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
+from tests.support.benches import SMALL_BENCH
+
+MAX = math.inf
+
+
+@pytest.fixture
+def config(tmp_path):
+    return parse_config(tmp_path / "bench.toml", SMALL_BENCH)
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Two seconds of a turn about the boresight at 0.1 rad/s, a sample each 0.1 s, which begins at 100 s of its clock."""
+    lines = [f"{100 + k / 10},{math.cos(0.005 * k)},0,0,{math.sin(0.005 * k)}" for k in range(21)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]) + "\n")
+    return path
+
+
+@pytest.fixture
+def ledger(tmp_path, small_bench_file):
+    return earlier_run(tmp_path / "run.mcap", small_bench_file)
+
+
+def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
+    """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last two on paths."""
+    bench = SimpleNamespace(
+        file=SimpleNamespace(
+            path=small_bench_file,
+            text=SMALL_BENCH,
+            sha256="0" * 64,
+            config=SimpleNamespace(certify=SimpleNamespace(certificate=None)),
+        ),
+        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
+        output={},
+        renderer=SimpleNamespace(
+            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+        ),
+        config=SimpleNamespace(
+            render=SimpleNamespace(codes_ms=None),
+            attitude=AttitudeSettings(),
+            tracker=SimpleNamespace(q_body_to_cam=None),
+        ),
+    )
+    with Ledger(path, bench) as kept:
+        for k in range(10):
+            sample = AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0]), None, k)
+            kept.packet(1000 + k, encode(sample), sample, None)
+            q, rate = None if k == 3 else (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0) if k >= 8 else None
+            at_ns = 20_000_000 * k
+            frame = FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate)
+            frame.velocity_km_s = (0.0, 7.5, speed_km_s) if k >= 6 else None
+            frame.place_km = (7000.0 + away_km, 0.0, 1.0) if k >= 6 else None
+            kept.frame(frame)
+    return path
+
+
+def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last(log, config):
+    play = plan_play(log, Wanted(), config)
+    assert play.paced and play.frame_count == 121 and play.packet_count == 21
+    number, t_ns, attitude, _ = play.frame(60)
+    assert (number, t_ns) == (60, 101_000_000_000)
+    assert attitude.q_icrs_to_cam == pytest.approx([math.cos(0.05), 0, 0, math.sin(0.05)], abs=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "frames"), [(2.0, 61), (0.5, 241), (MAX, 121)])
+def test_the_speed_stretches_the_log_and_max_draws_it_all_unpaced(log, config, speed, frames):
+    play = plan_play(log, Wanted(speed), config)
+    assert play.frame_count == frames
+    assert play.paced == (speed != MAX)
+
+
+def test_a_span_and_a_step_choose_the_frames(log, config):
+    play = plan_play(log, Wanted(MAX, start_s=0.5, stop_s=1.5, step_s=0.25), config)
+    assert [play.frame(k)[1] / 1e9 for k in range(play.frame_count)] == [100.5, 100.75, 101.0, 101.25, 101.5]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "word"),
+    [
+        (Wanted(start_s=3.0), "--start"),
+        (Wanted(stop_s=2.5), "--stop"),
+        (Wanted(start_s=1.5, stop_s=1.0), "--start"),
+        (Wanted(step_s=0.0), "--step"),
+        (Wanted(2.0, step_s=0.1), "--step"),
+        (Wanted(step_s=1e-12), "frames"),
+    ],
+)
+def test_a_replay_of_no_or_too_many_frames_is_refused(log, config, wanted, word):
+    with pytest.raises(InputError, match=word):
+        plan_play(log, wanted, config)
+
+
+def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(tmp_path, config):
+    path = tmp_path / "fast.csv"
+    path.write_text("t_s,qw,qx,qy,qz,rx,ry,rz\n0,1,0,0,0,0,0,0\n1,1,0,0,0,0,0,57.3\n")
+    with pytest.raises(InputError, match=r"attitude 2.*max_rate_deg_s"):
+        plan_play(path, Wanted(), config)
+
+
+def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_attitudes(ledger, config):
+    play = plan_play(ledger, Wanted(MAX), config)
+    assert (play.frame_count, play.packet_count, play.paced, play.moving) == (10, 10, False, True)
+    frames = [play.frame(k) for k in range(10)]
+    assert [(frame.number, frame.t_ns) for frame in frames] == [(2 * k, 500 + k) for k in range(10)]
+    assert [frame.attitude is None for frame in frames] == [k == 3 for k in range(10)]
+    assert frames[7][2].rate_cam_rad_s is None
+    assert frames[8][2].rate_cam_rad_s.tolist() == [0.0, 0.1, 0.0]
+
+
+def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledger, config):
+    play = plan_play(ledger, Wanted(start_s=0.04, stop_s=0.08), config)
+    assert [play.frame(k)[0] for k in range(play.frame_count)] == [4, 6, 8]
+    with pytest.raises(InputError, match="has no frame from"):
+        plan_play(ledger, Wanted(start_s=0.041, stop_s=0.042), config)
+    with pytest.raises(InputError, match="frame by frame"):
+        plan_play(ledger, Wanted(2.0), config)
+
+
+def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(ledger, config, tmp_path, small_bench_file):
+    places = [frame[2].place_km for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+    assert places[0] is None
+    assert places[1].tolist() == [7000.0, 0.0, 1.0]
+    far = earlier_run(tmp_path / "far.mcap", small_bench_file, away_km=1e8)
+    with pytest.raises(InputError, match="message 7 of /frame: a place beyond 6000 to"):
+        plan_play(far, Wanted(speed=MAX), config)
+
+
+def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(ledger, config, tmp_path, small_bench_file):
+    velocities = [frame[2].velocity_km_s for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+    assert velocities[0] is None
+    assert velocities[1].tolist() == [0.0, 7.5, 0.0]
+    too_fast = earlier_run(tmp_path / "fast.mcap", small_bench_file, speed_km_s=3e5)
+    with pytest.raises(InputError, match="message 7 of /frame: a velocity over 10000 km/s"):
+        plan_play(too_fast, Wanted(speed=MAX), config)
+
+
+def test_a_ledger_says_who_drew_it_and_a_log_does_not(ledger, log, config):
+    assert plan_play(ledger, Wanted(MAX), config).drawn_by == DrawnBy("none", "none", "NumPy")
+    assert plan_play(log, Wanted(MAX), config).drawn_by is None
+
+
+def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
+    here = DrawnBy("llvmpipe", "4.5", "compute shaders")
+    assert here.other_codes(DrawnBy("llvmpipe", "4.5", "compute shaders"), "exact") == 0
+    for other in (replace(here, gl_renderer="zink"), replace(here, gl_version="4.6"), replace(here, path="points")):
+        assert here.other_codes(other, "round") == QUANTISERS["round"].other_codes
+        assert here.other_codes(other, "exact") == QUANTISERS["exact"].other_codes
+    assert here.other_codes(replace(here, path="NumPy"), "exact") == OTHER_CODES_BY_NUMPY

@@ -1,0 +1,142 @@
+"""The status that goes back to the sender, and the summary of a run."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+
+from hilstar.attitude.clock.timeline import Attitude, StaleGate
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.attitude.wire import protocol
+from hilstar.basics.notices import Notices
+from hilstar.server.operator import OnScreen
+from hilstar.server.pacer import Shown
+from hilstar.server.serve import StatusMaker
+from hilstar.server.summary import RunTally, SwapTally
+
+FRESH = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 5_000_000, False, sequence=42)
+MS = 1_000_000
+
+
+class Keys:
+    """An operator, and a window, as a test sets them."""
+
+    def __init__(self) -> None:
+        self.now = OnScreen()
+
+    def look(self) -> OnScreen:
+        return self.now
+
+
+@pytest.fixture
+def loop():
+    return SimpleNamespace(
+        tally=RunTally(), gate=StaleGate(250 * MS), notices=Notices(), pacer=SimpleNamespace(operator=Keys())
+    )
+
+
+RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
+
+
+def shown(attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more) -> Shown:
+    return Shown(number, 0, attitude, SimpleNamespace(clipped_hip=clipped), **more)
+
+
+def test_a_status_names_the_frame_its_light_and_the_attitude_behind_it(loop):
+    counts = PacketCounts(received=10)
+    counts.refused_by["crc"] = 3
+    status = StatusMaker().status(shown(), 123, loop, counts, True)
+    assert (status.frame, status.light_t_ns, status.attitude_sequence, status.attitude_age_ns) == (9, 123, 42, 5 * MS)
+    assert (status.accepted, status.refused) == (7, 3)
+    assert status.health == protocol.HEALTH_CLOCK_SYNCHRONISED | protocol.HEALTH_REFUSED
+
+
+def test_without_an_attitude_its_age_is_minus_one(loop):
+    status = StatusMaker().status(shown(None, missing=True), 0, loop, PacketCounts(), False)
+    assert (status.attitude_age_ns, status.attitude_sequence) == (-1, 0)
+    assert status.health == protocol.HEALTH_NO_ATTITUDE | protocol.HEALTH_BLANK
+
+
+def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):
+    maker, counts = StatusMaker(), PacketCounts()
+    loop.tally.missed_frames, counts.refused_by["norm"] = 2, 1
+    bits = protocol.HEALTH_MISSED | protocol.HEALTH_REFUSED
+    assert [maker.status(shown(), 0, loop, counts, False).health for _ in range(2)] == [bits, 0]
+    loop.tally.missed_frames += 1
+    assert maker.status(shown(), 0, loop, counts, False).health == protocol.HEALTH_MISSED
+
+
+@pytest.mark.parametrize(
+    ("on_screen", "bit"),
+    [(OnScreen(operator="grid"), protocol.HEALTH_OPERATOR_OVERRIDE), (OnScreen(hidden="minimised"), protocol.HEALTH_HIDDEN)],
+)
+def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop, on_screen, bit):
+    maker = StatusMaker()
+    loop.pacer.operator.now = on_screen
+    assert [maker.status(shown(), 0, loop, PacketCounts(), False).health for _ in range(2)] == [bit, bit]
+
+
+def test_a_failed_ledger_a_clipped_star_and_a_stale_attitude_are_told_while_they_last(loop):
+    ledger = SimpleNamespace(failure=None)
+    maker = StatusMaker(ledger)
+    assert maker.status(shown(), 0, loop, PacketCounts(), False).health == 0
+    ledger.failure, loop.gate.stale = "No space left on device", True
+    bits = protocol.HEALTH_LEDGER_FAILED | protocol.HEALTH_CLIPPED | protocol.HEALTH_STALE
+    assert maker.status(shown(clipped=(32349,)), 0, loop, PacketCounts(), False).health == bits
+
+
+def test_a_second_sender_is_told_while_it_lasts_and_once_if_it_has_gone_since(loop):
+    maker, notices = StatusMaker(), loop.notices
+
+    def health() -> int:
+        return maker.status(shown(), 0, loop, PacketCounts(), False).health
+
+    notices.begin("second-sender", "two senders")
+    assert [health(), health()] == [protocol.HEALTH_SECOND_SENDER] * 2
+    notices.end("second-sender", "one-sender", "one sender again")
+    assert health() == 0
+    notices.begin("second-sender", "two senders")
+    notices.end("second-sender", "one-sender", "one sender again")
+    assert [health(), health()] == [protocol.HEALTH_SECOND_SENDER, 0]
+
+
+def test_a_run_without_a_frame_has_nulls_where_there_is_no_figure():
+    summary = msgspec.to_builtins(RunTally().summary(0.0, PacketCounts(), RENDERER))
+    assert summary["frames"] == 0 and summary["fps"] is None
+    assert summary["frame_ms"] == {"p50": None, "p99": None, "max": None}
+    assert summary["stars_drawn"] == {"mean": None, "max": None}
+    assert summary["clipped"] == {"max": 0, "hip": [], "bodies": []}
+    assert not {"clock", "turn_ms", "link", "screen", "ledger"} & set(summary)
+
+
+def test_a_summary_has_the_figures_of_its_frames():
+    tally = RunTally()
+    for k in range(100):
+        tally.add((2 + k % 2) * MS, None if k == 0 else 7 * MS, 50 + k, (5, 3) if k == 8 else ())
+    counts = PacketCounts(received=30)
+    counts.refused_by["crc"] = 10
+    summary = msgspec.to_builtins(tally.summary(2.0, counts, RENDERER))
+    assert (summary["frames"], summary["fps"]) == (100, 50)
+    assert summary["frame_ms"]["max"] == 3.0
+    assert summary["frame_ms"]["p50"] == pytest.approx(2.0, rel=2e-3)
+    assert summary["attitude_age_ms"]["p99"] == pytest.approx(7.0, rel=2e-3)
+    assert summary["stars_drawn"] == {"mean": pytest.approx(99.5), "max": 149}
+    assert summary["clipped"] == {"max": 2, "hip": [3, 5], "bodies": []}
+    assert summary["packets"]["accepted"] == 20 and summary["packets"]["refused_by"]["crc"] == 10
+
+
+def test_an_interval_over_missed_frames_is_no_jitter():
+    swaps = SwapTally()
+    assert swaps.summary() == {}
+    at = 0
+    for k in range(50):
+        at += 40 * MS if k == 25 else 20 * MS
+        swaps.add(at + (MS if k == 30 else 0), at, int(k == 25), at - 6 * MS)
+    summary = swaps.summary()
+    assert summary["swap_late_ms"]["max"] == 1.0
+    assert summary["packet_to_swap_ms"]["p50"] == pytest.approx(6.0, rel=2e-3)
+    # One swap a millisecond late makes one interval longer and one shorter: sqrt(2 / 48).
+    assert summary["pacing_jitter_ms"] == pytest.approx((2 / 48) ** 0.5, rel=1e-6)

@@ -1,14 +1,21 @@
-"""What an ADC's rounding does to light where too little noise spreads a level over its steps.
+"""What an ADC's rounding and its lowest code do to light.
+
+Rounding counts where too little noise spreads a level over the ADC's steps.
 
 A level that noise of 0.6 DN or more spreads is read right in the mean. With less noise, all pixels
 of one light are rounded alike: their errors add up, and no number of images takes them away. They
 follow from where the dark level is between two steps, which is not known. So they are taken at
 STEP_PHASES places of it, and their spread over these is the error.
+
+Without an offset the ADC cuts a dark pixel's noise off at code 0, which makes the dark brighter in
+the mean; light on that pixel lifts it away from code 0.
 """
 
 import math
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from hilstar.basics.arrays import FloatArray
 
@@ -16,6 +23,7 @@ VARIANCE_DN2 = 1 / 12  # of the reading of a level that noise spreads over the s
 STEP_PHASES = 16  # places of a dark level between two steps
 PLACES_DN = np.arange(STEP_PHASES)[:, None] / STEP_PHASES
 HARMONICS = np.arange(1, 9)  # of the sawtooth that rounding is: eight hold 93 % of its variance
+UNCUT_SIGMAS = 4.0  # of a dark level above code 0: what is cut off is under 1e-5 of the noise
 DITHERED_DN = 0.6  # of noise: the largest harmonic is then 3e-4 DN
 
 
@@ -56,3 +64,40 @@ def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -
     noise_dn = np.sqrt(dark_noise_dn**2 + dn_per_e * light_dn)
     lit = rounding_error(PLACES_DN + light_dn, noise_dn)
     return np.asarray((lit - rounding_error(PLACES_DN, np.array(dark_noise_dn))).mean(axis=1))
+
+
+def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
+    """The mean (n,) of levels (n,) with normal noise (n,), DN, rounded and cut off at 0.
+
+    The last term is that of whole codes in place of a continuous level (Euler and Maclaurin).
+    """
+    ratio = level_dn / noise_dn
+    density = np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
+    return np.asarray(level_dn * ndtr(ratio) + noise_dn * density - density / noise_dn / 24)
+
+
+def uncut_level_dn(mean_dn: float, noise_dn: float) -> float:
+    """The level whose mean is `mean_dn` when its noise is cut off at 0, DN."""
+    lowest_dn, highest_dn = -5.0 * noise_dn, mean_dn + noise_dn
+
+    def excess_dn(level_dn: float) -> float:
+        return float(cut_mean_dn(np.array(level_dn), np.array(noise_dn))) - mean_dn
+
+    if excess_dn(lowest_dn) >= 0:  # darker than any level that is told apart
+        return lowest_dn
+    return float(brentq(excess_dn, lowest_dn, highest_dn))
+
+
+def cut_light(light_dn: FloatArray, dark_mean_dn: float, noise_dn: float, dn_per_e: float) -> float:
+    """What the cut at code 0 adds on average to pixels of `light_dn` (n,) above a dark frame, DN;
+    below 0 where the dark is made brighter than the light.
+
+    `dark_mean_dn` is the mean of the dark frame as it is read, `noise_dn` a dark pixel's noise
+    before the ADC.
+    """
+    if noise_dn <= 0 or dark_mean_dn > UNCUT_SIGMAS * noise_dn:
+        return 0.0
+    dark_dn = uncut_level_dn(dark_mean_dn, noise_dn)
+    spread_dn = np.sqrt(noise_dn**2 + dn_per_e * light_dn)
+    lit_dn = cut_mean_dn(dark_dn + light_dn, spread_dn) - (dark_dn + light_dn)
+    return float((lit_dn - (dark_mean_dn - dark_dn)).mean())

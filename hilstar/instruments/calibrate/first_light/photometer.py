@@ -31,11 +31,18 @@ from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, P
 from hilstar.instruments.calibrate.measurements import COMMON
 from hilstar.instruments.calibrate.plan import Patch, in_channel
 from hilstar.instruments.simulate.optics import BenchGeometry
-from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light, rounding_rms
+from hilstar.tracker.rounding import (
+    STEP_PHASES,
+    before_adc_dn,
+    cut_light,
+    rounded_light,
+    rounding_rms,
+)
 
 SHARE = 0.5  # relative to the smaller side of what both screen and tracker have
 MAX_SIDE_TRACKER_PX = 200.0
 APART_TRACKER_PX = 8.0  # distance of the sparsest lattice's dots: their wings do not add up
+CUT_UNKNOWN = 0.3  # of what is cut off at code 0: the noise of a detector is stated to about a fifth
 MIN_DOTS = 4  # along a side of the sparsest lattice
 MARGIN_SIGMAS, MARGIN_PX = 6.0, 3.0
 PHASES = 24
@@ -304,6 +311,11 @@ class PixelScatter:
                 squares = squares + more * (not patch.code)
         return float(np.mean(squares)) if squares else 0.0
 
+    def dark_sum_dn(self, times: int) -> float:
+        """The sum of the last black image, DN, exposed so many times longer, else of another."""
+        sums = {at.times: total for (patch, at), total in self._sums.items() if not patch.code}
+        return sums.get(times, max(sums.values(), default=0.0))
+
     @property
     def dn_per_e(self) -> float:
         """The variance of light over light, DN: by the images of lit patterns; as the detector is
@@ -405,6 +417,10 @@ class Photometer:
             self._of_ratios(values.light, lit, links),
             self._of_rounding(values, lit, pairs, links),
         ]
+        cut = self._of_cut(values, lit, pairs, links)
+        if (np.abs(cut) > SMALL_MODE * values.sigma).any():
+            values = values._replace(light=values.light - cut)
+            causes.append(CUT_UNKNOWN * cut[:, None])
         with_black, black_error = self._with_black(planned, values.light)
         if black_error is not None:
             causes.append(np.full((len(planned), 1), black_error))
@@ -673,6 +689,39 @@ class Photometer:
         modes = modes * sizes
         used = (np.abs(modes) > SMALL_MODE * values.sigma[:, None]).any(axis=0)
         return np.asarray(modes[:, used])
+
+    def _of_cut(
+        self,
+        values: _Values,
+        lit: dict[int, _Reading],
+        pairs: list[_Pair],
+        links: list[LatticeRatio],
+    ) -> FloatArray:
+        """What the ADC's lowest code adds to light (n,) where it cuts off a dark pixel's noise."""
+        effect = np.zeros(len(values.light))
+        for order, reading in lit.items():
+            effect[order] = self._cut_dn(reading.at, reading.light_dn) * values.per_dn[order]
+        for pair, link in zip(pairs, links, strict=True):
+            more, less = pair.light_dn
+            off = self._cut_dn(pair.more, more) / more - self._cut_dn(pair.less, less) / less
+            for order, reading in lit.items():
+                if _passes(reading.patch, reading.at, link):
+                    effect[order] -= values.light[order] * off
+        return effect
+
+    def _cut_dn(self, at: Range, light_dn: float) -> float:
+        """What the cut at code 0 adds to the sum of a lattice's image above black, DN."""
+        detector = self.context.file.config.tracker.detector
+        stated_dn = detector.electronics_e / detector.gain_e_per_dn
+        read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
+        # What is cut off scatters less than it would: the stated noise counts where it is larger.
+        noise_dn = max(stated_dn, read_dn)
+        dark_dn = self.scatter.dark_sum_dn(at.times) / self.field.tracker_px
+        dots = self.field.lit(at.period)
+        along = self.profiles[at.period]
+        level_dn = max(light_dn, 0.0) / dots * np.outer(along, along).ravel()
+        cell_px = (at.period * self.ratio) ** 2
+        return dots * cell_px * cut_light(level_dn, dark_dn, noise_dn, self.scatter.dn_per_e)
 
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:
         """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the

@@ -21,7 +21,7 @@ from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.rounding import rounding_error, rounding_rms
+from hilstar.tracker.rounding import cut_light, rounding_error, rounding_rms
 from tests.support.benches import TWIN, bench_text
 
 pytestmark = pytest.mark.usefixtures("without_charts")
@@ -170,6 +170,24 @@ def test_rounding_is_that_of_levels_in_noise():
         assert rounding_error(level, np.array(noise_dn)) == pytest.approx(read.mean(axis=0) - level, abs=0.005)
     assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
     assert rounding_rms(0.6) < 1e-3
+
+
+@pytest.mark.parametrize(("dark_dn", "noise_dn", "light_dn"), [(0.0, 0.63, 2.0), (0.2, 0.63, 0.3), (-0.3, 1.5, 10.0)])
+def test_the_cut_at_code_0_is_that_of_noise_that_an_adc_reads(dark_dn, noise_dn, light_dn):
+    """Of two million pixels each, dark and lit, with shot noise of 24 e- a DN."""
+    rng = np.random.default_rng(1)
+    count = 2_000_000
+    spread_dn = math.hypot(noise_dn, math.sqrt(light_dn / 24))
+    dark = np.maximum(np.rint(dark_dn + noise_dn * rng.standard_normal(count)), 0)
+    lit = np.maximum(np.rint(dark_dn + light_dn + spread_dn * rng.standard_normal(count)), 0)
+    added_dn = float(lit.mean() - dark.mean()) - light_dn
+    assert added_dn < -0.05
+    assert cut_light(np.array([light_dn]), float(dark.mean()), noise_dn, 1 / 24) == pytest.approx(added_dn, rel=0.06)
+
+
+def test_an_adc_with_an_offset_cuts_nothing():
+    assert cut_light(np.array([2.0]), 64.0, 0.63, 1 / 24) == 0.0
+    assert cut_light(np.array([2.0]), 0.0, 0.0, 1 / 24) == 0.0
 
 
 def test_the_monitor_pixels_that_a_tilted_screen_shows_are_counted():

@@ -294,7 +294,7 @@ def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
     assert_refused(run_hilstar_here("study", "chain", tmp_path / "dark.toml", "-o", out), 2, "exposure_s = 0")
     assert_refused(run_hilstar_here("study", "chain", tmp_path / "bare.toml", "-o", out), 2, "bare.toml")
     assert_refused(run_hilstar_here("study", "chain", "-o", out), 2, "BENCH.toml")
-    assert_refused(run_hilstar_here("study", "models", tmp_path / "dark.toml", "-o", out), 2, "dark.toml")
+    assert_refused(run_hilstar_here("study", "timing", tmp_path / "dark.toml", "-o", out), 2, "dark.toml")
     (tmp_path / "chain.csv").write_text(SMALL)
     assert_refused(run_hilstar_here("study", "chain", tmp_path / "chain.csv", "-o", tmp_path), 2, "chain.csv")
 

@@ -33,6 +33,11 @@ DERIVED = {
     "lyra": "the thesis's figures, by number",
     "rosetta": "the thesis's figures, by number",
     "orion": "the thesis's figures, by number",
+    "lyra_as_published": "the thesis's figures, by number",
+    "rosetta_as_published": "the thesis's figures, by number",
+    "orion_as_published": "the thesis's figures, by number",
+    "frames": "a count of stars, each a point",
+    "confront": "the limit of the stars that count",
 }
 DRAWN_AS = (1.0, 1e2, 1e3, 1e-6)  # a share is told in percent, a second in ms, electrons in millions
 PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}  # of axes and of what a text beside it names

@@ -364,9 +364,15 @@ def code_part(effort: Effort) -> Choice:
 
 def _price(cost: FieldCost, light: Light) -> str:
     """What `exact` takes of a refresh."""
-    words = f"exact takes {cost.best_ms:.2g} ms of {light.refresh_ms:.3g} (round {cost.cheap_ms:.2g})"
+    best_ms, cheap_ms = (_two_digits(ms) for ms in (cost.best_ms, cost.cheap_ms))
+    words = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
     words += f" for an average field at 1 deg/s {cost.where}"
     return f"{words}, {cost.why}" if cost.why else words
+
+
+def _two_digits(number: float) -> str:
+    """A number to two digits, and whole from 100 on."""
+    return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"
 
 
 def side_candidates(render: RenderSettings, light: Light, method: Quantisation) -> list[Sides]:

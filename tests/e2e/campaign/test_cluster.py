@@ -64,14 +64,14 @@ def running(folder: Path, log: str, *words: str, **env: str) -> Iterator[subproc
 
 def other_version(folder: Path) -> Path:
     """A folder to import another hilstar from: the same but for its version."""
-    (folder / "other" / "hilstar").mkdir(parents=True)
-    for entry in Path(hilstar.__file__).parent.iterdir():
+    package, basics = Path(hilstar.__file__).parent, Path("basics")
+    (folder / "other" / "hilstar" / basics).mkdir(parents=True)
+    for entry in [*package.iterdir(), *(package / basics).iterdir()]:
+        copy = folder / "other" / "hilstar" / entry.relative_to(package)
         if entry.name == "version.py":
-            (folder / "other/hilstar/basics/version.py").write_text(
-                re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text())
-            )
-        elif entry.name != "__pycache__":
-            (folder / "other" / "hilstar" / entry.name).symlink_to(entry)
+            copy.write_text(re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text()))
+        elif entry.name not in {"__pycache__", basics.name}:
+            copy.symlink_to(entry)
     for name in ("shaders", "configs"):
         (folder / "other" / name).symlink_to(ROOT / name)
     return folder / "other"

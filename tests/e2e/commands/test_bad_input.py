@@ -330,7 +330,9 @@ def test_a_full_disk_is_one_line(words):
     assert_refused(result, 2, "cannot be written")
 
 
-@pytest.mark.parametrize(("module", "kept"), [("study/models.py", 200), ("cli/app.py", 16), ("errors.py", 200)])
+@pytest.mark.parametrize(
+    ("module", "kept"), [("instruments/study/models.py", 200), ("cli/app.py", 16), ("basics/errors.py", 200)]
+)
 def test_a_compiled_module_that_a_full_disk_cut_short_is_named(tmp_path, module, kept):
     """Marshal reads past its end: an EOFError, which click takes for Ctrl-C."""
     source = ROOT / "hilstar" / module

@@ -141,7 +141,7 @@ def test_wrong_inputs_are_refused(golden, small_bench_file, tmp_path):
     assert_refused(run_hilstar_here("compare", dn, fits_file), 2, "dn.fits", "electron/s")
     assert_refused(run_hilstar_here("compare", small, fits_file), 2, "100 x 240 px against 320 x 240 px")
     assert_refused(
-        run_hilstar_here("compare", fits_file, fits_file, "--truth", tmp_path / "empty.csv"), 2, "empty.csv:2", "y_px"
+        run_hilstar_here("compare", fits_file, fits_file, "--truth", tmp_path / "empty.csv"), 2, "empty.csv:1", "y_px"
     )
     assert_refused(run_hilstar_here("compare", fits_file, fits_file, "--truth", tmp_path / "no.csv"), 2, "no.csv")
     assert_refused(run_hilstar_here("compare", fits_file, fits_file, "--truth", fits_file), 2, "golden.fits")

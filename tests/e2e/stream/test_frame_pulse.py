@@ -89,7 +89,11 @@ def test_a_port_that_is_not_there_is_the_machine_s(tmp_path):
 
 def served(tmp_path, *changes):
     path = tmp_path / "beat.toml"
-    tables = {"render": {"quantisation": "round"}, "collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 3.0}}
+    tables = {
+        "render": {"quantisation": "round", "tolerance_px": 0.02},
+        "collimator": {"focal_length_mm": 350},
+        "sky": {"faintest_v_mag": 3.0},
+    }
     path.write_text(bench_text(tables, *changes))
     done = run_hilstar_here("serve", path, "--headless", "--frames", "2", "--json")
     assert done.returncode == 4, done.stderr  # nobody sends

@@ -196,7 +196,7 @@ def row(text, number, value, column):
     ("change", "words"),
     [
         (lambda text: text.replace("tw", "rw"), ("pairs.csv:1", "tw is missing", "scalar first")),
-        (lambda text: text.replace("tw", "qw"), ("tw is missing",)),
+        (lambda text: text.replace("tw", "qw"), ("pairs.csv:1", "qw is there twice")),
         (lambda text: HEADER + "\n", ("0 pairs", "3 are needed")),
         (lambda text: "", ("qw is missing",)),
         (lambda text: "\n".join(text.splitlines()[:3]) + "\n", ("2 pairs", "3 are needed")),

@@ -23,7 +23,7 @@ STUDIES = get_args(study_command.Study)
 TIMERS = {"in_turn", "medians_ms", "measured", "spent", "perf_counter", "perf_counter_ns"}
 # `chain` is run by a way of its own, whose times tests/study/test_study_chain.py plants.
 CHAIN = "chain"
-TIME_LABEL = re.compile(r"\btime\b.*\[(ms|us|s)\]|\(\d+ us\)", re.IGNORECASE | re.DOTALL)
+TIME_LABEL = re.compile(r"\btime\b.*\[(ms|us|s)\]|\(\d+ us\)|, time$", re.IGNORECASE | re.DOTALL)
 TIMES_IN_TITLE = re.compile(r"\d m?s\b(?! of latency)|\d us\b|times as (fast|long|SLOW)|of its time")
 WINNERS = re.compile(r"times as (fast|long|SLOW)|less time")
 

@@ -254,7 +254,8 @@ def test_steps_run_once_and_again_when_asked_or_when_what_they_depend_on_changes
 
 
 def test_a_session_knows_the_beat_by_what_it_has_seen_of_the_display(counted, tmp_path):
-    (tmp_path / "bench.toml").write_text(bench_text({"tracker": {"exposure_s": 0.04}, "collimator": {"focal_length_mm": 350}}))
+    tables = {"tracker": {"exposure_s": 0.04}, "collimator": {"focal_length_mm": 350}, "render": {"tolerance_px": 0.02}}
+    (tmp_path / "bench.toml").write_text(bench_text(tables))
     session = counted.go(tmp_path)[1]
     assert session.as_file().beat.refreshes_per_exposure == pytest.approx(2.4)
     assert session.as_file().beat.proposal.refresh_hz == pytest.approx(50)

@@ -21,7 +21,7 @@ from tests.support.commands import run_hilstar_here
 from tests.support.planted_sky import HEIGHT, NOTHING_WRONG, SKY, WIDTH, Extras, Planted, photograph, rotation_of, write_bench
 from tests.support.skies import STATION_TLE, skyfield
 
-RAW = sorted((Path(__file__).parents[2] / "data" / "confront").glob("*.tiff"))
+RAW = sorted((Path(__file__).parents[3] / "data" / "confront").glob("*.tiff"))
 RAW_BENCH = """[tracker]
 aperture_mm = 18.4
 focal_length_mm = 37.0

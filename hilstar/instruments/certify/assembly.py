@@ -222,9 +222,10 @@ def _of_structure(figures: Figures, read: Read, lasting: FloatArray, rough: Floa
         )
     if light.common_factors.size:
         common = (light.weights(figures.log_light) @ light.common_factors).T
-        error, source = float(np.abs(light.common_factors).max()), "pairs of images of one code on two lattices"
-        ratios = Input("ratios of lattices", "Student t", source, len(common), error, "relative", light.common_dof)
-        yield Effect(ratios, levels=common)
+        error = float(np.abs(light.common_factors).max())
+        source = "ratios of lattices by pairs of images, the ADC's rounding and its lowest code, black"
+        shared = Input("what readings share", "normal", source, len(common), error, "relative")
+        yield Effect(shared, levels=common)
     if rough.any():
         source = "codes read, each foretold by the others: those not read"
         yield Effect(

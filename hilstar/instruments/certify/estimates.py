@@ -64,7 +64,6 @@ class LightDeviation:
     lasting: Structure
     square_px: tuple[int, int, int]
     common_factors: FloatArray
-    common_dof: float
 
     def weights(self, log_light: FloatArray) -> FloatArray:
         """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes read it is held."""
@@ -178,7 +177,6 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         lasting=lasting,
         square_px=square,
         common_factors=common[1:] * (light / expected)[:, None],
-        common_dof=read.common_dof,
     )
 
 

@@ -47,7 +47,7 @@ class LightReadings:
     """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code (n,), at t_s (n,).
 
     It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings have in common, as the
-    ratios of lattices, is in `common` (n, inputs), one sigma relative to light, with its freedom. `noise_shape` (n,) is each
+    ratios of lattices, is in `common` (n, inputs), one sigma relative to light. `noise_shape` (n,) is each
     reading's noise relative to its light, up to a factor that their scatter tells; None where all are alike.
     """
 
@@ -56,7 +56,6 @@ class LightReadings:
     t_s: FloatArray
     square_px: tuple[int, int, int] | None = None
     common: FloatArray | None = None
-    common_dof: float = math.inf
     noise_shape: FloatArray | None = None
 
 

@@ -21,6 +21,7 @@ from hilstar.optics.glass.lens_data import (
     FieldPoint,
     Frame,
     Glass,
+    LensFileReader,
     LensLine,
     LensPrescription,
     LensSurface,
@@ -28,6 +29,7 @@ from hilstar.optics.glass.lens_data import (
     Shape,
     glass_of_code,
     nth,
+    only_aperture,
 )
 
 AIR, MIRROR = Glass(), Glass("MIRROR")
@@ -156,7 +158,7 @@ def _parts(line: str) -> list[str]:
     return re.findall(r"(?:'[^']*'|\"[^\"]*\"|[^;])+", line)
 
 
-class _Reader:
+class _Reader(LensFileReader):
     """Goes through the commands once, into system data and surfaces, and makes the lens of them."""
 
     def __init__(self, lines: list[LensLine]) -> None:
@@ -247,36 +249,15 @@ class _Reader:
         if light is not None and light.words and light.words[0].upper().startswith("Y"):
             light.refuse("asks for polarised rays", "write POL N")
 
-    def lens(self) -> LensPrescription:
-        """The whole. Raises InputError."""
+    def _check_ends(self) -> None:
         start = self.surfaces[0]
         if self._thickness(start) != np.inf:
             raise InputError(f"{start.label}: {NEAR_OBJECT}")
         if self.surfaces[-1].line.keyword != "SI":
             raise InputError(f"it has no image surface (SI); {CAN_WRITE}")
-        kind, pupil = self._pupil()
-        waves, primary = self._wavelengths()
-        lens = LensPrescription(
-            surfaces=tuple(self._placed()),
-            pupil_kind=kind,
-            pupil=pupil,
-            field_kind=self._field_kind(),
-            fields=tuple(self._fields()),
-            wavelengths_um=waves,
-            primary=primary,
-            notes=tuple(self.notes),
-        )
-        return lens.check()
 
     def _pupil(self) -> tuple[PupilKind, float]:
-        stated = [self.system[key] for key in ("EPD", "FNO", "NA", "NAO") if key in self.system]
-        if len(stated) != 1:
-            names = ", ".join(line.keyword for line in stated) or "none"
-            times = f"{len(stated)} times ({names})"
-            raise InputError(f"its aperture is stated {times}; write one of EPD, FNO and NA")
-        line = stated[0]
-        if line.keyword == "NAO":
-            line.refuse("is of a near object", "write EPD, FNO or NA, as for stars")
+        line = only_aperture(self.system, ("EPD", "FNO", "NA"), "NAO")
         if line.keyword == "EPD":
             return "diameter", line.value() * self.mm
         if line.value() <= 0:

@@ -4,7 +4,8 @@ Readers of formats (`zemax_file.py`, `codev_file.py`) make one; `optiland_lens.p
 """
 
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NoReturn, Self
 
@@ -276,6 +277,76 @@ class LensPrescription:
                 f"{first.label} has {radius}, and the pupil is {self.pupil:.4g} mm wide: no ray at its"
                 " edge meets it; are radii and curvatures, or units, mixed up?"
             )
+
+
+class LensFileReader(ABC):
+    """What readers of lens files share: the parts of a file, put together to a lens.
+
+    `notes` are lines for the person. Every part raises InputError.
+    """
+
+    notes: list[str]
+
+    def lens(self) -> LensPrescription:
+        """The whole. Raises InputError."""
+        self._check_ends()
+        kind, pupil = self._pupil()
+        waves, primary = self._wavelengths()
+        lens = LensPrescription(
+            surfaces=tuple(self._placed()),
+            pupil_kind=kind,
+            pupil=pupil,
+            field_kind=self._field_kind(),
+            fields=tuple(self._fields()),
+            wavelengths_um=waves,
+            primary=primary,
+            notes=tuple(self.notes),
+        )
+        return lens.check()
+
+    @abstractmethod
+    def _check_ends(self) -> None:
+        """Refuse an object that is near, and a lens without an image."""
+
+    @abstractmethod
+    def _pupil(self) -> tuple[PupilKind, float]:
+        """How the pupil is stated, and its size (mm) or F-number."""
+
+    @abstractmethod
+    def _wavelengths(self) -> tuple[tuple[float, ...], int]:
+        """The wavelengths, um, each once, and the place of the primary one."""
+
+    @abstractmethod
+    def _field_kind(self) -> FieldKind:
+        """What the numbers of the fields are."""
+
+    @abstractmethod
+    def _fields(self) -> Iterator[FieldPoint]:
+        """The fields, deg or mm."""
+
+    @abstractmethod
+    def _placed(self) -> Iterator[LensSurface]:
+        """The surfaces but the object, each in the axes of the lens."""
+
+
+def only_aperture(statements: Mapping[str, LensLine], names: Sequence[str], near: str) -> LensLine:
+    """The one statement of a lens's aperture among `names` and `near`, that of a near object.
+
+    Raises InputError where there is none, or several, or the one of a near object.
+    """
+    stated = [statements[name] for name in (*names, near) if name in statements]
+    if len(stated) != 1:
+        given = ", ".join(line.keyword for line in stated) or "none"
+        times = f"{len(stated)} times ({given})"
+        raise InputError(f"its aperture is stated {times}; write one of {_listed(names, 'and')}")
+    line = stated[0]
+    if line.keyword == near:
+        line.refuse("is of a near object", f"write {_listed(names, 'or')}, as for stars")
+    return line
+
+
+def _listed(names: Sequence[str], last: str) -> str:
+    return f"{', '.join(names[:-1])} {last} {names[-1]}"
 
 
 class Frame:

@@ -18,11 +18,13 @@ from hilstar.optics.glass.lens_data import (
     FieldPoint,
     Frame,
     Glass,
+    LensFileReader,
     LensLine,
     LensPrescription,
     LensSurface,
     PupilKind,
     nth,
+    only_aperture,
 )
 
 AIR, MIRROR = Glass(), Glass("MIRROR")
@@ -180,7 +182,7 @@ def _lines(data: bytes) -> Iterator[LensLine]:
             yield LensLine(number, items[0].upper(), items[1:], line)
 
 
-class _Reader:
+class _Reader(LensFileReader):
     """Goes through a file's lines once, into a head and surfaces, and makes the lens of them."""
 
     def __init__(self, lines: list[LensLine]) -> None:
@@ -296,35 +298,14 @@ class _Reader:
         if aiming is not None and len(aiming.words) > 1 and aiming.value(1):
             self.notes.append(f"line {aiming.number}: {AIMING_NOTE}")
 
-    def lens(self) -> LensPrescription:
-        """The whole. Raises InputError."""
+    def _check_ends(self) -> None:
         start = self.surfaces[0]
         far = start.values.get("DISZ")
         if far is None or far.length() != float("inf"):
             raise InputError(f"{start.label}: {NEAR_OBJECT}")
-        kind, pupil = self._pupil()
-        waves, primary = self._wavelengths()
-        lens = LensPrescription(
-            surfaces=tuple(self._placed()),
-            pupil_kind=kind,
-            pupil=pupil,
-            field_kind=self._field_kind(),
-            fields=tuple(self._fields()),
-            wavelengths_um=waves,
-            primary=primary,
-            notes=tuple(self.notes),
-        )
-        return lens.check()
 
     def _pupil(self) -> tuple[PupilKind, float]:
-        stated = [self.head[key] for key in ("ENPD", "FNUM", "FLOA", "OBNA") if key in self.head]
-        if len(stated) != 1:
-            names = ", ".join(line.keyword for line in stated) or "none"
-            times = f"{len(stated)} times ({names})"
-            raise InputError(f"its aperture is stated {times}; write one of ENPD, FNUM and FLOA")
-        line = stated[0]
-        if line.keyword == "OBNA":
-            line.refuse("is of a near object", "write ENPD, FNUM or FLOA, as for stars")
+        line = only_aperture(self.head, ("ENPD", "FNUM", "FLOA"), "OBNA")
         if line.keyword == "FNUM":
             return "f_number", line.value()
         if line.keyword == "ENPD":

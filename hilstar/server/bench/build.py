@@ -122,20 +122,18 @@ class Display(NamedTuple):
     context: Context | None
     drive: FloatArray | float
     turning: float
+    darkest: float
 
 
 def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
     """The scene of each way to draw a bench's stars, from the cheapest on."""
-    calibration, camera, context, drive, turning = display
-    render = file.config.render
-    uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
-    darkest = 1.0 if uniformity is None else float(uniformity.min())
+    camera, drive, render = display.camera, display.drive, file.config.render
     for psf, choice in display_psfs(file.config, file.folder, camera):
         white_e_per_s = white_of(render, stars, psf, drive)
         light = Light(
-            response=calibration.response,
+            response=display.calibration.response,
             # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
-            white_e_per_s=white_e_per_s * darkest,
+            white_e_per_s=white_e_per_s * display.darkest,
             rates_e_per_s=stars.electrons_per_s,
             sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
             refresh_hz=file.config.monitor.refresh_hz,
@@ -144,8 +142,8 @@ def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
             psf=psf,
             psf_choice=choice,
             exposure_frames=file.config.exposure_frames,
-            cost=partial(level_cost, context=context),
-            turning=turning,
+            cost=partial(level_cost, context=display.context),
+            turning=display.turning,
         )
         yield Scene(psf, choice, white_e_per_s, light)
 
@@ -189,11 +187,18 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
     colours = bench_colours(file.config, file.folder, stars.catalog)
     stars = stars if colours is None else colours.on(stars)
     drive = 1.0 if stars.primaries is None or colours is None else colours.drive(stars.primaries)
-    display = Display(calibration, camera, context, drive, turning_of(file.config, on_screen))
-    scenes = _scenes(file, stars, display)
-    (psf, drawn, white_e_per_s, light), planned = _planned(render, scenes)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
+    display = Display(
+        calibration=calibration,
+        camera=camera,
+        context=context,
+        drive=drive,
+        turning=turning_of(file.config, on_screen),
+        darkest=darkest,
+    )
+    scenes = _scenes(file, stars, display)
+    (psf, drawn, white_e_per_s, light), planned = _planned(render, scenes)
     panels = () if colours is None else primary_panels(file, colours, white_e_per_s, uniformity)
 
     def bench_by(effort: Effort) -> Bench:

@@ -300,6 +300,7 @@ class KnownClockFilter:
         self._off_since_ns: int | None = None
         self._shared_since_ns: int | None = None
         self._off = 0
+        self._least_late_ns = 0  # of the packets that are off
         self._told = False
         self._quickest: tuple[int, int] | None = None  # since when, and by how much the quickest packet since then was late
 
@@ -313,12 +314,15 @@ class KnownClockFilter:
             self._look_behind(late_ns, host_ns)
             return [arrival]
         self._shared_since_ns = None
-        self._off_since_ns = host_ns if self._off_since_ns is None else self._off_since_ns
+        # A link and a busy machine make packets late, and never early: the least late one is the clock's.
+        if self._off_since_ns is None:
+            self._off_since_ns, self._least_late_ns = host_ns, late_ns
+        self._least_late_ns = min(self._least_late_ns, late_ns)
         self._off += 1
         for_ns = AHEAD_FOR_NS if late_ns < 0 else PERSISTENT_NS
         if self._off >= MIN_OFF and host_ns - self._off_since_ns >= for_ns and not self._told:
             self._told = True
-            self._notices.begin(CLOCK, self._line(t_ns, late_ns), self._off_since_ns)
+            self._notices.begin(CLOCK, self._line(self._least_late_ns), self._off_since_ns)
         if late_ns >= -MAX_OFF_NS:
             return [arrival]
         detail = f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock"
@@ -351,7 +355,7 @@ class KnownClockFilter:
             " t_ns: the link is as slow, or the sender's clock as far behind; then the sky is drawn as far ahead",
         )
 
-    def _line(self, t_ns: int, late_ns: int) -> str:
+    def _line(self, late_ns: int) -> str:
         mode = self._clock.mode
         where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
         looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"

@@ -549,6 +549,20 @@ def test_another_clock_is_named_by_its_difference_from_unix_time(ahead_s, name, 
     assert (", as " not in line) if name is None else (name in line)
 
 
+def test_how_far_a_clock_is_ahead_is_not_what_a_late_packet_says(caplog):
+    """The packets about the moment of the notice are 60 ms late, as on a busy machine."""
+
+    def make(t0: int) -> list[Arrival]:
+        packets = Sender(offset_ns=UNIX_NOW_NS + NS_PER_S // 10).packets(t0, seconds(0, 1))
+        late_ns = 60 * NS_PER_S // 1000
+        return packets[:20] + [replace(each, host_ns=each.host_ns + late_ns) for each in packets[20:]]
+
+    run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000))
+    assert run.events == {"clock-not-shared": 1}
+    (line,) = [line for line in caplog.messages if 'clock = "unix"' in line]
+    assert "0.100 s ahead of CLOCK_REALTIME" in line
+
+
 @pytest.mark.parametrize("ahead_s", [0.1, 0.999])
 def test_a_clock_ahead_is_a_wrong_sky_until_it_is_right_again(ahead_s):
     def make(t0: int) -> list[Arrival]:

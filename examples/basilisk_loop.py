@@ -1,10 +1,12 @@
-"""Basilisk's attitude controller before hilstar's display and tracker: a slew that closes the loop, in real time.
+"""Basilisk's attitude controller before hilstar's display and tracker: a slew that closes the loop,
+in real time.
 
 python basilisk_loop.py [SLEW_DEG [SECONDS]]
 
-Basilisk's dynamics turn a spacecraft, whose true attitude goes to `hilstar serve`. `hilstar tracker` looks at the frames, and
-its answers (JSON over UDP) are all that Basilisk's controller (mrpFeedback) knows. The last line is a JSON object: the pointing
-error at the end, arcsec across the boresight and about it, and how many answers there were.
+Basilisk's dynamics turn a spacecraft, whose true attitude goes to `hilstar serve`. `hilstar
+tracker` looks at the frames, and its answers (JSON over UDP) are all that Basilisk's controller
+(mrpFeedback) knows. The last line is a JSON object: the pointing error at the end, arcsec across
+the boresight and about it, and how many answers there were.
 
 The bench is bench.toml beside this file. The camera's axes are the body's.
 """
@@ -51,7 +53,9 @@ def free_port(kind: int) -> int:
 
 
 def sigma_bn(q_icrs_to_cam: Array) -> list[float]:
-    """Basilisk's MRPs of an attitude: its [BN] turns the frame, so they are those of the conjugate."""
+    """Basilisk's MRPs of an attitude: its [BN] turns the frame, so they are those of the
+    conjugate.
+    """
     w, *vector = q_icrs_to_cam if q_icrs_to_cam[0] >= 0 else -q_icrs_to_cam
     return [-float(part / (1 + w)) for part in vector]
 
@@ -63,7 +67,9 @@ def attitude(sigma: list[float]) -> Array:
 
 
 class Plant:
-    """Basilisk's spacecraft, guidance and controller; the navigation message is what the tracker says."""
+    """Basilisk's spacecraft, guidance and controller; the navigation message is what the tracker
+    says.
+    """
 
     def __init__(self, q_start: Array, q_target: Array) -> None:
         self._sim = sim = SimulationBaseClass.SimBaseClass()
@@ -156,7 +162,8 @@ def run(slew_deg: float = 2.0, seconds: float = 25.0) -> dict[str, Any]:
                 sender.send(q, rate_rad_s)
                 said = newest(answers)
                 if said is not None:
-                    age_s = (time.monotonic_ns() - said["t_ns"]) / 1e9  # the tracker's clock is this machine's
+                    # the tracker's clock is this machine's
+                    age_s = (time.monotonic_ns() - said["t_ns"]) / 1e9
                     turn = np.array(said.get("rate", [0.0, 0.0, 0.0]))
                     plant.navigate(propagate(np.array(said["q"]), turn, age_s), turn)
                     ages_s.append(age_s)

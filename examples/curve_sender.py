@@ -1,6 +1,8 @@
-"""Send attitudes to hilstar over an encrypted ZeroMQ connection: `python curve_sender.py tcp://HOST:5560 KEYS [SECONDS]`.
+"""Send attitudes to hilstar over an encrypted ZeroMQ connection: `python curve_sender.py
+tcp://HOST:5560 KEYS [SECONDS]`.
 
-KEYS is a directory with client.key_secret and server.key of `hilstar keys`. Needs pyzmq, and nothing of hilstar.
+KEYS is a directory with client.key_secret and server.key of `hilstar keys`. Needs pyzmq, and
+nothing of hilstar.
 Exit codes: 0 done; 1 hilstar did not let this sender in, or the command was wrong.
 """
 
@@ -26,13 +28,15 @@ def attitude(t_ns: int, since_start_s: float, sequence: int) -> bytes:
     """The 64-byte packet of a steady turn about the boresight, from RA 0, Dec 0, roll 0."""
     half_rad = -0.5 * RATE_CAM_RAD_S * since_start_s  # q turns ICRS into camera components: minus
     w, z = math.cos(half_rad), math.sin(half_rad)
-    q = (0.5 * (w - z), 0.5 * (w + z), 0.5 * (z - w), 0.5 * (w + z))  # the turn times (0.5, 0.5, -0.5, 0.5)
+    # the turn times (0.5, 0.5, -0.5, 0.5)
+    q = (0.5 * (w - z), 0.5 * (w + z), 0.5 * (z - w), 0.5 * (w + z))
     body = struct.pack("<BBHIq4d3f", 1, 1, FLAG_RATE_VALID, sequence, t_ns, *q, 0.0, 0.0, RATE_CAM_RAD_S)
     return body + struct.pack("<I", zlib.crc32(body))
 
 
 def open_socket(context: zmq.Context[zmq.Socket[bytes]], endpoint: str, keys: Path) -> zmq.Socket[bytes] | None:
-    """A PUB socket with a subscriber; None where hilstar is not there, or did not let this sender in.
+    """A PUB socket with a subscriber; None where hilstar is not there, or did not let this sender
+    in.
 
     XPUB is a PUB that reads the subscriptions: what is sent before the first one is lost.
     """

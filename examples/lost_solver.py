@@ -1,6 +1,7 @@
 """LOST (UWCubeSat) as a campaign's solver: from a picture to w x y z of q_icrs_to_cam.
 
-python lost_solver.py LOST_FOLDER IMAGE.png FOV_DEG, where LOST_FOLDER has the program and a database, made once with
+python lost_solver.py LOST_FOLDER IMAGE.png FOV_DEG, where LOST_FOLDER has the program and a
+database, made once with
 ./lost database --max-stars 5000 --kvector --kvector-min-distance 0.2 --kvector-max-distance 15 \\
     --kvector-distance-bins 10000 --output stars.dat
 """

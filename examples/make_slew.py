@@ -1,23 +1,28 @@
 """Make slew.csv, an attitude log of a slew from rest to rest: `python make_slew.py > slew.csv`.
 
-The camera starts on Orion's belt and turns by 20 degrees about an axis that is fixed in it: 1 s of rest, 20 s of a
-cycloidal profile, which starts and ends without a step in acceleration and is fastest, 2 deg/s, in the middle, and 1 s of rest.
+The camera starts on Orion's belt and turns by 20 degrees about an axis that is fixed in it: 1 s of
+rest, 20 s of a
+cycloidal profile, which starts and ends without a step in acceleration and is fastest, 2 deg/s, in
+the middle, and 1 s of rest.
 """
 
 from __future__ import annotations
 
 import math
 
-START_Q_ICRS_TO_CAM = (0.6987226, 0.7135120, -0.0370377, 0.0362700)  # RA 84.057, Dec -1.200, roll 0 deg
+# RA 84.057, Dec -1.200, roll 0 deg
+START_Q_ICRS_TO_CAM = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
 AXIS_CAM = (0.36, 0.80, 0.48)  # a unit vector
 ANGLE_DEG, SLEW_S, REST_S = 20.0, 20.0, 1.0
 SAMPLES_HZ = 10
 
 
 def turned(angle_rad: float) -> tuple[float, float, float, float]:
-    """The start attitude after a turn of the camera by `angle_rad` about AXIS_CAM: a unit quaternion (w, x, y, z).
+    """The start attitude after a turn of the camera by `angle_rad` about AXIS_CAM: a unit
+    quaternion (w, x, y, z).
 
-    A Hamilton product, turn by start. The turn has a minus: q turns ICRS components into camera components, and a star
+    A Hamilton product, turn by start. The turn has a minus: q turns ICRS components into camera
+    components, and a star
     seems to turn against the camera.
     """
     w, (x, y, z) = math.cos(-0.5 * angle_rad), (math.sin(-0.5 * angle_rad) * component for component in AXIS_CAM)

@@ -1,7 +1,8 @@
-"""A small solver, lost in space: from an image alone to the attitude, by pairs of stars that other stars confirm.
+"""A small solver, lost in space: from an image alone to the attitude, by pairs of stars that other
+stars confirm.
 
-As a command: python star_solver.py IMAGE.fits FOCAL_LENGTH_PX prints w x y z of q_icrs_to_cam, or nothing where it finds none.
-As a function: --solver python:star_solver:solve.
+As a command: python star_solver.py IMAGE.fits FOCAL_LENGTH_PX prints w x y z of q_icrs_to_cam, or
+nothing where it finds none. As a function: --solver python:star_solver:solve.
 """
 
 from __future__ import annotations
@@ -33,9 +34,11 @@ EPOCH_JYEAR = 2026.0
 
 @functools.lru_cache(maxsize=2)
 def sky(field_rad: float, epoch_jyear: float) -> tuple[Array, KDTree, npt.NDArray[np.intp], Array]:
-    """Directions (n, 3) of the stars, a tree of them, and pairs (m, 2) nearer than the field, sorted by chords (m,).
+    """Directions (n, 3) of the stars, a tree of them, and pairs (m, 2) nearer than the field,
+    sorted by chords (m,).
 
-    Pairs are of the brightest stars, so many that PAIRED of them are in a field; a wide one would have millions otherwise.
+    Pairs are of the brightest stars, so many that PAIRED of them are in a field; a wide one would
+    have millions otherwise.
     """
     catalog = load_catalog().brighter_than(FAINTEST_V_MAG)
     vectors = unit_vectors_icrs(catalog, epoch_jyear)[np.argsort(catalog.v_mag, kind="stable")]
@@ -48,7 +51,9 @@ def sky(field_rad: float, epoch_jyear: float) -> tuple[Array, KDTree, npt.NDArra
 
 
 def solve(image: npt.NDArray[Any], tracker: dict[str, Any]) -> list[float] | None:
-    """q_icrs_to_cam of an image (height, width), or None. `tracker` has `focal_length_px`, and may have `epoch_jyear`."""
+    """q_icrs_to_cam of an image (height, width), or None. `tracker` has `focal_length_px`, and
+    may have `epoch_jyear`.
+    """
     focal_px = float(tracker["focal_length_px"])
     height, width = image.shape
     found = find_stars(image)
@@ -69,7 +74,9 @@ def solve(image: npt.NDArray[Any], tracker: dict[str, Any]) -> list[float] | Non
 
 
 def confirmed(seen: Array, pair: tuple[int, int], stars: Array, tree: KDTree, tolerance: float) -> Array | None:
-    """The rotation (3, 3) from ICRS to cam, of those that put two seen stars on pairs (m, 2, 3), that most stars confirm."""
+    """The rotation (3, 3) from ICRS to cam, of those that put two seen stars on pairs (m, 2, 3),
+    that most stars confirm.
+    """
     if not len(stars):
         return None
     cam, icrs = triad(seen[pair[0]][None], seen[pair[1]][None]), triad(stars[:, 0], stars[:, 1])
@@ -83,7 +90,9 @@ def confirmed(seen: Array, pair: tuple[int, int], stars: Array, tree: KDTree, to
 
 
 def triad(a: Array, b: Array) -> Array:
-    """Right-handed axes (m, 3, 3), as columns, of directions (m, 3) and (m, 3): the middle, the normal, and the third."""
+    """Right-handed axes (m, 3, 3), as columns, of directions (m, 3) and (m, 3): the middle, the
+    normal, and the third.
+    """
     middle, normal = a + b, np.cross(a, b)
     middle, normal = (part / np.linalg.norm(part, axis=1, keepdims=True) for part in (middle, normal))
     return np.stack([middle, normal, np.cross(middle, normal)], axis=2)

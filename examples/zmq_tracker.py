@@ -1,6 +1,7 @@
 """A star tracker's answers over ZeroMQ: python zmq_tracker.py tcp://127.0.0.1:5562 RATE_HZ COUNT
 
-Each message is a packet of kind 5. It needs only pyzmq. The bench file of the other end has [answers] with source = "zmq".
+Each message is a packet of kind 5. It needs only pyzmq. The bench file of the other end has
+[answers] with source = "zmq".
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ def answer(
     flags: int = VALID | TRACKING,
     stars: int = 0,
 ) -> bytes:
-    """The 68 bytes; `t_ns` is the tracker's clock at the middle of the exposure, q is (w, x, y, z), the rate (x, y, z)."""
+    """The 68 bytes; `t_ns` is the tracker's clock at the middle of the exposure, q is (w, x, y,
+    z), the rate (x, y, z).
+    """
     flags |= 0 if rate_cam_rad_s is None else RATE_VALID
     body = struct.pack("<BBHIq4d3fI", 1, 5, flags, sequence, t_ns, *q_icrs_to_cam, *(rate_cam_rad_s or (0, 0, 0)), stars)
     return body + struct.pack("<I", zlib.crc32(body))
@@ -34,6 +37,7 @@ if __name__ == "__main__":
     with zmq.Context() as context, context.socket(zmq.PUB) as sender:
         sender.bind(endpoint)
         for sequence in range(count):
-            sender.send(answer(sequence, time.monotonic_ns(), (0.5, 0.5, -0.5, 0.5), stars=12))  # RA 0, Dec 0, roll 0
+            # RA 0, Dec 0, roll 0
+            sender.send(answer(sequence, time.monotonic_ns(), (0.5, 0.5, -0.5, 0.5), stars=12))
             time.sleep(1 / rate_hz)
     print(f"sent {count}")

@@ -1,4 +1,5 @@
-"""Make what describes the wire from protocol.toml: the C header, the Python table, the test vectors, the tables of README.md.
+"""Make what describes the wire from protocol.toml: the C header, the Python table, the test
+vectors, the tables of README.md.
 
     python generate.py            write them
     python generate.py --check    write nothing; exit 1 and name the files that are stale
@@ -50,7 +51,9 @@ def python_table(wire: Wire) -> str:
 
 
 def readme(wire: Wire, text: str) -> str:
-    """README.md with its generated blocks renewed. Raises SystemExit where a block is missing or unknown."""
+    """README.md with its generated blocks renewed. Raises SystemExit where a block is missing or
+    unknown.
+    """
     blocks = {"kinds": _kinds(wire), "timing": _timing(wire), "cobs": _cobs_example(wire), "limits": _limits(wire)}
     blocks |= {p.name: _packet_section(p, wire) for p in wire.packets}
     found: list[str] = []

@@ -1,8 +1,10 @@
-"""The test vectors: packets and frames that every implementation must read and write alike, and some that it must refuse.
+"""The test vectors: packets and frames that every implementation must read and write alike, and
+some that it must refuse.
 
-Each is an object: `name`, `kind`, `fields` (what the sender chooses; numbers exact, "nan" for a NaN), `packet_hex` and
-`frame_hex`; or `name`, `packet_hex` (null: the frame contains none), `frame_hex` and `refused`, the reason. One refused for its
-time has `after`: the name of the vector that precedes it.
+Each is an object: `name`, `kind`, `fields` (what the sender chooses; numbers exact, "nan" for a
+NaN), `packet_hex` and `frame_hex`; or `name`, `packet_hex` (null: the frame contains none),
+`frame_hex` and `refused`, the reason. One refused for its time has `after`: the name of the vector
+that precedes it.
 """
 
 from __future__ import annotations

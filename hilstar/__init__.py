@@ -1,4 +1,6 @@
-"""hilstar: the stars that a star tracker would see, on a monitor, with the flux that it would collect."""
+"""hilstar: the stars that a star tracker would see, on a monitor, with the flux that it would
+collect.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,9 @@ __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineErro
 
 
 def __getattr__(name: str) -> Any:
-    """The public names, imported at their first use: `hilstar doctor` needs no renderer to start."""
+    """The public names, imported at their first use: `hilstar doctor` needs no renderer to
+    start.
+    """
     if name not in __all__:
         raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
     from hilstar.basics import errors

@@ -1,4 +1,6 @@
-"""The door to the commands: what they import takes a third of a second, and Ctrl-C may come in it."""
+"""The door to the commands: what they import takes a third of a second, and Ctrl-C may come in
+it.
+"""
 
 import gc
 import sys
@@ -6,7 +8,8 @@ from typing import NoReturn
 
 READER_WAITS_S = 0.1  # for a reader of stderr that sleeps
 WRONG_FILE = 2
-OBJECTS_BETWEEN_LOOKS = 20_000  # for garbage: nearly all that a start makes stays, and looking through it took 20 ms
+# for garbage: nearly all that a start makes stays, and looking through it took 20 ms
+OBJECTS_BETWEEN_LOOKS = 20_000
 
 
 def main() -> NoReturn:
@@ -41,9 +44,11 @@ def import_and_run() -> NoReturn:
 
 
 def damaged_module(error: BaseException) -> str | None:
-    """The path of the compiled module (.pyc) that Python could not read; None where the error is any other.
+    """The path of the compiled module (.pyc) that Python could not read; None where the error is
+    any other.
 
-    Python writes such a file on its own, cut short where the disk is full, and then fails at each start:
+    Python writes such a file on its own, cut short where the disk is full, and then fails at each
+    start:
     marshal raises EOFError, ValueError or TypeError.
     """
     trace = error.__traceback__

@@ -1,4 +1,6 @@
-"""For your own scripts: unit quaternions, Hamilton, scalar first, and what they do to directions."""
+"""For your own scripts: unit quaternions, Hamilton, scalar first, and what they do to
+directions.
+"""
 
 from hilstar.basics.rotation import (
     angle_between_rad,

@@ -1,6 +1,8 @@
-"""Charts of docs/ whose figures are times, redrawn from the CSV files beside this script: `python results/charts.py`.
+"""Charts of docs/ whose figures are times, redrawn from the CSV files beside this script: `python
+results/charts.py`.
 
-Measuring needs an idle machine, drawing does not. The other charts of docs/ are written by the commands that their pages name.
+Measuring needs an idle machine, drawing does not. The other charts of docs/ are written by the
+commands that their pages name.
 """
 
 from __future__ import annotations
@@ -52,7 +54,9 @@ def colour_rows() -> list[tuple[str | float, ...]]:
 
 
 def draw_scale(rows: list[dict[str, str]]) -> None:
-    """Six panels of scale.csv: what grows with stars, pixels, workers, packets a second and hours, and where it bends."""
+    """Six panels of scale.csv: what grows with stars, pixels, workers, packets a second and
+    hours, and where it bends.
+    """
 
     def points(axis: str, column: str) -> tuple[list[float], list[float]]:
         own = [row for row in rows if row["axis"] == axis]
@@ -60,7 +64,8 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
 
     case_s = points("workers", "time")[1][0] / 1e3
     cores = [1.0, 2.0, 10.0, 30.0, 100.0, 300.0, 1000.0]
-    # docs/campaign.md: a task takes the scheduler 3.3 ms and the command 1.8 ms, and a row the command 60 us
+    # docs/campaign.md: a task takes the scheduler 3.3 ms and the command 1.8 ms, and a row the
+    # command 60 us
     paper: dict[str, list[float]] = {"1 s": [], "20 ms a core": []}
     for count in cores:
         for words, seconds in (("1 s", 1.0), ("20 ms a core", max(1.0, 0.02 * count))):

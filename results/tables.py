@@ -1,12 +1,15 @@
-"""Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
+"""Tables of README and docs/ from the CSV files beside this script: `python results/tables.py`
+writes them between their marks.
 
-bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
-`hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
-which machine; bench_h100.csv on an NVIDIA H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200.
-chain.csv and chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv,
+timing.csv and those of colour by `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv
+by `hilstar study quantisation -o`. machine.txt says on which machine; bench_h100.csv on an NVIDIA
+H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. chain.csv and
+chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
-confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
+confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
+changes it.
 """
 
 from __future__ import annotations
@@ -54,7 +57,9 @@ def table(head: list[str], body: list[list[str]]) -> str:
 
 
 def bench_table(name: str = "bench.csv", counts: tuple[int, ...] = COUNTS, others: tuple[str, ...] = OTHERS) -> str:
-    """Medians of the whole frame by image size, and of the linear image beside the others at 1080p."""
+    """Medians of the whole frame by image size, and of the linear image beside the others at
+    1080p.
+    """
     rows = rows_of(name)
     at = {(r["width"], r["height"], int(r["stars"]), r["method"], r["kind"]): float(r["median_ms"]) for r in rows}
     sizes = list(dict.fromkeys((r["width"], r["height"]) for r in rows))
@@ -153,7 +158,9 @@ def limits_table() -> str:
 
 
 def economy_table() -> str:
-    """Five scenes by bits, with full effort and with what two tolerances need: processor time of a whole frame."""
+    """Five scenes by bits, with full effort and with what two tolerances need: processor time of
+    a whole frame.
+    """
     rows = rows_of("economy.csv")
     body = []
     for full, auto, loose in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
@@ -345,7 +352,9 @@ CERTIFIED = (
 
 
 def certify_table() -> str:
-    """How often certificates' intervals held the truth of planted benches, by kind and figure: the mean over regions."""
+    """How often certificates' intervals held the truth of planted benches, by kind and figure:
+    the mean over regions.
+    """
     rows = [row for row in rows_of("certify.csv") if row["held_percent"]]
     head, body = ["kind", "benches", *(name for name, _ in CERTIFIED)], []
     for kind in dict.fromkeys(row["kind"] for row in rows):

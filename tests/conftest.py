@@ -10,14 +10,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-# A worker fills its core: threads of BLAS that wait for another make small products slow. Before NumPy is loaded.
+# A worker fills its core: threads of BLAS that wait for another make small products slow. Before
+# NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Hundreds of commands are started: each that may not keep its compiled modules compiles all of hilstar, over a second of CPU.
+# Hundreds of commands are started: each that may not keep its compiled modules compiles all of
+# hilstar, over a second of CPU.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-gc.disable()  # until what is collected is there: a fifth of collecting 6000 tests was the collector's rounds
+# until what is collected is there: a fifth of collecting 6000 tests was the collector's rounds
+gc.disable()
 
 import numpy as np
 import pytest
@@ -26,7 +29,8 @@ import hilstar
 from tests.support import leftovers
 from tests.support.benches import SMALL_BENCH
 
-# A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's Ctrl-C would reach nobody.
+# A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's
+# Ctrl-C would reach nobody.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -34,17 +38,22 @@ leftovers.adopt_orphans()
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """One more worker than cores: half of the long tests wait for packets, frames and signals to come by the clock."""
+    """One more worker than cores: half of the long tests wait for packets, frames and signals to
+    come by the clock.
+    """
     return (os.cpu_count() or 1) + 1
 
 
-# Functions whose tests together took over 0.3 s of CPU when all were measured (`--durations=0`); one a line.
+# Functions whose tests together took over 0.3 s of CPU when all were measured (`--durations=0`);
+# one a line.
 SLOW = frozenset((Path(__file__).parent / "slow.txt").read_text().split())
 MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e", "examples": "e2e"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what lies in a folder, and what is slow; a test elsewhere that starts processes, or runs a study, marks itself."""
+    """Mark what lies in a folder, and what is slow; a test elsewhere that starts processes, or
+    runs a study, marks itself.
+    """
     here = Path(__file__).parent
     for item in items:
         folder = item.path.relative_to(here).parts[0]
@@ -55,7 +64,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """The garbage collector passes over what collecting 6000 tests has made: each of its rounds would take 0.15 s."""
+    """The garbage collector passes over what collecting 6000 tests has made: each of its rounds
+    would take 0.15 s.
+    """
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -77,7 +88,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 @pytest.fixture(scope="session", autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    """Whatever a test did, none of hilstar's commands runs on when the tests are over; the last one fails where one did."""
+    """Whatever a test did, none of hilstar's commands runs on when the tests are over; the last
+    one fails where one did.
+    """
     yield
     left = leftovers.end_hilstar_leftovers()
     assert not left, f"left behind by some test, and killed now: {left}"
@@ -91,7 +104,9 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def without_charts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Charts are neither laid out nor drawn, which takes a third of a calibration's time: for tests that look at none."""
+    """Charts are neither laid out nor drawn, which takes a third of a calibration's time: for
+    tests that look at none.
+    """
     from hilstar.basics import charts
 
     monkeypatch.setattr(charts, "finish", lambda figure: None)

@@ -1,9 +1,13 @@
-"""Try benches by chance from first light to an error budget: `python tools/any_bench.py --benches N --seed S -o DIR`.
+"""Try benches by chance from first light to an error budget: `python tools/any_bench.py --benches N
+--seed S -o DIR`.
 
-Each bench is drawn over what labs have, with a truth of which its bench file knows nothing (tests/support/any_bench).
-It goes through `first-light --virtual`, `verify`, `certify --quick`, 20 seconds of `serve --headless` with a stream,
-and `assess` of the virtual tracker's answers. DIR has a folder of each bench, any_bench.csv with a row of each, and the
-chart. The smallest benches come first. The same command goes on where it was stopped; a larger N adds benches.
+Each bench is drawn over what labs have, with a truth of which its bench file knows nothing
+(tests/support/any_bench).
+It goes through `first-light --virtual`, `verify`, `certify --quick`, 20 seconds of `serve
+--headless` with a stream,
+and `assess` of the virtual tracker's answers. DIR has a folder of each bench, any_bench.csv with a
+row of each, and the chart. The smallest benches come first. The same command goes on where it was
+stopped; a larger N adds benches.
 """
 
 from __future__ import annotations

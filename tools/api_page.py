@@ -1,4 +1,6 @@
-"""The reference at the end of python-api.md, from signatures and docstrings; the text before it is written by hand."""
+"""The reference at the end of python-api.md, from signatures and docstrings; the text before it
+is written by hand.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,9 @@ def _entry(level: str, name: str, found: Any, code: str) -> Iterator[str]:
 
 
 def signature(name: str, found: Any) -> str:
-    """How it is called, in one line or a parameter a line; of a property its type; "" where nobody calls it."""
+    """How it is called, in one line or a parameter a line; of a property its type; "" where
+    nobody calls it.
+    """
     short = name.rpartition(".")[2]
     if isinstance(found, property):
         returned = inspect.get_annotations(found.fget)["return"] if found.fget else ""

@@ -1,6 +1,8 @@
-"""The table of docs/optics.md: what each centroider loses by a wrong PSF. `python -m tools.centroider_table` in the checkout.
+"""The table of docs/optics.md: what each centroider loses by a wrong PSF. `python -m
+tools.centroider_table` in the checkout.
 
-The glass is that of tests/support/glass.py: coma, field curvature, axial and lateral colour in closed form. No noise.
+The glass is that of tests/support/glass.py: coma, field curvature, axial and lateral colour in
+closed form. No noise.
 """
 
 from __future__ import annotations

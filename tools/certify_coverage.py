@@ -1,12 +1,13 @@
 """Count how often certificates of planted benches hold the truth, and how long their intervals are.
 
-`python tools/certify_coverage.py BENCHES [KIND] [-o FILE.csv] [--seed S] [--levels N]`: all kinds, or one (`images` draws each
-image: 15 s a bench).
+`python tools/certify_coverage.py BENCHES [KIND] [-o FILE.csv] [--seed S] [--levels N]`: all kinds,
+or one (`images` draws each image: 15 s a bench).
 
-Each bench is drawn, and read, by code apart from certify's (tests/support/planted_readings.py), and certified as the
-command does by its readings. A row is a figure of a kind: how many of its intervals held the truth, three binomial sigmas
-about that for as many benches, the median ratio of the stated uncertainty to the true error, and in how many benches it was
-not assessed.
+Each bench is drawn, and read, by code apart from certify's (tests/support/planted_readings.py), and
+certified as the
+command does by its readings. A row is a figure of a kind: how many of its intervals held the truth,
+three binomial sigmas about that for as many benches, the median ratio of the stated uncertainty to
+the true error, and in how many benches it was not assessed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""commands.md from the functions that the commands are: their signatures, typer's options and their docstrings."""
+"""commands.md from the functions that the commands are: their signatures, typer's options and
+their docstrings.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def page() -> str:
 
 
 def commands_of(group: Typer, prefix: str = "", panel: str = "") -> Iterator[tuple[str, str, Callable[..., Any]]]:
-    """Each command's panel, name ("calibrate plan") and function; a group's commands are in its own panel."""
+    """Each command's panel, name ("calibrate plan") and function; a group's commands are in its
+    own panel.
+    """
     for info in group.registered_commands:
         if info.callback is None:
             raise TypeError("a command is a function")
@@ -123,14 +127,18 @@ def parameters_of(command: Callable[..., Any]) -> Iterator[Parameter]:
 
 
 def flags_of(name: str, info: OptionInfo) -> tuple[str, ...]:
-    """`-o`, `--output`: what is written on the command line. Within Annotated typer has the first of them as `default`."""
+    """`-o`, `--output`: what is written on the command line. Within Annotated typer has the
+    first of them as `default`.
+    """
     words = (info.default, *(info.param_decls or ()))
     written = tuple(word for word in words if isinstance(word, str) and word.startswith("-"))
     return written or (f"--{name.replace('_', '-')}",)
 
 
 def type_word(kind: Any, name: str, info: ParameterInfo) -> str:
-    """What stands for the value where the option names nothing: its choices, or a word for its type."""
+    """What stands for the value where the option names nothing: its choices, or a word for its
+    type.
+    """
     if get_origin(kind) in (Union, UnionType):
         kind = next(inner for inner in get_args(kind) if inner is not type(None))
     if get_origin(kind) is Literal:

@@ -1,6 +1,8 @@
-"""What mkdocs does besides: the changelog and the examples become pages, and links out of docs/ name the file.
+"""What mkdocs does besides: the changelog and the examples become pages, and links out of docs/
+name the file.
 
-The built pages stand alone; on a checkout such a link is followed, and tests/docs checks that it leads somewhere.
+The built pages stand alone; on a checkout such a link is followed, and tests/docs checks that it
+leads somewhere.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[1]
-ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}  # pages of the site, and the files that they are
-LINK = re.compile(r"(?<!!)\[((?:[^\]\[]|\[[^\]\[]*\])+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")  # its words may have brackets
+# pages of the site, and the files that they are
+ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}
+# its words may have brackets
+LINK = re.compile(r"(?<!!)\[((?:[^\]\[]|\[[^\]\[]*\])+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -28,7 +32,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
-    """A page's text with each link as the site has it: to a page, or as "words (`PATH`)" to any other file."""
+    """A page's text with each link as the site has it: to a page, or as "words (`PATH`)" to any
+    other file.
+    """
     source = "docs/x.md" if page is None else ADDED.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
     def linked(link: re.Match[str]) -> str:

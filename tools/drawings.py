@@ -1,4 +1,5 @@
-"""The drawings of the documentation as SVG, in the colours of the charts, light or dark as the reader's page is.
+"""The drawings of the documentation as SVG, in the colours of the charts, light or dark as the
+reader's page is.
 
 `python tools/make_pages.py` writes them; tests/docs fails where one is not what this makes.
 """
@@ -121,9 +122,11 @@ def bench() -> str:
     d.parts.append('<rect x="596" y="112" width="14" height="48" class="box"/>')
     d.text(658, 134, "tracker", "middle head")
     d.text(658, 134 + LINE_PX, "at infinity", "middle note")
-    for y0, y1 in ((116, 78), (116, 136), (116, 194)):  # one star: a pixel of the monitor lights the whole lens
+    # one star: a pixel of the monitor lights the whole lens
+    for y0, y1 in ((116, 78), (116, 136), (116, 194)):
         d.line((74, y0), (404, y1), kind="ray")
-    slope = 20 / 330  # parallel behind the lens, in the direction from the pixel to the lens's middle
+    # parallel behind the lens, in the direction from the pixel to the lens's middle
+    slope = 20 / 330
     for y1 in (98, 118, 136):
         d.arrow((404, y1), (594, y1 + slope * 190), kind="ray", tip="raytip")
     d.parts.append('<circle cx="84" cy="196" r="5" class="light"/>')

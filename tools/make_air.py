@@ -1,14 +1,18 @@
-"""Make the tables of the air over observatories, `extinction.csv` and `night_sky.csv`, from Astropy's and desihub's tables.
+"""Make the tables of the air over observatories, `extinction.csv` and `night_sky.csv`, from
+Astropy's and desihub's tables.
 
     git clone https://github.com/astropy/specreduce-data
-    python tools/make_air.py specreduce-data/specreduce_data/reference_data/extinction uves_paranal_sky_1nm.csv
+    python tools/make_air.py specreduce-data/specreduce_data/reference_data/extinction
+    uves_paranal_sky_1nm.csv
 
-Extinction: of Astropy's specreduce-data (BSD-3-Clause, commit dcba1c6), whose README names the sources: CTIO Stone & Baldwin
-1983, KPNO of IRAF, La Palma ING technical note 31, Mauna Kea Buton et al. 2013, Lick its observatory's means, Paranal Patat et
-al. 2011 (scattering alone). Every 10 nm from 300 to 1100 nm; beyond a table its end holds.
+Extinction: of Astropy's specreduce-data (BSD-3-Clause, commit dcba1c6), whose README names the
+sources: CTIO Stone & Baldwin 1983, KPNO of IRAF, La Palma ING technical note 31, Mauna Kea Buton et
+al. 2013, Lick its observatory's means, Paranal Patat et al. 2011 (scattering alone). Every 10 nm
+from 300 to 1100 nm; beyond a table its end holds.
 
-Night sky: Hanuschik 2003 (A&A 407, 1157), the UVES atlas as desihub/specter (BSD-3-Clause, commit b8490d3) has stitched it, in
-means of 1 nm, in W per wavelength: the shape alone, over its largest value.
+Night sky: Hanuschik 2003 (A&A 407, 1157), the UVES atlas as desihub/specter (BSD-3-Clause, commit
+b8490d3) has stitched it, in means of 1 nm, in W per wavelength: the shape alone, over its largest
+value.
 """
 
 from __future__ import annotations

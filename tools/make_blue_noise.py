@@ -1,6 +1,8 @@
-"""Make blue-noise.npy, the threshold mask of `dither` and `temporal`: `python tools/make_blue_noise.py`.
+"""Make blue-noise.npy, the threshold mask of `dither` and `temporal`: `python
+tools/make_blue_noise.py`.
 
-Void and cluster (R. Ulichney, Proc. SPIE 1913, 1993). All energies are whole numbers, so every machine makes the same file.
+Void and cluster (R. Ulichney, Proc. SPIE 1913, 1993). All energies are whole numbers, so every
+machine makes the same file.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ class Pattern:
 
 
 def void_and_cluster(rng: np.random.Generator) -> Ranks:
-    """Ranks 0 to SIDE^2 - 1, each once, shape (SIDE, SIDE): those under any rank are spread evenly, with no low frequencies."""
+    """Ranks 0 to SIDE^2 - 1, each once, shape (SIDE, SIDE): those under any rank are spread
+    evenly, with no low frequencies.
+    """
     first = rng.choice(SIDE**2, round(FIRST_SHARE * SIDE**2), replace=False)
     pattern = Pattern()
     for place in first:
@@ -66,8 +70,8 @@ def void_and_cluster(rng: np.random.Generator) -> Ranks:
         ranks[cluster] = rank
     for place in start:
         pattern.flip(int(place))
-    # The largest void among the few ones and the tightest cluster among the many zeros are one place: energies add up to a
-    # constant. So one rule fills both halves.
+    # The largest void among the few ones and the tightest cluster among the many zeros are one
+    # place: energies add up to a constant. So one rule fills both halves.
     for rank in range(len(start), SIDE**2):
         void = pattern.largest_void()
         pattern.flip(void)

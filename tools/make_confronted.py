@@ -1,4 +1,6 @@
-"""Make the pictures of docs/confronted.md from the raw frames in tests/data/confront, by `hilstar confront`'s own page."""
+"""Make the pictures of docs/confronted.md from the raw frames in tests/data/confront, by
+`hilstar confront`'s own page.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ CROP_PX = (330, 250, 650, 490)
 
 
 def main() -> None:
-    """Confront the frames, and write the charts and one frame's part beside its prediction and residual."""
+    """Confront the frames, and write the charts and one frame's part beside its prediction and
+    residual.
+    """
     import io
 
     from PIL import Image

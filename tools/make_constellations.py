@@ -1,7 +1,9 @@
-"""Make `hilstar/sky/data/constellations.csv`: the boundaries of the constellations, from the data files of Astropy.
+"""Make `hilstar/sky/data/constellations.csv`: the boundaries of the constellations, from the data
+files of Astropy.
 
-Roman 1987 (PASP 99, 695; CDS VI/42) divides the sky of equinox B1875 into zones, in which Delporte's boundaries run along
-circles of right ascension and declination: the first row that holds a place names its constellation.
+Roman 1987 (PASP 99, 695; CDS VI/42) divides the sky of equinox B1875 into zones, in which
+Delporte's boundaries run along circles of right ascension and declination: the first row that holds
+a place names its constellation.
 """
 
 import csv

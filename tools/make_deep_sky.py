@@ -1,14 +1,17 @@
-"""Make a map of bright galaxies, globular clusters and nebulae for `[sky.diffuse] map`, from your copy of OpenNGC.
+"""Make a map of bright galaxies, globular clusters and nebulae for `[sky.diffuse] map`, from your
+copy of OpenNGC.
 
     curl -LO https://github.com/mattiaverga/OpenNGC/raw/master/database_files/NGC.csv      (and addendum.csv)
     python tools/make_deep_sky.py NGC.csv addendum.csv -o deep_sky.fits.gz [--to 9.0]
 
-OpenNGC is under CC-BY-SA 4.0, and so is the map: `examples/deep_sky.fits.gz`, of OpenNGC's commit 17397545, which is no part of
-the package. Each object is an image of its own: an ellipse with the
-catalogue's axes, position angle and total V (B - 0.7 where that is missing). Galaxies are exponential discs, ellipticals
-Sersic profiles of index 4, cut at the catalogue's axes (B = 25 mag/arcsec2). The scale length of a disc is 1 / 3.2 of that
-radius (Freeman 1970), an elliptical's effective radius 1 / 3. Globular clusters are discs as well, nebulae even ellipses.
-Open clusters are left out, as their stars are in the star catalogue; so are objects without a size or a magnitude.
+OpenNGC is under CC-BY-SA 4.0, and so is the map: `examples/deep_sky.fits.gz`, of OpenNGC's commit
+17397545, which is no part of the package. Each object is an image of its own: an ellipse with the
+catalogue's axes, position angle and total V (B - 0.7 where that is missing). Galaxies are
+exponential discs, ellipticals Sersic profiles of index 4, cut at the catalogue's axes (B = 25
+mag/arcsec2). The scale length of a disc is 1 / 3.2 of that radius (Freeman 1970), an elliptical's
+effective radius 1 / 3. Globular clusters are discs as well, nebulae even ellipses. Open clusters
+are left out, as their stars are in the star catalogue; so are objects without a size or a
+magnitude.
 """
 
 from __future__ import annotations
@@ -25,7 +28,8 @@ from astropy.wcs import WCS
 
 SERSIC_4 = 7.669  # b of index 4: half of the light is within the effective radius
 GALAXIES, DISCS, NEBULAE = ("G", "GPair", "GTrpl"), ("GCl",), ("HII", "Neb", "RfN", "PN", "SNR", "EmN")
-MAX_SIDE_PX, MIN_SIDE_PX, FINER = 65, 33, 5  # the middle of a profile is the mean of FINER by FINER places
+# the middle of a profile is the mean of FINER by FINER places
+MAX_SIDE_PX, MIN_SIDE_PX, FINER = 65, 33, 5
 PX_DEG = 10 / 3600  # finer than a tracker's
 BLUER_MAG = 0.7
 

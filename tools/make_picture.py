@@ -1,4 +1,5 @@
-"""README's picture, Orion's belt three times: code values, stretched, and the virtual tracker's image.
+"""README's picture, Orion's belt three times: code values, stretched, and the virtual tracker's
+image.
 
 `python tools/make_picture.py [OUT.png]` writes readme.png, or OUT.png.
 """
@@ -47,7 +48,9 @@ def pictures(folder: Path) -> tuple[Image.Image, Image.Image, Image.Image]:
 
 
 def piece(image: Image.Image, middle_px: tuple[float, float], zoom: float) -> Image.Image:
-    """The part about a place, `zoom` times as large in pixels as PIECE_PX says, enlarged to the panel."""
+    """The part about a place, `zoom` times as large in pixels as PIECE_PX says, enlarged to the
+    panel.
+    """
     width, height = (side / zoom for side in PIECE_PX)
     x, y = middle_px
     box = (x + 0.5 - width / 2, y + 0.5 - height / 2, x + 0.5 + width / 2, y + 0.5 + height / 2)

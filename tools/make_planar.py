@@ -1,7 +1,9 @@
-"""Make configs/planar-1897.fits: the glass of P. Rudolph's double Gauss, US patent 583336 (1897), example 2.
+"""Make configs/planar-1897.fits: the glass of P. Rudolph's double Gauss, US patent 583336 (1897),
+example 2.
 
-The prescription is the patent's, scaled to a focal length of 25 mm, with the modern Schott glasses nearest to its own. It is
-stopped down to F/6.3, focused where its spots are small, and has an assumed filter of 480 to 700 nm. Needs
+The prescription is the patent's, scaled to a focal length of 25 mm, with the modern Schott glasses
+nearest to its own. It is stopped down to F/6.3, focused where its spots are small, and has an
+assumed filter of 480 to 700 nm. Needs
 `pip install 'hilstar[lens]'`: `python tools/make_planar.py`.
 """
 
@@ -30,7 +32,8 @@ BEHIND_MM, FOCUS_MM, SCALE = 42.3517, -0.25, 25 / 49.389
 APERTURE_MM, FIELD_DEG = 4.0, 22.0
 WAVELENGTHS_NM = (480.0, 580.0, 700.0)
 PRIMARY_NM = 580.0
-FILTER = Curve(np.array([479.0, 480.0, 700.0, 701.0]), np.array([0.0, 1.0, 1.0, 0.0]))  # assumed: the colours that are traced
+# assumed: the colours that are traced
+FILTER = Curve(np.array([479.0, 480.0, 700.0, 701.0]), np.array([0.0, 1.0, 1.0, 0.0]))
 PLATE = Plate((1024, 1024), 13.0, half_px=5)
 SAMPLES, TOLERANCE = 3, 5e-3
 
@@ -42,7 +45,8 @@ def planar() -> Any:
     lens = Optic()
     radii = [radius for radius, _, _ in FRONT]
     gaps = [(thickness, glass) for _, thickness, glass in FRONT]
-    # The stop's plane lies between two gaps of air; mirrored surfaces have the gap that was before their image.
+    # The stop's plane lies between two gaps of air; mirrored surfaces have the gap that was before
+    # their image.
     back = [(-radius, *gap) for radius, gap in zip(radii[::-1], [*gaps[-2::-1], (BEHIND_MM + FOCUS_MM, None)], strict=True)]
     lens.surfaces.add(index=0, radius=np.inf, thickness=np.inf)
     rows = [*FRONT, (np.inf, 2.313, None), *back]

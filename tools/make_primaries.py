@@ -1,9 +1,11 @@
-"""Make the spectra of primaries in configs: an LCD's and a CRT's as measured, shapes of an OLED's and of a projector's lasers.
+"""Make the spectra of primaries in configs: an LCD's and a CRT's as measured, shapes of an OLED's
+and of a projector's lasers.
 
     pip install colour-science==0.4.7      (an environment of its own will do)
     python tools/make_primaries.py
 
-No measured spectra of an OLED or of lasers were found under a free licence, so those two are the study's Gaussians, and say so.
+No measured spectra of an OLED or of lasers were found under a free licence, so those two are the
+study's Gaussians, and say so.
 """
 
 from __future__ import annotations

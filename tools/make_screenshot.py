@@ -1,8 +1,10 @@
-"""The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in Debian's chromium.
+"""The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in
+Debian's chromium.
 
-`python tools/make_screenshot.py` writes console.png, pixels.png, report.png and first-light.png into docs, and each again as
-NAME-light.png. The run goes by the clock, so that no two are alike. The page is taken once it has been on time for a minute; on
-a machine that is too busy for that, the picture shows and says what was missed.
+`python tools/make_screenshot.py` writes console.png, pixels.png, report.png and first-light.png
+into docs, and each again as NAME-light.png. The run goes by the clock, so that no two are alike.
+The page is taken once it has been on time for a minute; on a machine that is too busy for that, the
+picture shows and says what was missed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Writes hilstar/instruments/study/stability/*.csv: the figures of failing methods that no machine changes.
+"""Writes hilstar/instruments/study/stability/*.csv: the figures of failing methods that no machine
+changes.
 
 Run without arguments.
 
-The cases and curves are those of tests/authority/failing_methods, which hold them with every commit.
+The cases and curves are those of tests/authority/failing_methods, which hold them with every
+commit.
 """
 
 from __future__ import annotations

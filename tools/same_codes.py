@@ -2,9 +2,10 @@
 
     python tools/same_codes.py BEFORE/bin/hilstar AFTER/bin/hilstar
 
-Both replay a log of ten attitudes on each of BENCHES (round, exact, temporal, dither, bit stealing, a black level, 10 bits,
-a lens, bodies, satellites, faults, motion, effort), write one linear image with its truth table, and simulate one exposure of
-the virtual tracker; every picture, table and exposure is compared by its pixels. Exit code 1 where one differs.
+Both replay a log of ten attitudes on each of BENCHES (round, exact, temporal, dither, bit stealing,
+a black level, 10 bits, a lens, bodies, satellites, faults, motion, effort), write one linear image
+with its truth table, and simulate one exposure of the virtual tracker; every picture, table and
+exposure is compared by its pixels. Exit code 1 where one differs.
 """
 
 from __future__ import annotations
@@ -165,7 +166,9 @@ def pointing_at(ra_deg: float, dec_deg: float) -> Any:
 
 
 def write_log(path: Path, name: str) -> None:
-    """Write ten attitudes that turn at the bench's rate: from TARGETS_DEG in equal parts, the others' second half anywhere."""
+    """Write ten attitudes that turn at the bench's rate: from TARGETS_DEG in equal parts, the
+    others' second half anywhere.
+    """
     rng = np.random.default_rng([SEED, list(BENCHES).index(name)])
     omega = np.radians(RATES_DEG_S.get(name, USUAL_RATE_DEG_S))
     targets = TARGETS_DEG.get(name, [ORION_DEG])

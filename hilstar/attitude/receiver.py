@@ -1,6 +1,8 @@
-"""The receiver thread of a live stream: link to timeline, with the sender's clock kept and the sender answered.
+"""The receiver thread of a live stream: link to timeline, with the sender's clock kept and the
+sender answered.
 
-`BackChannel` sends what a two-way link carries back: statuses, time requests, and replies to the sender's own time requests.
+`BackChannel` sends what a two-way link carries back: statuses, time requests, and replies to the
+sender's own time requests.
 """
 
 import threading
@@ -31,7 +33,8 @@ ASK_NS = NS_PER_S // 2
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 POLL_MS = 20
 MAX_PASSED_ON = 10
-# Messages found when the frames begin were there before; those that arrive this soon after may have queued on the way.
+# Messages found when the frames begin were there before; those that arrive this soon after may have
+# queued on the way.
 QUEUED_NS = NS_PER_S // 10
 QUEUE_NEVER_EMPTY_NS = NS_PER_S
 KNOWN_AGAIN_NS = NS_PER_S // 5  # how soon a step of this machine's clock of Unix time is followed
@@ -47,7 +50,9 @@ MAX_BACK_OFF_NS = NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What goes back to the sender on a two-way link, and what its clock is: estimated, this machine's own, or Unix time."""
+    """What goes back to the sender on a two-way link, and what its clock is: estimated, this
+    machine's own, or Unix time.
+    """
 
     status_hz: float = 0.0
     time_requests: bool = False
@@ -58,7 +63,8 @@ QUIET = Traffic()
 
 
 class BackChannel:
-    """Sends what is due over `link`, to the sender of the newest attitude shown where it has several.
+    """Sends what is due over `link`, to the sender of the newest attitude shown where it has
+    several.
 
     The receiver's thread calls it, but for `post` and `pass_on`.
     """
@@ -77,14 +83,18 @@ class BackChannel:
         self._next_ask_ns = 0
 
     def post(self, status: wire.Status) -> None:
-        """Take the newest status; it leaves when it is due, with the one-time health bits of those that never left."""
+        """Take the newest status; it leaves when it is due, with the one-time health bits of
+        those that never left.
+        """
         with self._posting:
             if self._status is not None:
                 status = replace(status, health=status.health | self._status.health & TOLD_ONCE)
             self._status = status
 
     def pass_on(self, answer: wire.AnswerPacket) -> None:
-        """Take an answer of the tracker; it leaves at once. The oldest of more than MAX_PASSED_ON is dropped."""
+        """Take an answer of the tracker; it leaves at once. The oldest of more than
+        MAX_PASSED_ON is dropped.
+        """
         self._answers.append(answer)
 
     def talk(self, now_ns: int, *, ask: bool) -> None:
@@ -104,7 +114,8 @@ class BackChannel:
                 status, self._status = self._status, None
             period_ns = round(NS_PER_S / self._traffic.status_hz)
             due_ns = self._next_status_ns + period_ns
-            self._next_status_ns = due_ns if due_ns > now_ns else now_ns + period_ns  # never two at once, after a pause either
+            # never two at once, after a pause either
+            self._next_status_ns = due_ns if due_ns > now_ns else now_ns + period_ns
             self._send(status)
 
     def ask_quickly(self, now_ns: int) -> None:
@@ -122,7 +133,9 @@ class BackChannel:
         send(wire.TimeReply(request.sequence, request.t1_ns, arrival.host_ns, self._now_ns()))
 
     def exchange(self, reply: wire.TimeReply, t4_ns: int, correction_ns: int) -> Exchange | None:
-        """The exchange that a reply completes, its sender times made continuous; None for a reply to nothing."""
+        """The exchange that a reply completes, its sender times made continuous; None for a
+        reply to nothing.
+        """
         request = self._asked.pop(reply.sequence, None)
         if request is None or request.t1_ns != reply.t1_ns:
             return None
@@ -132,9 +145,11 @@ class BackChannel:
 
 @dataclass(slots=True)
 class PacketCounts:
-    """How many attitude messages arrived, how many of those were refused, by reason, and how many were lost on the way.
+    """How many attitude messages arrived, how many of those were refused, by reason, and how many
+    were lost on the way.
 
-    `shown` is what was sent instead, by reason, where the bytes of the first refused message showed it.
+    `shown` is what was sent instead, by reason, where the bytes of the first refused message showed
+    it.
     """
 
     received: int = 0
@@ -156,16 +171,18 @@ class PacketCounts:
         return sum(self.refused_by.values())
 
 
-# Called for every attitude message with its arrival, its bytes, what it says, and why it was refused, if it was.
+# Called for every attitude message with its arrival, its bytes, what it says, and why it was
+# refused, if it was.
 Watch = Callable[[int, bytes, wire.AttitudeSample | None, wire.Refusal | None], None]
 
 
 class Receiver:
-    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
+    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends
+    it. `back` leads back.
 
-    What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
-    `read_as` is how the link has read quaternions. `tell_lost` is called with a number of packets once it is clear that they
-    never came.
+    What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns`
+    is the host's clock. `read_as` is how the link has read quaternions. `tell_lost` is called with
+    a number of packets once it is clear that they never came.
     """
 
     def __init__(
@@ -246,7 +263,9 @@ class Receiver:
         self._thread.join()
 
     def clock_summary(self) -> ClockSummary:
-        """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""
+        """The clock's summary, its offset that of the sender's clock as it is now, after all
+        jumps.
+        """
         told = replace(self.clock.summary(), jumps=self.jumps.jumps)
         if told.offset_ms is not None:
             told = replace(told, offset_ms=told.offset_ms + self.jumps.correction_ns / NS_PER_MS)
@@ -260,7 +279,8 @@ class Receiver:
             while not self._stop.is_set():
                 self.listen()
             self.release()
-        except BaseException as error:  # whatever it is: the display continues, and `tend` restarts this
+        except BaseException as error:
+            # whatever it is: the display continues, and `tend` restarts this
             self._failure = f"{type(error).__name__}: {error}"
 
     def release(self) -> None:
@@ -290,7 +310,8 @@ class Receiver:
             self._learn_from_ns = now_ns + QUEUED_NS
         arrivals = self._link.receive(POLL_MS)
         for k, arrival in enumerate(arrivals):
-            # The newest of those that arrived while this thread slept woke it; the others had to wait.
+            # The newest of those that arrived while this thread slept woke it; the others had to
+            # wait.
             timely = not waits and k == len(arrivals) - 1
             waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
             self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
@@ -338,7 +359,9 @@ class Receiver:
                 self._refuse(arrival, other if isinstance(other, wire.Refusal) else refusal)
 
     def _take_decided(self, arrivals: list[SampleArrival]) -> None:
-        """Take samples whose sender is decided: the one shown, or another, whose samples are refused."""
+        """Take samples whose sender is decided: the one shown, or another, whose samples are
+        refused.
+        """
         for arrival in arrivals:
             if arrival.refusal is not None:
                 self._refuse(arrival, arrival.refusal)

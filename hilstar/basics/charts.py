@@ -1,6 +1,8 @@
-"""Charts and their tables: one style of figure, whose title is its finding, for light and dark pages, and the CSV behind it.
+"""Charts and their tables: one style of figure, whose title is its finding, for light and dark
+pages, and the CSV behind it.
 
-A figure is as wide as a page shows it, so that its points are the page's points. Its SVG has the colours of both themes.
+A figure is as wide as a page shows it, so that its points are the page's points. Its SVG has the
+colours of both themes.
 """
 
 import csv
@@ -52,7 +54,8 @@ DARK = {
     TEAL: "#56cfe0",
     RED: "#ff7b7b",
 }
-_SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()  # by figure, while it is drawn
+# by figure, while it is drawn
+_SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()
 STYLE: Any = {
     "font.size": TEXT_PT,
     "text.color": INK,
@@ -93,16 +96,20 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
 
 
 def write_records(path: Path, records: Sequence[Any]) -> None:
-    """A table of frozen dataclasses of one class, a column for each field. Raises InputError where it cannot be written."""
+    """A table of frozen dataclasses of one class, a column for each field. Raises InputError
+    where it cannot be written.
+    """
     columns = [field.name for field in fields(records[0])]
     write_csv(path, columns, [[getattr(record, name) for name in columns] for record in records])
 
 
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> "Iterator[list[Axes]]":
-    """Panels titled by their finding, laid out as `panels_of` says, and written when they are drawn.
+    """Panels titled by their finding, laid out as `panels_of` says, and written when they are
+    drawn.
 
-    `path` without an ending gives both NAME.png and NAME.svg. Raises InputError where a file cannot be written.
+    `path` without an ending gives both NAME.png and NAME.svg. Raises InputError where a file cannot
+    be written.
     """
     with panels_of(finding, panels, columns, **layout) as axes:
         yield axes
@@ -121,7 +128,9 @@ def panels_of(
     heights: Sequence[float] | None = None,
     height_inch: float | None = None,
 ) -> "Iterator[list[Axes]]":
-    """Axes to draw on, row by row, of a figure titled by its finding; `note` says below, in small type, what it holds for."""
+    """Axes to draw on, row by row, of a figure titled by its finding; `note` says below, in
+    small type, what it holds for.
+    """
     # Not pyplot: it would change the backend of a program that imports this.
     from cycler import cycler
     from matplotlib import rc_context
@@ -140,7 +149,9 @@ def panels_of(
 
 
 def finish(figure: "Figure") -> None:
-    """Make labels, ticks and side names uniform, and lay the figure out until they want no other room beside their panels."""
+    """Make labels, ticks and side names uniform, and lay the figure out until they want no other
+    room beside their panels.
+    """
     from matplotlib.ticker import LogLocator
 
     panels, side_names = figure.axes, _SIDE_NAMES.pop(figure, [])
@@ -153,7 +164,9 @@ def finish(figure: "Figure") -> None:
     engine, texts = figure.get_layout_engine(), list["Annotation"]()
 
     def place() -> tuple[list[object], ...]:
-        """Ticks and names at the panels' present size: what of them takes room beside the panels."""
+        """Ticks and names at the panels' present size: what of them takes room beside the
+        panels.
+        """
         for axis in log_axes:
             log_ticks(axis, axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25)
         for text in texts:
@@ -176,7 +189,9 @@ def capital(text: str) -> str:
 
 
 def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
-    """A finding in the fewest lines of about equal length, with no line break between a figure and its unit."""
+    """A finding in the fewest lines of about equal length, with no line break between a figure
+    and its unit.
+    """
     finding = re.sub(r"\d(\.\d+)?e[+-]\d+", lambda found: two_digits(float(found[0])), finding)
     bound = re.sub(r"(?<=\d) (?=%|(K|mag|mm|px|ms|s|deg/s|arcsec)\b)", "\N{NO-BREAK SPACE}", finding)
 
@@ -195,7 +210,9 @@ def plain_ticks(axis: "Axis", values: Sequence[float]) -> None:
 
 
 def plain(value: float) -> str:
-    """A round figure as a person writes it; below 0.0001 and from a million on as a power of ten."""
+    """A round figure as a person writes it; below 0.0001 and from a million on as a power of
+    ten.
+    """
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         return f"{value:g}"
     mantissa, power = f"{value:.1e}".split("e")
@@ -210,7 +227,9 @@ def two_digits(value: float) -> str:
 
 
 def log_ticks(axis: "Axis", room: float) -> None:
-    """Round ticks of a logarithmic axis within its limits, as many as stand apart where there is room for `room`."""
+    """Round ticks of a logarithmic axis within its limits, as many as stand apart where there is
+    room for `room`.
+    """
     low, high = sorted(axis.get_view_interval())
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     within_decades: tuple[tuple[float, ...], ...] = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 3, 5), (1, 2, 5), (1, 3))
@@ -223,13 +242,16 @@ def log_ticks(axis: "Axis", room: float) -> None:
 
 
 def label_ends(*panels: "Axes") -> None:
-    """Names of lines in their colours, right of each panel where each line ends, in place of a legend."""
+    """Names of lines in their colours, right of each panel where each line ends, in place of a
+    legend.
+    """
     for axes in panels:
         name_at_side(axes, [])
 
 
 def name_at_side(axes: "Axes", named: SideNames) -> None:
-    """Names of points (x, y) of the data, with their colours, in a column right of the axes, level where there is room.
+    """Names of points (x, y) of the data, with their colours, in a column right of the axes, level
+    where there is room.
 
     Without any, lines are named where they end. The names are placed when the chart is finished.
     """
@@ -240,7 +262,8 @@ def _line_ends(axes: "Axes") -> Iterator[tuple[str, tuple[float, float], str]]:
     """The name, the last point in view (x, y) and the colour of each line that has a name."""
     low, high = sorted(axes.get_xlim())
     for line in axes.get_lines():
-        x_is_data, _ = line.get_transform().contains_branch_seperately(axes.transData)  # an axhline's x is not
+        # an axhline's x is not
+        x_is_data, _ = line.get_transform().contains_branch_seperately(axes.transData)
         xy = np.asarray(line.get_xydata(), dtype=float)
         ends = xy[np.isfinite(xy[:, 1]) & ((low <= xy[:, 0]) & (xy[:, 0] <= high) | (not x_is_data))]
         if len(ends) and not str(line.get_label()).startswith("_"):
@@ -288,7 +311,9 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
 
 
 def value_bars(axes: "Axes", names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str) -> None:
-    """Horizontal bars, the first on top, each with its figure at its end in the place of an axis."""
+    """Horizontal bars, the first on top, each with its figure at its end in the place of an
+    axis.
+    """
     bars = axes.barh(range(len(names)), values, color=colours)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
@@ -301,7 +326,9 @@ def value_bars(axes: "Axes", names: Sequence[str], values: Sequence[float], colo
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure as PNG, as SVG, or where its path has no ending as both. Raises InputError where one cannot be written."""
+    """Write a figure as PNG, as SVG, or where its path has no ending as both. Raises InputError
+    where one cannot be written.
+    """
     for target in [path] if path.suffix in ENDINGS else [path.with_name(path.name + ending) for ending in ENDINGS]:
         data = svg(figure).encode() if target.suffix == ".svg" else png(figure)
         write_whole(target, data)
@@ -315,7 +342,9 @@ def png(figure: "Figure") -> bytes:
 
 
 def svg(figure: "Figure") -> str:
-    """A figure as SVG with both sets of colours: dark ones where the reader, or the page around it, prefers them."""
+    """A figure as SVG with both sets of colours: dark ones where the reader, or the page around
+    it, prefers them.
+    """
     from matplotlib import rc_context
 
     data = io.StringIO()

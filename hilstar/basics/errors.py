@@ -1,4 +1,6 @@
-"""The two kinds of refusal, each with its exit code, how it quotes what it refuses, and what it takes a wrong word for."""
+"""The two kinds of refusal, each with its exit code, how it quotes what it refuses, and what it
+takes a wrong word for.
+"""
 
 from collections.abc import Iterable
 
@@ -8,7 +10,9 @@ CUT = "[...]"
 
 
 class HilstarError(Exception):
-    """One line for a person: what is wrong, where, and what to write instead; of bounded length, whatever it quotes."""
+    """One line for a person: what is wrong, where, and what to write instead; of bounded length,
+    whatever it quotes.
+    """
 
     exit_code = 1
 
@@ -29,7 +33,9 @@ class MachineError(HilstarError):
 
 
 class NotThereError(MachineError):
-    """A device that the command or a file names is not there; the line says what to plug in or which others are."""
+    """A device that the command or a file names is not there; the line says what to plug in or
+    which others are.
+    """
 
 
 class GpuError(MachineError):
@@ -37,7 +43,9 @@ class GpuError(MachineError):
 
 
 def cannot_read(path: object, reason: object, advice: str) -> InputError:
-    """The refusal of an input: `reason` is words or the error that came, `advice` what to give instead."""
+    """The refusal of an input: `reason` is words or the error that came, `advice` what to give
+    instead.
+    """
     return InputError(f"{path}: cannot be read ({_in_words(reason)}); {advice}")
 
 
@@ -51,7 +59,9 @@ def _in_words(reason: object) -> str:
 
 
 def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
-    """A quoted piece of input in at most `limit` characters: its beginning and its end, where a file's name is."""
+    """A quoted piece of input in at most `limit` characters: its beginning and its end, where a
+    file's name is.
+    """
     try:
         whole = str(text)
     except ValueError:  # Python writes no integer of more than 4300 digits
@@ -63,7 +73,9 @@ def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
 
 
 def printable(text: str) -> str:
-    r"""The text with control characters, and bytes that are not UTF-8, as escapes such as \x1b or \xff."""
+    r"""The text with control characters, and bytes that are not UTF-8, as escapes such as \x1b
+    or \xff.
+    """
     return "".join(c if c.isprintable() or c == " " else _escape(c) for c in text)
 
 
@@ -81,7 +93,9 @@ def one_line(text: str) -> str:
 
 
 def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """ "did you mean frame? " where `word` is nearly one of the words that are known; else nothing."""
+    """ "did you mean frame? " where `word` is nearly one of the words that are known; else
+    nothing.
+    """
     import difflib  # 5 ms, which a command without a mistake does not need
 
     by_small_letters = {one.casefold(): one for one in known}

@@ -1,7 +1,9 @@
-"""Files that are written: complete or not at all, never over an input or another output, and under a name that fits.
+"""Files that are written: complete or not at all, never over an input or another output, and under
+a name that fits.
 
-A run's ledger is never overwritten unless the user asks for it. Temporary names are random and made anew (O_EXCL), and what
-is written goes through the open file, never again by its name: nobody who can write to the folder can turn it elsewhere.
+A run's ledger is never overwritten unless the user asks for it. Temporary names are random and made
+anew (O_EXCL), and what is written goes through the open file, never again by its name: nobody who
+can write to the folder can turn it elsewhere.
 """
 
 import contextlib
@@ -31,7 +33,8 @@ HEAD_BYTES = 16_384
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
 PART_BYTES = 100  # part of a file's name that its temporary file's name (at most 255 bytes) keeps
-PART_NAME = re.compile(r"\..+\.([0-9a-f]{16}|[0-9]+)\.part(\.\w+)?", re.DOTALL)  # a process id in those of 0.1.0
+# a process id in those of 0.1.0
+PART_NAME = re.compile(r"\..+\.([0-9a-f]{16}|[0-9]+)\.part(\.\w+)?", re.DOTALL)
 OWNER = ".owner"  # in a temporary folder: the file that its process has locked
 MIN_REST_S, MAX_REST_S = 1.0, 3600.0  # before a file that was found whole is read through again
 FOLDERS = "hilstar-"  # what temporary folders are called
@@ -55,14 +58,17 @@ STDOUT = Path("-")  # the output that is stdout: for text alone
 
 
 def stdout_bytes() -> IO[bytes]:
-    """The process's own stdout, wherever what a command prints goes meanwhile. Raises InputError without one."""
+    """The process's own stdout, wherever what a command prints goes meanwhile. Raises InputError
+    without one.
+    """
     if sys.__stdout__ is None:
         raise cannot_write("stdout", "it is closed", "write the name of a file")
     return cast(IO[bytes], sys.__stdout__.buffer)
 
 
 def place_of(path: Path) -> Place | None:
-    """The identity of a path: the file that it leads to, or the full path of one that does not exist yet.
+    """The identity of a path: the file that it leads to, or the full path of one that does not
+    exist yet.
 
     None for anything but a regular file, such as /dev/null.
     """
@@ -74,7 +80,9 @@ def place_of(path: Path) -> Place | None:
 
 
 def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None]) -> None:
-    """Refuse (InputError), before the first byte, an output that is an input or another output of the same command."""
+    """Refuse (InputError), before the first byte, an output that is an input or another output
+    of the same command.
+    """
     taken: dict[Place, Path] = {}
     for path in inputs:
         place = None if path is None else place_of(path)
@@ -97,7 +105,8 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
 
 
 def files_named_in(path: Path, text: str | None = None, depth: int = 0) -> list[Path]:
-    """A TOML file (of this `text`, where it has been read) and every file that it names, relative to it, and so on.
+    """A TOML file (of this `text`, where it has been read) and every file that it names, relative
+    to it, and so on.
 
     Nothing is refused here.
     """
@@ -124,10 +133,11 @@ def _texts(value: Any) -> Iterator[str]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A temporary file beside `path`, open for writing; at the end it replaces `path`, and an error leaves that unchanged.
+    """A temporary file beside `path`, open for writing; at the end it replaces `path`, and an error
+    leaves that unchanged.
 
-    Devices and pipes are written themselves, and stdout for `STDOUT`. Raises InputError where nothing can be written, and for a
-    run's ledger.
+    Devices and pipes are written themselves, and stdout for `STDOUT`. Raises InputError where
+    nothing can be written, and for a run's ledger.
     """
     if path == STDOUT:
         yield stdout_bytes()
@@ -147,7 +157,9 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """That of the file a path leads to, None where there is none yet. Raises OSError for links in a circle."""
+    """That of the file a path leads to, None where there is none yet. Raises OSError for links
+    in a circle.
+    """
     try:
         return path.stat()
     except FileNotFoundError:
@@ -173,13 +185,17 @@ def _part_of(target: Path, mode: int | None) -> Iterator[IO[bytes]]:
 
 
 def _part_path(target: Path) -> Path:
-    """A temporary name beside a file that nobody can foresee; after a kill it is known by its ending."""
+    """A temporary name beside a file that nobody can foresee; after a kill it is known by its
+    ending.
+    """
     name = os.fsdecode(os.fsencode(target.stem)[:PART_BYTES])
     return target.with_name(f".{name}.{secrets.token_hex(8)}.part{target.suffix}")
 
 
 def clear_parts(folder: Path) -> None:
-    """Delete what killed writers left in a directory and below it; for one that has a single writer, who is asking."""
+    """Delete what killed writers left in a directory and below it; for one that has a single
+    writer, who is asking.
+    """
     for path in folder.rglob(".*"):
         if PART_NAME.fullmatch(path.name) and path.is_file() and not path.is_symlink():
             with contextlib.suppress(OSError):
@@ -226,8 +242,8 @@ def refuse_ledger(path: Path) -> None:
 class NewFile:
     """A new file that grows while it is written, locked so that it has one writer.
 
-    `fd` is its descriptor, which writes at the file's end. With `overwrite` an older file stays until `commit`. Raises
-    InputError.
+    `fd` is its descriptor, which writes at the file's end. With `overwrite` an older file stays
+    until `commit`. Raises InputError.
     """
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
@@ -242,7 +258,8 @@ class NewFile:
             made = self._part = _part_path(Path(os.path.realpath(path)))
         self._mtime_ns, self._look_s, self._rest_s = 0, 0.0, MIN_REST_S
         try:
-            # Written by append: what somebody cuts off is missing for good, and the size says so. Read to be compared.
+            # Written by append: what somebody cuts off is missing for good, and the size says so.
+            # Read to be compared.
             self.fd = _create(made, os.O_RDWR | os.O_CREAT | os.O_APPEND)
         except FileExistsError as error:
             raise InputError(f"{path}: is there already; {OVERWRITE}") from error
@@ -263,7 +280,8 @@ class NewFile:
         self._mtime_ns = os.fstat(self.fd).st_mtime_ns
 
     def harm(self, size_bytes: int, crc: int) -> str | None:
-        """What somebody has done to the file, of which this process wrote so many bytes of this CRC-32; None for nothing.
+        """What somebody has done to the file, of which this process wrote so many bytes of this
+        CRC-32; None for nothing.
 
         Raises OSError.
         """
@@ -276,7 +294,8 @@ class NewFile:
             return None
         if _crc_of(self.fd, size_bytes) != crc:
             return "overwritten"
-        # It was only touched, or its file system keeps other times than it says: it is not read over and over.
+        # It was only touched, or its file system keeps other times than it says: it is not read
+        # over and over.
         self._look_s, self._rest_s = time.monotonic() + self._rest_s, min(2 * self._rest_s, MAX_REST_S)
         return None
 
@@ -315,7 +334,9 @@ def refuse_writer(path: Path) -> None:
 
 
 def make_directory(path: Path) -> Path:
-    """Create the directory `path` if it does not exist, and return it. Raises InputError where it cannot be created."""
+    """Create the directory `path` if it does not exist, and return it. Raises InputError where
+    it cannot be created.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
@@ -324,13 +345,16 @@ def make_directory(path: Path) -> Path:
 
 
 def written(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a file by `write`, complete or not at all; an older file stays until the new one is complete."""
+    """Write a file by `write`, complete or not at all; an older file stays until the new one is
+    complete.
+    """
     with whole_file(path) as file:
         write(file)
 
 
 def lock_alone(path: Path, held: str) -> int:
-    """The descriptor of a lock file, made where there is none, and locked until it is closed or its process ends.
+    """The descriptor of a lock file, made where there is none, and locked until it is closed or its
+    process ends.
 
     A link there is not followed. Raises InputError, with `held` where another process has the lock.
     """
@@ -362,7 +386,9 @@ def temporary_folder(kind: str) -> Iterator[Path]:
 
 
 def _owned_folder(prefix: str) -> tuple[Path, int]:
-    """A new folder, and the descriptor by which its owner holds it: the kernel lets it go however the owner ends."""
+    """A new folder, and the descriptor by which its owner holds it: the kernel lets it go
+    however the owner ends.
+    """
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
         owner = _create(folder / OWNER)
@@ -373,9 +399,12 @@ def _owned_folder(prefix: str) -> tuple[Path, int]:
 
 
 def clear_left() -> None:
-    """Delete the temporary folders of this user whose owner has ended; no link is followed, and no folder but ours."""
+    """Delete the temporary folders of this user whose owner has ended; no link is followed, and
+    no folder but ours.
+    """
     for folder in Path(tempfile.gettempdir()).glob(f"{FOLDERS}*"):
-        with contextlib.suppress(OSError):  # it is gone, or no folder, or has no owner's file, or its owner lives
+        # it is gone, or no folder, or has no owner's file, or its owner lives
+        with contextlib.suppress(OSError):
             _clear(folder)
 
 
@@ -396,7 +425,8 @@ def _clear(folder: Path) -> None:
 
 
 def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse (InputError) a name with the ending of another kind of file; one without a known ending is accepted.
+    """Refuse (InputError) a name with the ending of another kind of file; one without a known
+    ending is accepted.
 
     `endings` are those of the kind that is written, and .gz after those of FITS.
     """
@@ -422,7 +452,8 @@ def refuse_stdout(option: str, path: Path) -> None:
 
 
 def check_directory(option: str, path: Path | None) -> None:
-    """Refuse (InputError) the name of a file where a directory is created, and a place where nothing can be.
+    """Refuse (InputError) the name of a file where a directory is created, and a place where
+    nothing can be.
 
     For the start of a command: before its work, and before anything is created.
     """

@@ -1,4 +1,6 @@
-"""Pages that need no other file: the operator's page's colours, light, dark and on paper, with cards, tables and pictures."""
+"""Pages that need no other file: the operator's page's colours, light, dark and on paper, with
+cards, tables and pictures.
+"""
 
 import base64
 import html

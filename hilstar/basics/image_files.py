@@ -1,7 +1,9 @@
-"""Pictures and FITS images that a user gives: opened by one function each, and measured before anything is decoded.
+"""Pictures and FITS images that a user gives: opened by one function each, and measured before
+anything is decoded.
 
-A picture of 170 kB may unpack to gigabytes, and Pillow knows formats that other programs decode (EPS is given to Ghostscript,
-whatever its name ends with). So a picture is opened in FORMATS alone, and its size is compared first.
+A picture of 170 kB may unpack to gigabytes, and Pillow knows formats that other programs decode
+(EPS is given to Ghostscript, whatever its name ends with). So a picture is opened in FORMATS alone,
+and its size is compared first.
 """
 
 import gzip
@@ -22,7 +24,8 @@ if TYPE_CHECKING:
     from astropy.io import fits
     from PIL import Image
 
-FORMATS = ("PNG", "TIFF", "JPEG", "WEBP", "BMP", "PPM")  # several pictures in one JPEG (MPO) are opened as JPEG
+# several pictures in one JPEG (MPO) are opened as JPEG
+FORMATS = ("PNG", "TIFF", "JPEG", "WEBP", "BMP", "PPM")
 MAX_PIXELS = 1 << 26  # where no size is known: 8192 x 8192, half a GB as float64
 MAX_UNPACKED_BYTES = 8 * MAX_PIXELS
 FITS_MAGIC, GZIP_MAGIC = b"SIMPLE", b"\x1f\x8b"
@@ -30,7 +33,9 @@ NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.forma
 
 
 class ImageSizeError(Exception):
-    """An image that is not decoded, because of its size or of what it is; the message says which."""
+    """An image that is not decoded, because of its size or of what it is; the message says
+    which.
+    """
 
 
 def _check_size(size_px: tuple[int, int], wanted_px: tuple[int, int] | None) -> None:
@@ -46,7 +51,9 @@ def _check_size(size_px: tuple[int, int], wanted_px: tuple[int, int] | None) -> 
 def opened_picture(
     data: bytes, size_px: tuple[int, int] | None = None, formats: Sequence[str] = FORMATS
 ) -> Iterator["Image.Image"]:
-    """A picture, not decoded yet, of this (width, height) if any is wanted. Raises ImageSizeError, and whatever Pillow does."""
+    """A picture, not decoded yet, of this (width, height) if any is wanted. Raises
+    ImageSizeError, and whatever Pillow does.
+    """
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -57,7 +64,9 @@ def opened_picture(
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_UNPACKED_BYTES) -> bytes:
-    """A file's bytes, without gzip around them. Raises ImageSizeError for more than `limit_bytes`, or a damaged file."""
+    """A file's bytes, without gzip around them. Raises ImageSizeError for more than
+    `limit_bytes`, or a damaged file.
+    """
     if not data.startswith(GZIP_MAGIC):
         return data
     try:
@@ -83,9 +92,11 @@ def is_fits(data: bytes) -> bool:
 
 @contextmanager
 def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator["fits.HDUList"]:
-    """A FITS file, whose images are not decoded yet; the first has this (width, height) if any is wanted.
+    """A FITS file, whose images are not decoded yet; the first has this (width, height) if any is
+    wanted.
 
-    It may be packed by gzip. Raises ImageSizeError, also for a file of another compression, and whatever astropy does.
+    It may be packed by gzip. Raises ImageSizeError, also for a file of another compression, and
+    whatever astropy does.
     """
     from astropy.io import fits
 
@@ -115,7 +126,9 @@ def _image_shape(hdu: Any) -> tuple[int, ...]:
 
 
 def npy_array(data: bytes) -> npt.NDArray[Any]:
-    """The array of a .npy file. Raises ValueError for one whose header promises more than there is, or that holds objects."""
+    """The array of a .npy file. Raises ValueError for one whose header promises more than there
+    is, or that holds objects.
+    """
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
     if version not in NPY_HEADERS:

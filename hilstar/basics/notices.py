@@ -1,8 +1,10 @@
-"""Events of a run, told as they happen: a line on stderr, a count in the summary, an event in the ledger.
+"""Events of a run, told as they happen: a line on stderr, a count in the summary, an event in the
+ledger.
 
-A kind that comes more than MAX_SAID times within SAID_WINDOW_S is only counted for a while, twice as long each time up to
-MAX_QUIET_S, and then said with how many there were meanwhile; so is its end, by `sum_up`. Where it comes on, what is only
-counted is not recorded either, but for what a person did.
+A kind that comes more than MAX_SAID times within SAID_WINDOW_S is only counted for a while, twice
+as long each time up to MAX_QUIET_S, and then said with how many there were meanwhile; so is its
+end, by `sum_up`. Where it comes on, what is only counted is not recorded either, but for what a
+person did.
 """
 
 import logging
@@ -28,7 +30,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a person, who caused it.
+    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a
+    person, who caused it.
 
     `since_ns` is when that began of which it tells, where this was earlier.
     """
@@ -41,7 +44,9 @@ class Notice:
 
     @classmethod
     def now(cls, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> Self:
-        """An event of this moment, in text that JSON and a terminal hold, whatever a file in it is called."""
+        """An event of this moment, in text that JSON and a terminal hold, whatever a file in it
+        is called.
+        """
         return cls(time.monotonic_ns(), kind, printable(detail)[:MAX_DETAIL_CHARACTERS], printable(who), since_ns)
 
 
@@ -106,7 +111,8 @@ class Notices:
     def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
         """Count an event, say it unless its kind floods, and hand it on.
 
-        `who` is the person that it comes from, if one; `since_ns` is when that began of which it tells, host time.
+        `who` is the person that it comes from, if one; `since_ns` is when that began of which it
+        tells, host time.
         """
         notice = Notice.now(kind, detail, who, since_ns)
         self.wrong_sky.see(kind, notice.detail, notice.host_ns, since_ns)
@@ -143,7 +149,9 @@ class Notices:
         self._hand_on(notice)
 
     def begin(self, kind: str, detail: str, since_ns: int | None = None) -> None:
-        """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has begun already."""
+        """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has
+        begun already.
+        """
         with self._lock:
             if kind in self._active:
                 return

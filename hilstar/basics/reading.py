@@ -1,6 +1,7 @@
 """Files that a user names: regular ones only, and of a bounded size.
 
-A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file: each is refused instead.
+A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file:
+each is refused instead.
 """
 
 import codecs
@@ -20,7 +21,8 @@ import msgspec
 
 from hilstar.basics.errors import InputError, cannot_read, shortened
 
-# What msgspec raises for bytes that are no JSON of the wanted form: for some that are no UTF-8 it is Python's own error.
+# What msgspec raises for bytes that are no JSON of the wanted form: for some that are no UTF-8 it
+# is Python's own error.
 NOT_JSON = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 HEAD_BYTES = 16
 MAX_LINE_CHARACTERS = 1_000_000
@@ -80,7 +82,9 @@ def add_kinds(kinds: Callable[[], Mapping[bytes, str]]) -> None:
 
 
 def kind_of(head: bytes) -> str | None:
-    """What a file is by its first bytes (HEAD_BYTES of them): "a zip archive" or the like; None where that says nothing."""
+    """What a file is by its first bytes (HEAD_BYTES of them): "a zip archive" or the like; None
+    where that says nothing.
+    """
     for kinds in (*[room() for room in _kinds_of_rooms], MAGIC):
         for magic, kind in kinds.items():
             if head.startswith(magic):
@@ -111,12 +115,15 @@ def by_number(path: Path) -> list[str | int]:
 
 
 def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[bytes]:
-    """A regular file, open for reading. `advice` is what to give instead, such as "give the path of a bench file".
+    """A regular file, open for reading. `advice` is what to give instead, such as "give the path of
+    a bench file".
 
-    Raises InputError for anything else (a pipe is not awaited), and for a file of more than `limit_bytes`.
+    Raises InputError for anything else (a pipe is not awaited), and for a file of more than
+    `limit_bytes`.
     """
     try:
-        _refuse_other(path, path.stat().st_mode, advice)  # before the open, which some devices take as a command
+        # before the open, which some devices take as a command
+        _refuse_other(path, path.stat().st_mode, advice)
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no file has such a name"
@@ -145,12 +152,16 @@ def read_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
 
 
 def read_text(path: Path, advice: str, limit_bytes: int) -> str:
-    """The text (UTF-8; a byte order mark is dropped) of a regular file of at most `limit_bytes`. Raises InputError."""
+    """The text (UTF-8; a byte order mark is dropped) of a regular file of at most `limit_bytes`.
+    Raises InputError.
+    """
     return as_text(path, read_bytes(path, advice, limit_bytes), advice)
 
 
 def as_text(path: Path, raw: bytes, advice: str) -> str:
-    """The text of a file's bytes. Raises InputError with the kind of file, or the first byte that is not UTF-8."""
+    """The text of a file's bytes. Raises InputError with the kind of file, or the first byte
+    that is not UTF-8.
+    """
     refuse_kind(path, raw[:HEAD_BYTES], advice)
     try:
         return raw.decode("utf-8-sig")
@@ -159,7 +170,9 @@ def as_text(path: Path, raw: bytes, advice: str) -> str:
 
 
 def refuse_kind(path: Path, head: bytes, advice: str) -> None:
-    """Refuse (InputError) a file whose first bytes say that it is no text, by the name of its kind."""
+    """Refuse (InputError) a file whose first bytes say that it is no text, by the name of its
+    kind.
+    """
     kind = kind_of(head)
     if kind is not None:
         raise cannot_read(path, f"it is {kind}", advice)

@@ -28,7 +28,8 @@ def conjugate(q: FloatArray) -> FloatArray:
 def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """Hamilton product a b: first the rotation b, then a."""
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    single = a.ndim == b.ndim == 1  # then Python's floats give the same bits, several times faster than arrays
+    # then Python's floats give the same bits, several times faster than arrays
+    single = a.ndim == b.ndim == 1
     aw, ax, ay, az = a.tolist() if single else np.moveaxis(a, -1, 0)
     bw, bx, by, bz = b.tolist() if single else np.moveaxis(b, -1, 0)
     product = (
@@ -41,7 +42,9 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def to_matrix(q: FloatArray) -> FloatArray:
-    """The matrices R (..., 3, 3) of unit quaternions (..., 4): v_cam = R v_icrs, so that rows are the camera's axes in ICRS."""
+    """The matrices R (..., 3, 3) of unit quaternions (..., 4): v_cam = R v_icrs, so that rows
+    are the camera's axes in ICRS.
+    """
     q = np.asarray(q, dtype=np.float64)
     w, x, y, z = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
     matrix = np.array(
@@ -74,7 +77,9 @@ def rotate(q: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def frame_turns(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """The rotations (n, 4) of components into frames that are turned by angles (n,) about their axis 0, 1 or 2."""
+    """The rotations (n, 4) of components into frames that are turned by angles (n,) about their
+    axis 0, 1 or 2.
+    """
     q = np.zeros((len(angle_rad), 4))
     q[:, 0], q[:, 1 + axis] = np.cos(angle_rad / 2), -np.sin(angle_rad / 2)
     return q
@@ -90,7 +95,9 @@ def to_rotation_vector(q: FloatArray) -> FloatArray:
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
-    """The quaternion (4,), w >= 0, of a rotation matrix (3, 3): the largest component first (Shepperd 1978)."""
+    """The quaternion (4,), w >= 0, of a rotation matrix (3, 3): the largest component first
+    (Shepperd 1978).
+    """
     trace = float(np.trace(matrix))
     squares = np.array([trace, *np.diag(matrix)])
     k = int(np.argmax(squares))
@@ -106,13 +113,16 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
 
 
 def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
-    """The unit vectors (..., 3) of right ascensions and declinations, degrees, in the axes that these are of."""
+    """The unit vectors (..., 3) of right ascensions and declinations, degrees, in the axes that
+    these are of.
+    """
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     return np.stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)), axis=-1)
 
 
 def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
-    """q_icrs_to_cam of a boresight and roll (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90) A1(dec-90) A3(roll).
+    """q_icrs_to_cam of a boresight and roll (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90)
+    A1(dec-90) A3(roll).
 
     At roll 0 the image has north up and east left.
     """
@@ -126,7 +136,8 @@ def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> Float
 def to_radec_roll_deg(q_icrs_to_cam: FloatArray) -> tuple[float, float, float]:
     """Boresight right ascension [0, 360), declination and roll [0, 360) of one attitude, degrees.
 
-    At a pole, where right ascension and roll are one angle, the right ascension comes out as `arctan2` has it.
+    At a pole, where right ascension and roll are one angle, the right ascension comes out as
+    `arctan2` has it.
     """
     r = to_matrix(q_icrs_to_cam)
     dec = np.arctan2(r[2, 2], np.hypot(r[2, 0], r[2, 1]))
@@ -138,16 +149,21 @@ def to_radec_roll_deg(q_icrs_to_cam: FloatArray) -> tuple[float, float, float]:
 
 
 def angle_between_rad(a: FloatArray, b: FloatArray) -> float:
-    """The angle of the rotation from attitude `a` to attitude `b`, 0 to pi; exact for tiny angles too."""
+    """The angle of the rotation from attitude `a` to attitude `b`, 0 to pi; exact for tiny
+    angles too.
+    """
     d = multiply(a, conjugate(b))
     return float(2 * np.arctan2(np.linalg.norm(d[..., 1:]), abs(d[..., 0])))
 
 
 def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
-    """The attitude at `fraction` of the shorter way from `a` to `b` (Shoemake 1985); unit length."""
+    """The attitude at `fraction` of the shorter way from `a` to `b` (Shoemake 1985); unit
+    length.
+    """
     if float(np.dot(a, b)) < 0:
         b = -b
-    # The half angle from both chords is well conditioned from 0 to pi/2; arccos of the dot product is not.
+    # The half angle from both chords is well conditioned from 0 to pi/2; arccos of the dot product
+    # is not.
     half = 2 * np.arctan2(np.linalg.norm(b - a), np.linalg.norm(b + a))
     if half < SMALL_RAD:
         return normalise(a + fraction * (b - a))
@@ -155,7 +171,9 @@ def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
 
 
 def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: float) -> FloatArray:
-    """The attitude after turning at a constant rate (of cam with respect to icrs, cam components): v_cam' = -omega x v_cam."""
+    """The attitude after turning at a constant rate (of cam with respect to icrs, cam
+    components): v_cam' = -omega x v_cam.
+    """
     vector = -0.5 * seconds * np.asarray(rate_cam_rad_s, dtype=np.float64)
     half = float(np.linalg.norm(vector))
     sinc = 1.0 - half * half / 6.0 if half < SMALL_RAD else np.sin(half) / half
@@ -164,7 +182,9 @@ def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: fl
 
 
 def rate_between_rad_s(earlier: FloatArray, later: FloatArray, seconds: float) -> FloatArray:
-    """The constant rate that turns `earlier` into `later` the shorter way (inverse of `propagate`)."""
+    """The constant rate that turns `earlier` into `later` the shorter way (inverse of
+    `propagate`).
+    """
     d = multiply(later, conjugate(earlier))
     if d[0] < 0:
         d = -d

@@ -1,4 +1,6 @@
-"""Percentiles, mean and deviation of a figure over a run of any length, in memory that does not grow."""
+"""Percentiles, mean and deviation of a figure over a run of any length, in memory that does not
+grow.
+"""
 
 import math
 
@@ -51,7 +53,8 @@ class RunningStatistics:
         if not len(values):
             return
         count, step = self.count + len(values), float(values.mean()) - self._mean
-        self._squares += float(((values - values.mean()) ** 2).sum()) + step**2 * self.count * len(values) / count  # Chan 1979
+        # Chan 1979
+        self._squares += float(((values - values.mean()) ** 2).sum()) + step**2 * self.count * len(values) / count
         self._mean += step * len(values) / count
         self.count, self.max = count, max(self.max, float(values.max()))
         place = (1 + np.log(np.maximum(np.abs(values) / MIN_SIZE, 1.0)) / STEP).astype(np.intp).clip(max=BINS)

@@ -233,7 +233,9 @@ class TextTable:
             yield " ".join(line.split()) + "\n" if blanks else line
 
     def _counted(self, line: int, cells: list[str]) -> list[str]:
-        """A row's cells where further ones are blank. Raises InputError for another number of them."""
+        """A row's cells where further ones are blank. Raises InputError for another number of
+        them.
+        """
         count = len(self.columns)
         rest = cells[count:]
         if len(cells) >= count and not any(map(str.strip, rest)):
@@ -429,7 +431,9 @@ def _scaled(text: str, size: Decimal) -> str:
 
 @contextmanager
 def open_table(path: Path, advice: str, limit_bytes: int) -> Iterator[TextTable]:
-    """A text table with its head read. Raises InputError, with `advice`, for what is no text table."""
+    """A text table with its head read. Raises InputError, with `advice`, for what is no text
+    table.
+    """
     with open_lines(path, advice, limit_bytes) as lines:
         yield table_of(path, advice, lines)
 
@@ -476,7 +480,9 @@ def _name_by_header(
 
 
 class Head(NamedTuple):
-    """The comments before a table, its first lines, the number of the first, and Excel's delimiter."""
+    """The comments before a table, its first lines, the number of the first, and Excel's
+    delimiter.
+    """
 
     comments: list[str]
     sample: list[str]
@@ -523,7 +529,9 @@ def split(line: str, delimiter: str) -> list[str]:
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
-    """What stands between the cells of a table's first lines, a header or a row before the others."""
+    """What stands between the cells of a table's first lines, a header or a row before the
+    others.
+    """
     best, best_rank = ",", (0, 0.0, 0)
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     for delimiter in DELIMITERS:
@@ -541,7 +549,9 @@ def delimiter_of(lines: Sequence[str]) -> str:
 
 
 def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> None:
-    """Name the columns of a table whose first line is a row, where the last comment has all names."""
+    """Name the columns of a table whose first line is a row, where the last comment has all
+    names.
+    """
     table.header = False
     table.columns = [Column("", "")] * count
     text = comments[-1].strip().lstrip("#%!;").strip() if comments else ""
@@ -554,7 +564,9 @@ def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> N
 
 
 def _skip_units(table: TextTable, rows: Sequence[list[str]], following: Iterator[str]) -> int:
-    """Read a line of units and one of dashes below the header, where they are; how many these are."""
+    """Read a line of units and one of dashes below the header, where they are; how many these
+    are.
+    """
     skipped = 0
     dashes = [bool(row) and len(row) == len(table.columns) and _is_rule(row) for row in rows[:2]]
     has_dashes = any(dashes)
@@ -665,7 +677,9 @@ def finite_numbers(
     cells: Iterable[str],
     advice: str,
 ) -> list[float]:
-    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for one not finite."""
+    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for one not
+    finite.
+    """
     numbers = []
     for name, cell in zip(columns, cells, strict=True):
         try:

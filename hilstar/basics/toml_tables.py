@@ -13,7 +13,8 @@ import msgspec
 
 from hilstar.basics.errors import did_you_mean, shortened
 
-EXAMPLES: dict[int, tuple[float, ...]] = {2: (1024, 1024), 3: (0.0, 0.0, 0.0), 4: (1.0, 0.0, 0.0, 0.0)}  # by length
+# by length
+EXAMPLES: dict[int, tuple[float, ...]] = {2: (1024, 1024), 3: (0.0, 0.0, 0.0), 4: (1.0, 0.0, 0.0, 0.0)}
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -22,7 +23,9 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of file: its outermost table, the page that describes its keys, and the words for msgspec's types."""
+    """A kind of file: its outermost table, the page that describes its keys, and the words for
+    msgspec's types.
+    """
 
     root: type[Table]
     reference: str
@@ -33,7 +36,8 @@ def explained(message: str, tables: dict[str, Any], kind: Kind) -> str:
     """The line for msgspec's `message` about `tables`, a file as it was read."""
     try:
         return _explain(message, tables, kind)
-    except (LookupError, TypeError, ValueError):  # a key of the user's own with brackets or quotes in it
+    except (LookupError, TypeError, ValueError):
+        # a key of the user's own with brackets or quotes in it
         return f"{shortened(message)}; see {kind.reference}"
 
 
@@ -71,11 +75,14 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
 
 
 def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
-    """An example of what the key takes, from what stands there: ", such as bits = 8"; "" where there is none."""
+    """An example of what the key takes, from what stands there: ", such as bits = 8"; "" where
+    there is none.
+    """
     if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value):
         return f", such as {field.name} = {shortened(value)}"
     kind = plain(field.type)
-    parts = next((part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None)  # X of `X | None`
+    # X of `X | None`
+    parts = next((part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None)
     if parts is None:
         return ""
     kinds = [plain(kind) for kind in get_args(parts)]
@@ -88,9 +95,11 @@ def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
 
 
 def toml_text(tables: Mapping[str, Any]) -> str:
-    """A file of plain keys, then a table for each dictionary; None and empty tables are left unsaid.
+    """A file of plain keys, then a table for each dictionary; None and empty tables are left
+    unsaid.
 
-    TOML writes numbers, truth values, plain text and lists as JSON does; a list of lists stands row by row.
+    TOML writes numbers, truth values, plain text and lists as JSON does; a list of lists stands row
+    by row.
     """
     plain_keys = {key: value for key, value in tables.items() if not isinstance(value, dict)}
     parts = {"": plain_keys} | {f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)}
@@ -111,12 +120,15 @@ def _written(value: Any) -> str:
 def _toml(value: Any) -> str:
     try:
         return shortened(msgspec.json.encode(value, enc_hook=str).decode())
-    except (ValueError, OverflowError, TypeError, RecursionError):  # a whole number of more than 64 bits
+    except (ValueError, OverflowError, TypeError, RecursionError):
+        # a whole number of more than 64 bits
         return shortened(value)
 
 
 def _choices(kind: Any) -> tuple[Any, ...]:
-    """The values of a key that has choices, those of X where it is `X | None`; none of another key."""
+    """The values of a key that has choices, those of X where it is `X | None`; none of another
+    key.
+    """
     parts = get_args(kind) if type(None) in get_args(kind) else (kind,)
     literal = [plain(part) for part in parts if get_origin(plain(part)) is Literal]
     return tuple(choice for part in literal for choice in get_args(part))

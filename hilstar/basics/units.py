@@ -17,7 +17,8 @@ NS_PER_US = 1_000
 NS_PER_MS = 1_000_000
 NS_PER_S = 1_000_000_000
 ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
-MAD_TO_SIGMA = 1.482602218505602  # from the median absolute deviation of a normal distribution: 1 / its upper quartile
+# from the median absolute deviation of a normal distribution: 1 / its upper quartile
+MAD_TO_SIGMA = 1.482602218505602
 ERROR_OF_MEDIAN = math.sqrt(math.pi / 2)  # in those of the mean, for normal errors
 LIGHT_M_S = 299_792_458.0  # SI, exact
 LIGHT_KM_S = LIGHT_M_S / 1000.0
@@ -129,7 +130,8 @@ def magnitude(ratio: "float | FloatArray") -> "float | FloatArray":
     return -2.5 * math.log10(ratio) if ratio > 0 else math.inf
 
 
-# OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and no newer one.
+# OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and
+# no newer one.
 GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))
 
 
@@ -151,7 +153,9 @@ def _known() -> frozenset[str]:
 
 
 def ascii_text(text: str) -> str:
-    """A unit's or a number's characters in ASCII where they have such a form: "e⁻" is e-, "µm" um."""
+    """A unit's or a number's characters in ASCII where they have such a form: "e⁻" is e-, "µm"
+    um.
+    """
     if text.isascii():
         return text
     for character, plain in ASCII_OF.items():

@@ -1,11 +1,13 @@
-"""Conditions under which the sky that is shown is wrong, though its attitudes are fresh: what each is, and how long it lasted.
+"""Conditions under which the sky that is shown is wrong, though its attitudes are fresh: what each
+is, and how long it lasted.
 
-A check of the attitudes begins a condition and ends it, as events of the run (`Notices.begin`, `Notices.end`). Everything else
-follows from these events: status line, page, `/health`, `/metrics` and the summary of a run; and, as the ledger keeps them, its
-report and its replay.
+A check of the attitudes begins a condition and ends it, as events of the run (`Notices.begin`,
+`Notices.end`). Everything else follows from these events: status line, page, `/health`, `/metrics`
+and the summary of a run; and, as the ledger keeps them, its report and its replay.
 
 Laws:
-1. A condition is found after it began: its event says since when it holds, and the frames from then on are wrong.
+1. A condition is found after it began: its event says since when it holds, and the frames from then
+   on are wrong.
 2. Conditions may overlap; a second is counted once.
 3. A run that ends ends its conditions.
 """
@@ -27,7 +29,9 @@ FOR_EVER_NS = 2**63 - 1
 
 
 class Condition(NamedTuple):
-    """A condition that holds: its kind, a line with figures and what to write instead, and since when (host time, ns)."""
+    """A condition that holds: its kind, a line with figures and what to write instead, and since
+    when (host time, ns).
+    """
 
     kind: str
     text: str
@@ -35,7 +39,9 @@ class Condition(NamedTuple):
 
 
 class ConditionTotal(msgspec.Struct, frozen=True):
-    """A kind of condition over a run: how often it began, for how long it held in all, and its first line."""
+    """A kind of condition over a run: how often it began, for how long it held in all, and its
+    first line.
+    """
 
     kind: str
     count: int
@@ -56,7 +62,9 @@ class _Span(NamedTuple):
 
 
 class WrongSky:
-    """The conditions of a run, from its events. Any thread may call any of its methods; host times, ns."""
+    """The conditions of a run, from its events. Any thread may call any of its methods; host
+    times, ns.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,7 +74,9 @@ class WrongSky:
         self.any = False  # one attribute, so that a frame costs nothing in a run without any
 
     def see(self, kind: str, text: str, host_ns: int, since_ns: int | None = None) -> None:
-        """Take an event of the run; one that neither begins nor ends a condition changes nothing."""
+        """Take an event of the run; one that neither begins nor ends a condition changes
+        nothing.
+        """
         if kind not in KINDS:
             return
         with self._lock:
@@ -91,7 +101,9 @@ class WrongSky:
             return [(kind, self._texts[kind]) for kind, spans in self._spans() if _covers(spans, host_ns)]
 
     def spans_ns(self) -> list[tuple[int, int]]:
-        """Begin and end of each time of a wrong sky, in order and apart; the end of one that goes on is FOR_EVER_NS."""
+        """Begin and end of each time of a wrong sky, in order and apart; the end of one that
+        goes on is FOR_EVER_NS.
+        """
         with self._lock:
             every = [span for _, spans in self._spans() for span in spans]
         return [(span.begin_ns, span.end_ns) for span in _merged(every)]

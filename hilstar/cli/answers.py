@@ -40,10 +40,12 @@ def answers(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Decode a tracker's answers by `[answers]`, live or recorded: each as a line, and why bytes were refused.
+    """Decode a tracker's answers by `[answers]`, live or recorded: each as a line, and why bytes
+    were refused.
 
-    With --explain each answer is compared with what is shown: --radec or --quaternion, or else the newest frame of a run with
-    --console, or what the sender of [attitude] says now, where that is a ZeroMQ stream.
+    With --explain each answer is compared with what is shown: --radec or --quaternion, or else the
+    newest frame of a run with --console, or what the sender of [attitude] says now, where that is a
+    ZeroMQ stream.
     """
     from collections import Counter, deque
 
@@ -108,7 +110,9 @@ def _shown_now(file: "BenchFile") -> "FloatArray | None":
 
 
 def _shown_by_page() -> "FloatArray | None":
-    """The attitude of the newest frame of the run whose page is at the usual address; None where there is none."""
+    """The attitude of the newest frame of the run whose page is at the usual address; None where
+    there is none.
+    """
     import http.client
 
     import msgspec

@@ -35,7 +35,9 @@ GROUPS = {
 
 
 class EarlyEnd(Exception):
-    """Carries an EOFError through typer, which would take it for Ctrl-D, print an empty line and drop it."""
+    """Carries an EOFError through typer, which would take it for Ctrl-D, print an empty line and
+    drop it.
+    """
 
     def __init__(self, error: EOFError) -> None:
         super().__init__(str(error))
@@ -70,7 +72,9 @@ def print_version(wanted: bool) -> None:
 def hilstar(
     _: Annotated[bool, Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")] = False,
 ) -> None:
-    """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out."""
+    """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values
+    out.
+    """
 
 
 def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
@@ -86,7 +90,9 @@ def public(name: str) -> str:
 
 @cache
 def application(only: str | None = None) -> typer.Typer:
-    """The commands of `hilstar`, or `only` the command or group of a name: each imports its file, and all take 50 ms."""
+    """The commands of `hilstar`, or `only` the command or group of a name: each imports its
+    file, and all take 50 ms.
+    """
     app = typer.Typer(
         cls=Commands,
         pretty_exceptions_enable=False,
@@ -118,7 +124,8 @@ def run(words: list[str]) -> Any:
 
     Raises EarlyEnd, and what typer and the command raise.
     """
-    if not words or (len(words) == 1 and words[0] in GROUPS):  # no command was given: the help lists them
+    # no command was given: the help lists them
+    if not words or (len(words) == 1 and words[0] in GROUPS):
         run([*words, "--help"])
         return InputError.exit_code
     names = {public(name) for names in COMMANDS.values() for name in names} | GROUPS.keys()

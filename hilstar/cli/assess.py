@@ -41,7 +41,9 @@ def assess(
     ] = 12,
     as_json: Json = False,
 ) -> None:
-    """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
+    """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock,
+    availability, wrong answers.
+    """
     from hilstar.instruments.assess.assessment import AssessSettings, assess_files
     from hilstar.instruments.assess.report import budget_of, lines_of, write_page, write_tables
 

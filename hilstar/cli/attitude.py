@@ -42,7 +42,9 @@ def attitude(
     ] = False,
     as_json: options.Json = False,
 ) -> None:
-    """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
+    """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest
+    stars in view.
+    """
     from hilstar.server.bench.bench_file import dated, read_bench_file
 
     live = source.suffix.lower() == ".toml"

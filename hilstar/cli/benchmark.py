@@ -25,7 +25,9 @@ def benchmark(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Time a whole frame and its stages, and the virtual tracker, beside NumPy, numba, GalSim, photutils and sep."""
+    """Time a whole frame and its stages, and the virtual tracker, beside NumPy, numba, GalSim,
+    photutils and sep.
+    """
     import numpy as np
 
     from hilstar.instruments.study.speed import benchmark as speed

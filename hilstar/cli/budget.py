@@ -1,4 +1,6 @@
-"""hilstar budget: which magnitudes a bench can show and how well, or the noise of its tracker's stars."""
+"""hilstar budget: which magnitudes a bench can show and how well, or the noise of its tracker's
+stars.
+"""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,6 @@
-"""hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale by stars."""
+"""hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale
+by stars.
+"""
 
 import json
 from pathlib import Path
@@ -34,7 +36,8 @@ def dots(
 ) -> None:
     """Make frames of dots for `calibrate geometric`: each dot blinks its own code.
 
-    They stand where the tracker sees the screen, by the bench file's lens, or by its geometry file once it has one.
+    They stand where the tracker sees the screen, by the bench file's lens, or by its geometry file
+    once it has one.
     """
     import numpy as np
 
@@ -78,7 +81,9 @@ def geometric(
     plot: Annotated[Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
+    """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
+    saw.
+    """
     from hilstar.instruments.calibrate.geometric.calibration import calibrate_files, lines_of, summary_of, write_calibrated
     from hilstar.server.bench.bench_file import read_bench_file
 
@@ -102,7 +107,9 @@ def psf(
     plot: Annotated[Path | None, Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate geometric`."""
+    """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate
+    geometric`.
+    """
     from hilstar.instruments.calibrate.effective_psf import draw_effective, effective_psf, lines_of, summary_of
     from hilstar.optics.glass.psf_file import write_glass
     from hilstar.server.bench.bench_file import read_bench_file
@@ -120,7 +127,9 @@ def psf(
 
 
 def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
-    """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
+    """The identity of the display that was measured, where this machine has it, of those sides;
+    None elsewhere.
+    """
     from hilstar.display.window.this_monitor import identity_here
 
     identity = identity_here(display)
@@ -155,7 +164,9 @@ def alignment(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find how the tracker stands before the screen from the attitudes that it reports, for one that gives nothing else."""
+    """Find how the tracker stands before the screen from the attitudes that it reports, for one
+    that gives nothing else.
+    """
     from hilstar.instruments.calibrate.alignment import align_files, lines_of, summary_of, write_alignment
     from hilstar.server.bench.bench_file import read_bench_file
 
@@ -285,7 +296,9 @@ def scale(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Scale the light by the tracker: what one pixel at white is worth, from its readings of stars shown."""
+    """Scale the light by the tracker: what one pixel at white is worth, from its readings of
+    stars shown.
+    """
     from hilstar.instruments.calibrate.scale import UNSURE_MAG, scale_by_tracker, with_flux_at_white
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.build import open_bench

@@ -98,7 +98,8 @@ def campaign(
                 show_cases(this, directory, shown_bench, frames, listener)
         elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
-        from hilstar.instruments.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
+        # charts and statistics, once there is a table
+        from hilstar.instruments.campaign.results import lines_of, write_results
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
         lines, not_met = lines_of(summary), False

@@ -25,7 +25,9 @@ def catalogue(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the stars as the tracker sees them: places with errors, types, electrons per second, instrument magnitudes."""
+    """Write the stars as the tracker sees them: places with errors, types, electrons per second,
+    instrument magnitudes.
+    """
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
 

@@ -51,9 +51,11 @@ def certify(
     seed: Annotated[int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
-    """State how sure a bench is: the light, places, attitude and latency of stars, with the uncertainty of each.
+    """State how sure a bench is: the light, places, attitude and latency of stars, with the
+    uncertainty of each.
 
-    Without --grab and --virtual nothing is read, and the calibration files say it. DIR has index.html and certificate.json.
+    Without --grab and --virtual nothing is read, and the calibration files say it. DIR has
+    index.html and certificate.json.
     """
     from hilstar.server.bench.bench_file import read_bench_file
 

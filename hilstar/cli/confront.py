@@ -26,7 +26,9 @@ def confront(
     as_json: Json = False,
     strict: Annotated[bool, Option("--strict", help="Exit with 1 where an image is beyond the limits.")] = False,
 ) -> None:
-    """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts against them."""
+    """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts
+    against them.
+    """
     from hilstar.instruments.confront.files import read_tracker_file
     from hilstar.instruments.confront.images import parse_utc
     from hilstar.instruments.confront.run import OUTPUTS

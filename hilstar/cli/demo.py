@@ -31,7 +31,8 @@ HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
 MAX_MISSED = 0.01  # share of frames from which the budget is no longer the tracker's alone
 FREE_PORT = "tcp://127.0.0.1:*"
-BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01  # the tracker of --loop
+# the tracker of --loop
+BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01
 PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
 PLANTED += ["--wrong", str(WRONG)]
 
@@ -51,9 +52,11 @@ def demo(
     console_name: running.ConsoleName = None,
     as_json: Json = False,
 ) -> None:
-    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out.
+    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket,
+    frames out.
 
-    Where frames show an old sky, because attitudes came too late, the last line says so and the exit code is 1.
+    Where frames show an old sky, because attitudes came too late, the last line says so and the
+    exit code is 1.
     """
     import numpy as np
 
@@ -131,7 +134,9 @@ def _watching(
 
 @contextmanager
 def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> "Iterator[TrackerBeside]":
-    """The demo's tracker, whose answers come by a socket of its own; the bench file that names it is in `folder`."""
+    """The demo's tracker, whose answers come by a socket of its own; the bench file that names
+    it is in `folder`.
+    """
     make_directory(folder)
     with temporary_folder("loop") as place:
         endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
@@ -141,7 +146,9 @@ def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> 
 
 
 class TrackerBeside:
-    """The demo's tracker, a process of its own, with its planted errors, and the budget that is found of it."""
+    """The demo's tracker, a process of its own, with its planted errors, and the budget that is
+    found of it.
+    """
 
     def __init__(self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int) -> None:
         self.ledger, self.bench_file, self._page = folder / "loop.mcap", bench_file, folder / "budget.html"
@@ -172,7 +179,9 @@ class TrackerBeside:
         return self._feed.watched
 
     def report(self, live: object, as_json: bool) -> None:
-        """Print the budget of the tracker's answers beside what was planted; `live` are the run's own figures."""
+        """Print the budget of the tracker's answers beside what was planted; `live` are the
+        run's own figures.
+        """
         from hilstar.instruments.assess.assessment import AssessSettings, assess_files
         from hilstar.instruments.assess.report import lines_of, write_page
         from hilstar.instruments.simulate.tracker_process import ROLL

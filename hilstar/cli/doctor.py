@@ -25,7 +25,9 @@ Report = Annotated[
 
 
 def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = False) -> None:
-    """Check this machine's OpenGL, displays, links and files, and say what is missing; of a bench file, what it means."""
+    """Check this machine's OpenGL, displays, links and files, and say what is missing; of a
+    bench file, what it means.
+    """
     from hilstar.server.doctor import examine, examine_bench, row, table
 
     if report:

@@ -1,4 +1,6 @@
-"""The entry point of the command line: runs a command, and turns each refusal into one line and an exit code."""
+"""The entry point of the command line: runs a command, and turns each refusal into one line and
+an exit code.
+"""
 
 import contextlib
 import io
@@ -23,11 +25,14 @@ from hilstar.server.console.terminal import fail
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
-READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # longest wait for a slow reader of stderr, without and with a signal
+# longest wait for a slow reader of stderr, without and with a signal
+READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1
 INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem")
-NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several numbers, with commas
+# several numbers, with commas
+NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word that a shell makes of numbers with spaces between them
+# a word that a shell makes of numbers with spaces between them
+NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")
 ELSEWHERE = dict.fromkeys(("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays")
 
 
@@ -37,20 +42,24 @@ def main() -> NoReturn:
     queue_stderr()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name is printed with the bytes that it came with
+        # a file's name is printed with the bytes that it came with
+        sys.stdout.reconfigure(errors="surrogateescape")
     code = run_command(sys.argv[1:])
     finish_stderr(READER_WAITS_S if interrupts.caught() is None else STOPPED_READER_WAITS_S)
     interrupts.leave(code)
 
 
 def _kinds_of_logs() -> Mapping[bytes, str]:
-    from hilstar.attitude.logs.log_formats import kinds  # 0.1 s, where a file of another kind is refused
+    # 0.1 s, where a file of another kind is refused
+    from hilstar.attitude.logs.log_formats import kinds
 
     return kinds()
 
 
 def run_command(words: list[str]) -> int:
-    """Run a command line in this process. Returns its exit code; a refusal is one line on stderr."""
+    """Run a command line in this process. Returns its exit code; a refusal is one line on
+    stderr.
+    """
     add_kinds(_kinds_of_logs)
     try:
         if not writes_to_stdout(words):
@@ -88,7 +97,8 @@ def _run(words: list[str]) -> int:
         _let_go_of_stdout()
         return 1
     except Exception as error:
-        # typer's usage errors have no public base class in all its versions; they can format themselves.
+        # typer's usage errors have no public base class in all its versions; they can format
+        # themselves.
         if hasattr(error, "format_message"):
             fail(usage_line(error, words), InputError.exit_code)
         _fail_for_the_machine(error)
@@ -131,7 +141,9 @@ def _missing_file(words: list[str]) -> str | None:
 
 
 def _spaced_numbers(words: list[str]) -> str | None:
-    """The line for an option whose numbers have spaces between them, such as --radec 84.057 -1.2 0; None if there is none."""
+    """The line for an option whose numbers have spaces between them, such as --radec 84.057 -1.2
+    0; None if there is none.
+    """
     for k, word in enumerate(words):
         option, is_joined, first = word.partition("=")
         rest = ([first] if is_joined else []) + words[k + 1 :]
@@ -143,7 +155,9 @@ def _spaced_numbers(words: list[str]) -> str | None:
 
 
 def _fail_for_the_machine(error: Exception) -> None:
-    """Refuse in one line what the machine refuses: a full disk, a file that went away, not enough memory."""
+    """Refuse in one line what the machine refuses: a full disk, a file that went away, not
+    enough memory.
+    """
     if isinstance(error, OSError) and error.strerror:
         what = "stdout, or a file that it names"
         if isinstance(error.filename, str | bytes):

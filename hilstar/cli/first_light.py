@@ -86,9 +86,11 @@ def first_light(
     console_name: ConsoleName = None,
     as_json: Json = False,
 ) -> None:
-    """Bring up a bench: mounting, focus, warm-up, geometry, light, full scale, delay and verification, with a page at the end.
+    """Bring up a bench: mounting, focus, warm-up, geometry, light, full scale, delay and
+    verification, with a page at the end.
 
-    Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
+    Sets the bench file's keys; SESSION keeps the file as it was, the calibration files,
+    session.json and first-light.html.
     """
     from hilstar.instruments.calibrate.first_light.page import write_page
     from hilstar.instruments.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
@@ -135,7 +137,9 @@ def first_light(
 def _shown(
     listener: "PageListener | None", control: bool, file: "files.BenchFile"
 ) -> "Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]":
-    """The audience of a session's lines and patterns: the terminal and, if there is one, the page."""
+    """The audience of a session's lines and patterns: the terminal and, if there is one, the
+    page.
+    """
     if listener is None:
         yield say, lambda pattern: None
         return

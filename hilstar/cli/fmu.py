@@ -24,7 +24,9 @@ EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 def fmu(
     bench_file: BenchFile, output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")]
 ) -> None:
-    """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and answered attitude out."""
+    """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and
+    answered attitude out.
+    """
     from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, FMU)

@@ -49,7 +49,8 @@ def frame(
             explain_bench(bench, t_ns)
         effects = None
         if wrong is not None:
-            from hilstar.server.bench.fault_views import faults_at  # takes 20 ms, with the random numbers of its light
+            # takes 20 ms, with the random numbers of its light
+            from hilstar.server.bench.fault_views import faults_at
 
             effects = faults_at(bench, wrong, t_ns or 0)
         shot = bench.frame(q, t_ns=t_ns, faults=effects)
@@ -109,7 +110,9 @@ def clipped_text(loss_mag: dict[int | str, float]) -> str:
 
 
 def left_out(truth: Any) -> dict[str, float | int]:
-    """The stars in view that the monitor cannot show: their number, and their share of all stars' light."""
+    """The stars in view that the monitor cannot show: their number, and their share of all
+    stars' light.
+    """
     stars = truth[truth["name"] == ""]
     missing = stars["electrons_per_s"][~stars["drawn"]]
     total = float(stars["electrons_per_s"].sum())

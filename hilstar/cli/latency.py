@@ -27,7 +27,9 @@ def latency(
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
+    """Measure the latency from swap to light, by a photodiode over the screen's square and the
+    run's ledger.
+    """
     from hilstar.instruments.calibrate import latency as by_diode
 
     check_directory("-o", output)

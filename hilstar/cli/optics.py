@@ -1,4 +1,6 @@
-"""hilstar optics: the file of a tracker's glass, from a prescription, a map of images, or a pupil's aberrations."""
+"""hilstar optics: the file of a tracker's glass, from a prescription, a map of images, or a
+pupil's aberrations.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,7 +33,9 @@ def map_(
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
 ) -> None:
-    """Make a tracker's glass of measured or simulated PSF images at field points and wavelengths."""
+    """Make a tracker's glass of measured or simulated PSF images at field points and
+    wavelengths.
+    """
     from hilstar.optics.glass.maps import glass_of_map
 
     check_ending("-o", output, FITS)
@@ -48,7 +52,9 @@ def zernike(
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
 ) -> None:
-    """Make a tracker's glass of an aperture and Zernike or Seidel coefficients, by diffraction (needs hilstar[optics])."""
+    """Make a tracker's glass of an aperture and Zernike or Seidel coefficients, by diffraction
+    (needs hilstar[optics]).
+    """
     from hilstar.optics.glass.zernike import glass_of_pupil
 
     check_ending("-o", output, FITS)
@@ -82,7 +88,8 @@ def lens(
 ) -> None:
     """Make a tracker's glass of a lens's prescription, by tracing it (needs hilstar[lens]).
 
-    Wavelengths and the field are the prescription's; pixel pitch and resolution those of --bench, or as given.
+    Wavelengths and the field are the prescription's; pixel pitch and resolution those of --bench,
+    or as given.
     """
     from hilstar.optics.glass.prescription import Plate, glass_of_prescription
     from hilstar.server.bench.bench_file import read_bench_file

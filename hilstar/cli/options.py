@@ -1,4 +1,5 @@
-"""Options that several commands share, and parsers of options that hold more than one word or number.
+"""Options that several commands share, and parsers of options that hold more than one word or
+number.
 
 A parser takes a text and returns a value. Each refusal shows the form to write.
 """
@@ -86,9 +87,11 @@ def check_files(
     kept: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Refuse (InputError) outputs that are inputs or one and the same file, and `kept` if it exists, before anything is done.
+    """Refuse (InputError) outputs that are inputs or one and the same file, and `kept` if it
+    exists, before anything is done.
 
-    The bench file and all files that it names count as inputs; `kept` is an output that cannot be made again.
+    The bench file and all files that it names count as inputs; `kept` is an output that cannot be
+    made again.
     """
     named = [] if file is None else files_named_in(file.path, file.text)
     check_outputs([*inputs, *named], [*outputs, kept])
@@ -98,7 +101,9 @@ def check_files(
 
 
 def with_values(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone, an address after --console, --darks for each."""
+    """The command line with a share after each fault option that stands alone, an address after
+    --console, --darks for each.
+    """
     complete: list[str] = []
     several = False  # --darks takes files up to the next option
     for k, word in enumerate(words):
@@ -127,7 +132,9 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
 
 
 def parse_at(command: str, at_s: float | None, config: "BenchConfig", timed: bool = False) -> int | None:
-    """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where nothing changes with time."""
+    """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where
+    nothing changes with time.
+    """
     from hilstar.server.bench.config.bench_config import has_observer
 
     if at_s is None:

@@ -15,7 +15,9 @@ def report(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json.")],
     as_json: Json = False,
 ) -> None:
-    """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
+    """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events
+    and memory.
+    """
     from hilstar.server.console.report import report as write_report
     from hilstar.server.record.report import table_rows
 

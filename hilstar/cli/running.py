@@ -1,4 +1,6 @@
-"""Parts of the commands that run a bench: its screen, its ledger, its page, what is said of it, and the end of a run."""
+"""Parts of the commands that run a bench: its screen, its ledger, its page, what is said of it,
+and the end of a run.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -101,7 +103,9 @@ FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://1
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
-    """Explain the attitudes' source, that of the stars, the choices within the tolerance, and bodies that are discs then."""
+    """Explain the attitudes' source, that of the stars, the choices within the tolerance, and
+    bodies that are discs then.
+    """
     from hilstar.optics.layers.diffuse import DiffuseLayer
     from hilstar.server.bench.effort_report import effort_lines
     from hilstar.server.bench.moving import observer_lines, satellite_lines, wide_bodies
@@ -120,7 +124,9 @@ def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] 
 
 
 def effort_of_run(bench: Any, explain: bool, as_json: bool) -> dict[str, dict[str, Any]]:
-    """The key "effort" of a run's JSON, where the bench leaves something to its tolerance or it is to be explained; else {}."""
+    """The key "effort" of a run's JSON, where the bench leaves something to its tolerance or it
+    is to be explained; else {}.
+    """
     asked = bench.effort.asked
     chosen = asked.effort == "auto" or asked.quantisation == "auto"
     return explained_effort(bench, as_json and (explain or chosen))
@@ -140,7 +146,8 @@ def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, 
         from hilstar.display.render.context import create_context
         from hilstar.server.bench.build import open_bench
 
-        with open_bench(file, create_context(file.config.render.gpu), timed=timed) as bench:  # NumPy is too slow for a stream
+        # NumPy is too slow for a stream
+        with open_bench(file, create_context(file.config.render.gpu), timed=timed) as bench:
             yield bench, None
         return
     from hilstar.server.screen.gate import open_screen
@@ -164,7 +171,9 @@ def say_of_light(bench: Any) -> None:
 
 
 def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
-    """Warn of a length in the bench file that is probably in another unit than its key; else of a star that is too wide."""
+    """Warn of a length in the bench file that is probably in another unit than its key; else of
+    a star that is too wide.
+    """
     fault = star.fault()
     if fields.warning is not None:
         say_units(fields)
@@ -173,7 +182,9 @@ def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
 
 
 def say_seen(bench: Any) -> dict[str, Any]:
-    """Say what screen and tracker see and how wide a star is then, with what is wrong of it; both for the run's summary."""
+    """Say what screen and tracker see and how wide a star is then, with what is wrong of it;
+    both for the run's summary.
+    """
     from hilstar.server.bench.cameras import fields_of_view
     from hilstar.server.bench.star_size import star_size
 
@@ -186,7 +197,9 @@ def say_seen(bench: Any) -> dict[str, Any]:
 
 
 def say_units_of(file: "BenchFile") -> None:
-    """Warn of a length of a bench file that is probably another quantity, or in another unit than its key."""
+    """Warn of a length of a bench file that is probably another quantity, or in another unit
+    than its key.
+    """
     from hilstar.server.bench.cameras import fields_of_view
 
     say_units(fields_of_view(file.config, file.folder))
@@ -199,7 +212,9 @@ def say_units(fields: "FieldsOfView") -> None:
 
 
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":
-    """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
+    """The beat between the tracker's exposures and the screen's refresh, with a line where it
+    matters.
+    """
     from hilstar.server.sync import beat_line, beat_of
 
     measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
@@ -212,7 +227,9 @@ def say_beat(bench: Any, screen: Any) -> "BeatSummary":
 
 @contextmanager
 def optional_pulse(file: "BenchFile", notices: Notices) -> "Iterator[FramePulse | None]":
-    """The bench file's pulse at each frame; None without one. Raises InputError where its port cannot be opened."""
+    """The bench file's pulse at each frame; None without one. Raises InputError where its port
+    cannot be opened.
+    """
     from hilstar.server.frame_pulse import FramePulse
 
     settings = file.config.sync
@@ -225,7 +242,9 @@ def optional_pulse(file: "BenchFile", notices: Notices) -> "Iterator[FramePulse 
 
 @contextmanager
 def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", screen: Any) -> "Iterator[LiveAnswers | None]":
-    """The tracker's answers while this is open; None where the bench file names none. Raises InputError."""
+    """The tracker's answers while this is open; None where the bench file names none. Raises
+    InputError.
+    """
     if bench.config.answers is None:
         yield None
         return
@@ -242,7 +261,9 @@ def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", scree
 
 @contextmanager
 def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> "Iterator[FrameFeed | None]":
-    """The feed of the run's frames to watchers; None without an endpoint. Raises InputError where it cannot be bound."""
+    """The feed of the run's frames to watchers; None without an endpoint. Raises InputError
+    where it cannot be bound.
+    """
     if endpoint is None:
         yield None
         return
@@ -288,7 +309,9 @@ def optional_scenario(path: Path | None) -> "Scenario | None":
 def run_with_faults(
     bench: Any, scenario: "Scenario | None", notices: Notices, ledger: "LedgerSwitch", recording: "Recording | None" = None
 ) -> "Iterator[AnyFaults | None]":
-    """The faults of a run, from its scenario and stream or from the run that is replayed; None for none."""
+    """The faults of a run, from its scenario and stream or from the run that is replayed; None
+    for none.
+    """
     from hilstar.server.bench.scenario import NO_SCENARIO
     from hilstar.server.faults import ReplayedFaults, RunFaults
 
@@ -318,9 +341,11 @@ def end_of_run(
     as_json: bool,
     strict: bool = False,
 ) -> None:
-    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed, or the run is not `strict`.
+    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed, or
+    the run is not `strict`.
 
-    Raises MachineError where the window went away or the GPU was lost. A run without an attitude is the caller's.
+    Raises MachineError where the window went away or the GPU was lost. A run without an attitude is
+    the caller's.
     """
     if ledger.last is not None:
         summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
@@ -364,7 +389,9 @@ def page_listener(
 def scpi_listener(
     file: "BenchFile", scpi: str | None, page: "PageListener | None", token: str | None
 ) -> "Iterator[PageListener | None]":
-    """SCPI's listening socket, with the page's token if that has one; None without --scpi. Raises InputError."""
+    """SCPI's listening socket, with the page's token if that has one; None without --scpi.
+    Raises InputError.
+    """
     from hilstar.server.console.listener import PageListener, parse_address
 
     if scpi is None:
@@ -420,7 +447,9 @@ def followed(
     frames: "FrameFeed | None" = None,
     scpi: "PageListener | None" = None,
 ) -> "Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]":
-    """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its follower, their requests."""
+    """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its
+    follower, their requests.
+    """
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
         sinks.append(frames.see)

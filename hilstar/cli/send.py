@@ -52,7 +52,9 @@ def send(
     statements: options.LogStatements = options.NOTHING_STATED,
     as_json: options.Json = False,
 ) -> None:
-    """Send a log or a constant rotation over ZeroMQ, UDP or a serial line, with the faults of a bad cable on request."""
+    """Send a log or a constant rotation over ZeroMQ, UDP or a serial line, with the faults of a
+    bad cable on request.
+    """
     import numpy as np
 
     from hilstar.attitude.wire.keys import CurveKeys
@@ -80,7 +82,9 @@ def send(
 
 
 def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
-    """`advance`, which keeps this process prompt, too: it stands for another machine, which no display here delays."""
+    """`advance`, which keeps this process prompt, too: it stands for another machine, which no
+    display here delays.
+    """
     if not is_command():
         return advance
     priority = PromptWhileLight()

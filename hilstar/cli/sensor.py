@@ -20,7 +20,9 @@ def import_(
     output: Output,
     as_json: Json = False,
 ) -> None:
-    """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet, and its curves."""
+    """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet,
+    and its curves.
+    """
     from hilstar.instruments.calibrate.sensor import import_emva
 
     _check(output)
@@ -36,7 +38,9 @@ def measure(
     output: Output,
     as_json: Json = False,
 ) -> None:
-    """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write [tracker.detector]."""
+    """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write
+    [tracker.detector].
+    """
     from hilstar.instruments.calibrate.sensor import measure_sensor
 
     _check(output)

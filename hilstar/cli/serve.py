@@ -1,4 +1,6 @@
-"""hilstar serve: the live attitude stream on the monitor; of a file with `heads`, one process per head beside one source."""
+"""hilstar serve: the live attitude stream on the monitor; of a file with `heads`, one process
+per head beside one source.
+"""
 
 import math
 from contextlib import ExitStack
@@ -36,7 +38,8 @@ FedBy = Annotated[str | None, Option("--fed-by", hidden=True)]
 
 
 def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json: bool) -> None:
-    """Serve every head until its end, and print what each reported; exit code 4 if none ever had an attitude.
+    """Serve every head until its end, and print what each reported; exit code 4 if none ever had an
+    attitude.
 
     The page of head k is at the port of `console` plus k.
     """
@@ -90,7 +93,9 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
 
 
 def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
-    """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
+    """A head's link to the process that has the source, with which it ends; `fed_by` is that
+    one's endpoint and process id.
+    """
     from hilstar.attitude.wire.source import Mounting, SentAttitudes
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
     from hilstar.server.bench.config.attitude import PACKET_SOURCES
@@ -99,7 +104,8 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     end_with_parent(int(parent))
     sent = SentAttitudes(file.config.attitude.convention, Mounting(file.config.tracker.q_body_to_cam))
     decoder = FedDecoder(sent)
-    # Only packets have the key of a convention; the other sources have one of their own, and refuse it.
+    # Only packets have the key of a convention; the other sources have one of their own, and refuse
+    # it.
     of_packets = file.config.attitude.source in PACKET_SOURCES
     decoder.conventions = replace(decoder.conventions, source="the source of several heads", of_packets=of_packets)
     return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
@@ -129,7 +135,9 @@ def serve(
     head_of: HeadOf = None,
     fed_by: FedBy = None,
 ) -> None:
-    """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of each."""
+    """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of
+    each.
+    """
     from hilstar.server.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
@@ -163,7 +171,8 @@ def serve(
         running.scpi_listener(file, scpi, listener, token) as instrument,
         _source(file, fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
-        # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are those of any other machine.
+        # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are
+        # those of any other machine.
         running.shown_bench(file, headless, windowed, force, timed=not file.config.attitude.lockstep) as (bench, screen),
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept) as wrong,
@@ -212,7 +221,9 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
 
 
 def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
-    """The run as its page says it; where SCPI steers, with the port of the link to which it sends."""
+    """The run as its page says it; where SCPI steers, with the port of the link to which it
+    sends.
+    """
     from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude

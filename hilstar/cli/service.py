@@ -85,7 +85,9 @@ def install(
     to_stdout: Annotated[bool, Option("--print", help="Print the unit, and write nothing.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
+    """Write a systemd unit of this user that serves a bench: watched, and back within seconds
+    whenever it ends.
+    """
     from hilstar.server.bench.bench_file import read_bench_file
 
     read_bench_file(bench_file)
@@ -171,7 +173,9 @@ def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAd
 
 
 def can_confine() -> bool:
-    """Whether this user may drop capabilities: that takes a user namespace, which some systems allow only to root."""
+    """Whether this user may drop capabilities: that takes a user namespace, which some systems
+    allow only to root.
+    """
     import ctypes  # 3 ms, and every command imports this module
 
     libc = ctypes.CDLL(None)
@@ -198,7 +202,8 @@ def units_folder(environment: Mapping[str, str] = os.environ) -> Path:
 def unit_text(
     path: Path, bench: Path, options: list[str], confined: bool = True, environment: Mapping[str, str] = os.environ
 ) -> str:
-    """The unit at `path` that serves a bench file with these options of `hilstar serve`, from this folder.
+    """The unit at `path` that serves a bench file with these options of `hilstar serve`, from this
+    folder.
 
     A `confined` one drops its capabilities, if `can_confine`.
     """

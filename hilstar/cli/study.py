@@ -61,7 +61,9 @@ def study(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Draw charts and tables of what each choice costs in accuracy and in time, and of where methods fail."""
+    """Draw charts and tables of what each choice costs in accuracy and in time, and of where
+    methods fail.
+    """
     check_directory("-o", output)
     refuse_unused(what, bench, radec, images)
     place = None if radec is None else parse_radec(radec)
@@ -112,7 +114,9 @@ def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int],
 
 
 def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float, float] | None) -> list[str]:
-    """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a place; what it found."""
+    """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a
+    place; what it found.
+    """
     from hilstar.instruments.study import outputs, rapp
     from hilstar.instruments.study.fields import fields_of
     from hilstar.server.bench.bench_file import read_bench_file
@@ -127,7 +131,9 @@ def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
-    """Run a study; what it found, and whether everything was right (None: its times cannot be judged)."""
+    """Run a study; what it found, and whether everything was right (None: its times cannot be
+    judged).
+    """
     make_directory(output)
     study_of = import_module(f"hilstar.instruments.study.{what}{'.run' if what in ROOMS else ''}")
     if what in TIMED:

@@ -80,7 +80,9 @@ def tracker(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """The bench's virtual tracker before the running display: it watches the frames, and answers in real time."""
+    """The bench's virtual tracker before the running display: it watches the frames, and answers
+    in real time.
+    """
     if is_command():
         stand_back()
     import numpy as np
@@ -127,7 +129,9 @@ def tracker(
 
 
 def stand_back() -> None:
-    """Take one core, and that after a display on this machine: the process stands for another machine."""
+    """Take one core, and that after a display on this machine: the process stands for another
+    machine.
+    """
     for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     with suppress(OSError):

@@ -89,7 +89,9 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
 
 
 def _proposed(file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool) -> dict[str, Any]:
-    """The keys of --propose and --write in the JSON object; the lines are printed unless that is wanted."""
+    """The keys of --propose and --write in the JSON object; the lines are printed unless that is
+    wanted.
+    """
     from hilstar.instruments.verify.proposals import proposal_lines, propose, write_proposal
 
     if verdict.passed:

@@ -1,8 +1,10 @@
-"""The ten sums over a star's pixels that `exact` balances, so that any centroider finds its light and its place.
+"""The ten sums over a star's pixels that `exact` balances, so that any centroider finds its light
+and its place.
 
-A centroider's error is a weighted sum of the errors of the pixels, and centroiders differ by their weights. Those of all are
-near the span of ten: light and first moments of all pixels, the same under a Gaussian (a fitted PSF and a Gaussian window,
-before and after the tracker's own blur), and moments in boxes of 3 x 3 and 5 x 5 of the tracker's pixels (centres of mass).
+A centroider's error is a weighted sum of the errors of the pixels, and centroiders differ by their
+weights. Those of all are near the span of ten: light and first moments of all pixels, the same
+under a Gaussian (a fitted PSF and a Gaussian window, before and after the tracker's own blur), and
+moments in boxes of 3 x 3 and 5 x 5 of the tracker's pixels (centres of mass).
 """
 
 import math
@@ -21,9 +23,10 @@ BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulat
 class Weights:
     """Weights of the sums in a squared error, in light or light times 1 px.
 
-    A star of `few_steps` steps weighs its light twice; its flux is then as near as the panel's step allows. `last_light` weighs
-    the light in the last choice, after which no pixel can make up for it. `window_blurs` is the Gaussian's variance beyond the
-    sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
+    A star of `few_steps` steps weighs its light twice; its flux is then as near as the panel's step
+    allows. `last_light` weighs the light in the last choice, after which no pixel can make up for
+    it. `window_blurs` is the Gaussian's variance beyond the sprite's, in variances of the blur: a
+    fit has 0 before the blur and 2 after it.
     """
 
     light: float
@@ -37,16 +40,20 @@ class Weights:
     window_blurs: float
 
 
-# Found by search, for the centroider that gains least over rounding: stars of 46 to 95 steps, most of all 66 at 32 x 32 phases.
+# Found by search, for the centroider that gains least over rounding: stars of 46 to 95 steps, most
+# of all 66 at 32 x 32 phases.
 IN_A_FRAME = Weights(1.0, 0.587, 0.676, 3.262, 2.05, 0.484, 8.64, 1.891, 0.497)
-# Over frames no star weighs its light more, or faint stars' moments would drift; the larger box leaves 0.0034 px in place of
-# 0.0038 over six frames of a star of 66 steps, and the others stay under 0.0031.
+# Over frames no star weighs its light more, or faint stars' moments would drift; the larger box
+# leaves 0.0034 px in place of 0.0038 over six frames of a star of 66 steps, and the others stay
+# under 0.0031.
 OVER_FRAMES = Weights(1.0, 0.75, 0.8, 3.0, 2.2, 1.2, 0.0, 3.5, 0.6)
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """How a tracker sees the monitor: its optics' blur (sigma) and the side of its pixel, both in monitor pixels."""
+    """How a tracker sees the monitor: its optics' blur (sigma) and the side of its pixel, both
+    in monitor pixels.
+    """
 
     blur_px: float = 0.62
     pixel_px: float = 1.0
@@ -57,7 +64,9 @@ AS_USUAL = Seen()
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The ten sums of stars of one PSF, seen by one tracker, by weights in one frame or over several (`temporal`)."""
+    """The ten sums of stars of one PSF, seen by one tracker, by weights in one frame or over
+    several (`temporal`).
+    """
 
     psf: Psf
     seen: Seen = AS_USUAL
@@ -70,9 +79,12 @@ class Balance:
         return x, y
 
     def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
-        """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a star's nearest."""
+        """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a
+        star's nearest.
+        """
         half, ends = side * self.seen.pixel_px / 2, range(BOX_REACH + 1)
-        # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the monitor's is not known.
+        # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the
+        # monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)
         scale = 1 / (blur * math.sqrt(2))  # scipy.special would take 0.12 s to import
         along_axis = np.array([(math.erf((at + half) * scale) - math.erf((at - half) * scale)) / 2 for at in ends])
@@ -80,7 +92,9 @@ class Balance:
         return np.asarray(along_axis[x] * along_axis[y])
 
     def follows(self, side: int) -> tuple[float, float]:
-        """How far a star's centre of mass in a box follows the box: 0 where it holds all light, 1 in an even field."""
+        """How far a star's centre of mass in a box follows the box: 0 where it holds all light,
+        1 in an even field.
+        """
         slopes = []
         for variance in self.psf.variance_px2:
             # The slope of the mean of a unit Gaussian between -h and h, as both edges move
@@ -92,8 +106,8 @@ class Balance:
     def arms(self, offset_px: Float32Array, fraction_px: Float32Array, steps: Float32Array) -> Float32Array:
         """The factor of each pixel's error in each sum, (SUMS, pixels, n).
 
-        `offset_px` (2, pixels, n) are whole pixels from the stars' own, `fraction_px` (2, n) the stars' places from there,
-        `steps` (n,) their light in steps from black.
+        `offset_px` (2, pixels, n) are whole pixels from the stars' own, `fraction_px` (2, n) the
+        stars' places from there, `steps` (n,) their light in steps from black.
         """
         fraction = np.asarray(fraction_px, dtype=np.float32)[:, None]
         nearest = np.rint(fraction)

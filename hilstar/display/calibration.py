@@ -1,4 +1,5 @@
-"""A monitor's light: response, uniformity and noise, where they come from, and the files that hold them.
+"""A monitor's light: response, uniformity and noise, where they come from, and the files that hold
+them.
 
 configs/CALIBRATION.md describes the files (TOML and CSV).
 """
@@ -33,17 +34,19 @@ ADVICE = "see configs/CALIBRATION.md"
 GREY, PRIMARIES = ("w",), ("r", "g", "b")
 TYPE_WORDS = {"float": "a number", "int": "a whole number", "str": "text", "object": "a table"}
 Share = Annotated[float, Meta(ge=0, le=1e12)]
-REC709_WEIGHTS: responses.Weights = (0.2126, 0.7152, 0.0722)  # a photometer's, of the sRGB primaries (IEC 61966-2-1)
+# a photometer's, of the sRGB primaries (IEC 61966-2-1)
+REC709_WEIGHTS: responses.Weights = (0.2126, 0.7152, 0.0722)
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """A monitor's light, and where that knowledge comes from.
 
-    `uniformity` is a coarse grid (rows, columns) of relative light, rows from top to bottom, each value at the middle of its
-    equal share of the screen; None where the light is the same everywhere. `noise` is the relative repeatability of a patch.
-    `weights` are the shares of the primaries in white as the tracker sees them, of sum 1; None where they are not known.
-    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read.
+    `uniformity` is a coarse grid (rows, columns) of relative light, rows from top to bottom, each
+    value at the middle of its equal share of the screen; None where the light is the same
+    everywhere. `noise` is the relative repeatability of a patch. `weights` are the shares of the
+    primaries in white as the tracker sees them, of sum 1; None where they are not known. `black` of
+    the response is that of the whole screen. `sha256` covers the bytes of every file that was read.
     """
 
     name: str
@@ -71,9 +74,11 @@ class Calibration:
         return self.name in FORMULAS
 
     def uniformity_map(self, resolution_px: tuple[int, int]) -> Float32Array | None:
-        """Relative light of each pixel (height, width), 1 at the brightest; None where it is the same everywhere.
+        """Relative light of each pixel (height, width), 1 at the brightest; None where it is the
+        same everywhere.
 
-        Bilinear between the centres of the grid's fields, extrapolated by the same slope to the edges of the screen.
+        Bilinear between the centres of the grid's fields, extrapolated by the same slope to the
+        edges of the screen.
         """
         if self.uniformity is None:
             return None
@@ -100,10 +105,13 @@ def weights_of_grid(pixels: int, fields: int) -> FloatArray:
 
 
 def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = False) -> Calibration:
-    """The calibration of a built-in name ("srgb", "gamma2.2", "lcd-example") or of a file, for a monitor of `bits`.
+    """The calibration of a built-in name ("srgb", "gamma2.2", "lcd-example") or of a file, for a
+    monitor of `bits`.
 
-    With `bit_stealing` its levels are triples of codes between the greys. Raises InputError for a malformed file, for
-    other bits than the file's, and for bit stealing where the weights of the primaries are not known.
+    With `bit_stealing` its levels are triples of codes between the greys. Raises InputError for a
+    malformed file, for
+    other bits than the file's, and for bit stealing where the weights of the primaries are not
+    known.
     """
     name = str(source)
     if name in FORMULAS:
@@ -154,7 +162,8 @@ def _path_of(source: str | Path) -> Path:
 
 
 def primary_lights(source: str | Path, bits: int) -> FloatArray:
-    """Light above black of each primary by its code (3, 2^bits), relative to white as the tracker sees it.
+    """Light above black of each primary by its code (3, 2^bits), relative to white as the tracker
+    sees it.
 
     Raises InputError as `load_calibration` does with bit stealing.
     """
@@ -176,7 +185,8 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
 
 
 def primary_responses(source: str | Path, bits: int) -> tuple[responses.Response, ...]:
-    """The response of each primary, relative to its own white: a calibration's columns r, g and b, or its grey one for all.
+    """The response of each primary, relative to its own white: a calibration's columns r, g and b,
+    or its grey one for all.
 
     Raises InputError as `load_calibration` does.
     """
@@ -200,10 +210,11 @@ def with_uniformity(
     *,
     relative: float | None = None,
 ) -> tuple[Path, ...]:
-    """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
+    """Write a calibration's light with another grid of relative light (rows, columns), or with
+    none; the files, TOML first.
 
-    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's; `relative` is the standard
-    error of a field. Raises InputError.
+    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's;
+    `relative` is the standard error of a field. Raises InputError.
     """
     response, weights, noise, notes, errors = f"{path.stem}.csv", None, 0.0, NotesTable(), None
     if str(source) in FORMULAS:
@@ -261,7 +272,9 @@ class WeightsTable(Table, frozen=True):
 
 
 class UniformityTable(Table, frozen=True):
-    """[uniformity]: where the grid of relative light is, and the standard error of one of its fields."""
+    """[uniformity]: where the grid of relative light is, and the standard error of one of its
+    fields.
+    """
 
     file: str
     relative: Share | None = None
@@ -274,10 +287,12 @@ class NoiseTable(Table, frozen=True):
 
 
 class ErrorsTable(Table, frozen=True):
-    """[errors]: at the levels measured, by their light relative to white: measured over fitted light less 1, and its error.
+    """[errors]: at the levels measured, by their light relative to white: measured over fitted
+    light less 1, and its error.
 
-    `black` is the error of the black level over white. `common` is that of the readings of code 0 among the others: it is part
-    of every level's light above black, and all that is common to them. Without it, it is `black`.
+    `black` is the error of the black level over white. `common` is that of the readings of code 0
+    among the others: it is part of every level's light above black, and all that is common to them.
+    Without it, it is `black`.
     """
 
     light: list[Annotated[float, Meta(gt=0, le=1)]]
@@ -320,7 +335,9 @@ def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYT
 
 
 def beside(path: Path, name: str, key: str) -> Path:
-    """The path of a file that `path` names, relative to it. Raises InputError where there is none."""
+    """The path of a file that `path` names, relative to it. Raises InputError where there is
+    none.
+    """
     other = path.parent / name
     if not exists(other):
         raise InputError(f"{path}: {key} = {shortened(json.dumps(name))}; there is no such file beside it")
@@ -328,10 +345,13 @@ def beside(path: Path, name: str, key: str) -> Path:
 
 
 def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
-    """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to write."""
+    """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to
+    write.
+    """
     tables = parse_toml(path, _read(path, read, MAX_TOML_BYTES))
     head = tables.get("calibration")
-    if isinstance(head, dict) and isinstance(head.get("when"), datetime.date):  # TOML has dates of its own
+    # TOML has dates of its own
+    if isinstance(head, dict) and isinstance(head.get("when"), datetime.date):
         head["when"] = str(head["when"])
     try:
         return msgspec.convert(tables, CalibrationFile)
@@ -364,9 +384,11 @@ def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
 
 
 def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dict[str, FloatArray]:
-    """Light (2^bits,) of each channel, black level included: every code, or some of them and the curve between.
+    """Light (2^bits,) of each channel, black level included: every code, or some of them and the
+    curve between.
 
-    Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with blacks that disagree.
+    Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with
+    blacks that disagree.
     """
     table = _table(path, read)
     header = tuple(column.name for column in table.columns)
@@ -390,7 +412,9 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
 
 
 def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, white: int) -> FloatArray:
-    """Light at codes 0 to `white`: between rows, PCHIP of log light above black over log code; below the first, a power law."""
+    """Light at codes 0 to `white`: between rows, PCHIP of log light above black over log code;
+    below the first, a power law.
+    """
     fall = np.flatnonzero(np.diff(light) <= 0)
     if len(fall):
         low, high = code[fall[0]], code[fall[0] + 1]
@@ -402,7 +426,8 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
     if len(code) < 3:
         raise InputError(f"{path}: two codes make no response; give some between black and white")
     log_code, log_light = np.log(code[1:]), np.log(light[1:] - light[0])
-    from scipy.interpolate import PchipInterpolator  # a quarter of a second of every command that has no such file
+    # a quarter of a second of every command that has no such file
+    from scipy.interpolate import PchipInterpolator
 
     curve = PchipInterpolator(log_code, log_light)
     wanted = np.log(np.arange(1, white + 1))
@@ -412,7 +437,9 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
 
 
 def read_grid(path: Path, read: list[bytes]) -> FloatArray:
-    """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises InputError."""
+    """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises
+    InputError.
+    """
     table = _table(path, read)
     if table.header:
         raise InputError(f"{path}:{table.header_line}: {shortened(table.names)!r} is no row of numbers")
@@ -433,7 +460,9 @@ def write_calibration(
     identity: MonitorIdentity | None = None,
     errors: ErrorsTable | None = None,
 ) -> Path:
-    """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
+    """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError
+    where they cannot be written.
+    """
     table = path.parent / head.response
     codes = np.arange(len(next(iter(columns.values()))))
     rows = "".join(",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n" for code in codes)
@@ -446,7 +475,8 @@ def write_calibration(
 
 
 def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) -> Path:
-    """Give a calibration file that has none a grid of relative light (rows, columns), rows from the top; the grid's CSV.
+    """Give a calibration file that has none a grid of relative light (rows, columns), rows from the
+    top; the grid's CSV.
 
     `relative` is the standard error of a field. Raises InputError where it cannot be written.
     """

@@ -1,12 +1,15 @@
-"""`exact`: the levels of one star's footprint chosen together, so that its light and its place are right in one frame.
+"""`exact`: the levels of one star's footprint chosen together, so that its light and its place are
+right in one frame.
 
-Every pixel shows one of the two levels around its light, so that no pixel is off by a whole level. The choice between the
-two minimises the ten sums of `balance`. From the star's middle outwards each pixel is decided, with several choices of the
-pixels before it kept side by side: of the four that two of them lead to the better two are kept, and who is compared with whom
-changes from pixel to pixel. The last pixels, and the choice among what is left, weigh the light more.
+Every pixel shows one of the two levels around its light, so that no pixel is off by a whole level.
+The choice between the two minimises the ten sums of `balance`. From the star's middle outwards each
+pixel is decided, with several choices of the pixels before it kept side by side: of the four that
+two of them lead to the better two are kept, and who is compared with whom changes from pixel to
+pixel. The last pixels, and the choice among what is left, weigh the light more.
 A star drawn as a path hands its errors from sprite to sprite.
-In the straight foot of sRGB all steps are equal, so a star of N steps cannot have its light closer than half a step: 1 / 2N.
-This is the oracle of shaders/exact.comp, and what draws where that cannot run.
+In the straight foot of sRGB all steps are equal, so a star of N steps cannot have its light closer
+than half a step: 1 / 2N. This is the oracle of shaders/exact.comp, and what draws where that cannot
+run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +27,8 @@ from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites
 
-KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
+# choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
+KEPT = 8
 KEPT_BEFORE = 4  # where another primary makes up for what these leave
 CHUNK = 256  # stars at a time: their arrays stay in a core's cache
 OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
@@ -34,8 +38,8 @@ NONE = np.float32(1e30)  # the square of a choice that does not exist yet
 COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 MAX_NEAR = 128  # pixels of a star that exact.comp has bits for: sprites up to a sigma of 1.8 px
 MAX_SIZE = 63  # largest footprint whose places fit into six bits
-# As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for the shader. A field of the
-# Milky Way has twice the stars of an average one.
+# As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for
+# the shader. A field of the Milky Way has twice the stars of an average one.
 EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 
 
@@ -43,8 +47,8 @@ EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 class Carried:
     """The errors of the sums (SUMS, n) that n sprites have to make up for, in steps from black.
 
-    Those of light and moments are plain, the others weighed. Where all steps of a star are equal, `phase` (n,) is the part of
-    one that its light has in hand.
+    Those of light and moments are plain, the others weighed. Where all steps of a star are equal,
+    `phase` (n,) is the part of one that its light has in hand.
     """
 
     error: Float32Array
@@ -62,24 +66,30 @@ def nothing_carried(count: int) -> Carried:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers (n,) as in `Sprites.star`."""
+    """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers
+    (n,) as in `Sprites.star`.
+    """
 
     star: IntArray
     error: Float32Array
 
 
 def _fits(psf: Psf) -> bool:
-    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are products, as it takes them."""
+    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are
+    products, as it takes them.
+    """
     order = PixelOrder(psf)
     return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
 
 
 class ExactQuantiser(quantise.Quantiser):
-    """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the nearest ones.
+    """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the
+    nearest ones.
 
-    An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that sees it as `seen`. `weights`
-    are those of its sums. One that `remembers` begins each star with what the last frame left, in `left`: None where each frame
-    stands by itself, and at the beginning of a sequence.
+    An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that
+    sees it as `seen`. `weights` are those of its sums. One that `remembers` begins each star with
+    what the last frame left, in `left`: None where each frame stands by itself, and at the
+    beginning of a sequence.
     """
 
     words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
@@ -88,7 +98,8 @@ class ExactQuantiser(quantise.Quantiser):
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None
-    # For so much of what these quantisers of other primaries left in the same frame each star makes up, in steps of both.
+    # For so much of what these quantisers of other primaries left in the same frame each star makes
+    # up, in steps of both.
     given: Sequence[tuple[float, quantise.Quantiser]] = ()
     kept = KEPT
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
@@ -103,7 +114,8 @@ class ExactQuantiser(quantise.Quantiser):
         self._lower = quantise.ThresholdCounter(response.light[1:].astype(np.float32))
         self._nearest = quantise.ThresholdCounter(response.threshold.astype(np.float32))
         self._first_threshold = np.float32(response.threshold[0])
-        self._flat = np.zeros(self._map.pixels + 1, dtype=quantise.level_dtype(response))  # one more, for pixels off the image
+        # one more, for pixels off the image
+        self._flat = np.zeros(self._map.pixels + 1, dtype=quantise.level_dtype(response))
         self._lit: PlaceArray = np.empty(0, dtype=np.int32)
         self._on_floor = False
         uniformity = panel.uniformity
@@ -153,7 +165,8 @@ class ExactQuantiser(quantise.Quantiser):
         return panel.response.half_step * panel.flux_at_white_e_per_s
 
     def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
-        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same
+        array.
 
         Their light is added to that of the levels `floor` (height, width), None for black.
         """
@@ -185,7 +198,9 @@ class ExactQuantiser(quantise.Quantiser):
         return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
 
     def _carried(self, sprites: Sprites) -> Carried:
-        """The errors that each sprite begins with: what its light in other primaries left, or none."""
+        """The errors that each sprite begins with: what its light in other primaries left, or
+        none.
+        """
         carried = nothing_carried(len(sprites))
         for part, other in self.given if sprites.per_star == 1 else ():
             if part and isinstance(other, ExactQuantiser) and other.over is not None:
@@ -193,7 +208,9 @@ class ExactQuantiser(quantise.Quantiser):
         return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
-        """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to make up for."""
+        """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to
+        make up for.
+        """
         return error
 
     def _keep(self, sprites: Sprites, left: Float32Array) -> None:
@@ -201,7 +218,8 @@ class ExactQuantiser(quantise.Quantiser):
         self.over = left
 
     def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
-        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n).
+        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried`
+        leave, (SUMS, n).
 
         Of each star the nearest `reach` (n,) pixels are chosen.
         """
@@ -217,7 +235,8 @@ class ExactQuantiser(quantise.Quantiser):
         )
         error = self._bounded(carried.error, step).copy()
         error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
-        # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them no choice can show.
+        # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them
+        # no choice can show.
         largest, smallest = step.max(axis=0), np.min(step, axis=0, initial=np.inf, where=step > 0)
         grid = np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
         error[0] += carried.phase * grid
@@ -233,8 +252,9 @@ class ExactQuantiser(quantise.Quantiser):
         return np.concatenate([lower + up, upper]), left
 
     def _levels_about(self, found: Footprints) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
-        """The lower levels of the near pixels and the nearest ones of the others, what these are off the wanted light
-        (pixels, n), and what the next level adds to the near ones' (near, n), in steps from black.
+        """The lower levels of the near pixels and the nearest ones of the others, what these are
+        off the wanted light (pixels, n), and what the next level adds to the near ones' (near, n),
+        in steps from black.
         """
         near = self._map.order.near
         output = None if self._output is None else self._output[found.place]
@@ -243,7 +263,8 @@ class ExactQuantiser(quantise.Quantiser):
             asked /= output
         if self._on_floor:
             asked += self._light[self._flat[found.place]].astype(np.float32)
-        np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
+        # light over white is lost; neighbours do not make up for it
+        np.minimum(asked, np.float32(1), out=asked)
         # The nearest level this far out is 0 for all but the brightest stars.
         lower, upper = self._lower.count(asked[:near]), np.zeros(asked[near:].shape, dtype=np.intp)
         bright = asked[near:] >= self._first_threshold
@@ -271,7 +292,9 @@ def _part(found: Footprints, some: IntArray) -> Footprints:
 
 
 def _turns(sprites: Sprites) -> Iterator[IntArray]:
-    """The sprites in chunks, each of a path after those before it; a long path is begun anew in places."""
+    """The sprites in chunks, each of a path after those before it; a long path is begun anew in
+    places.
+    """
     place = np.arange(len(sprites))
     if sprites.per_star > 1:
         begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
@@ -293,7 +316,9 @@ def _sprites_in_path(sprites: Sprites) -> IntArray:
 
 
 def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites: Sprites) -> None:
-    """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their paths, about their centres."""
+    """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their
+    paths, about their centres.
+    """
     if sprites.per_star == 1:
         return
     after = np.minimum(some + 1, len(sprites) - 1)
@@ -307,11 +332,13 @@ def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites:
 def _decide(
     short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float, choices: int
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves, (SUMS, n).
+    """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves,
+    (SUMS, n).
 
-    `short` (near, n) is what the lower level is off the wanted light (0 or less), `step` (near, n) how much the next one adds
-    (0 where there is none to take), both in steps from black. `arm` (SUMS, near, n) weighs a pixel's error into the sums of
-    `error` (SUMS, n), of which that of light counts `last_light` times at the end.
+    `short` (near, n) is what the lower level is off the wanted light (0 or less), `step` (near, n)
+    how much the next one adds (0 where there is none to take), both in steps from black. `arm`
+    (SUMS, near, n) weighs a pixel's error into the sums of `error` (SUMS, n), of which that of
+    light counts `last_light` times at the end.
     """
     near, count = step.shape
     kept = np.repeat(error[:, None], choices, axis=1)
@@ -324,8 +351,8 @@ def _decide(
         down = np.square(kept).sum(axis=0) + missing
         rise = by * (2 * (weight * kept).sum(axis=0) + by * np.square(weight).sum(axis=0))
         rise[:, by == 0] = NONE
-        # Of the four choices that two of those kept lead to keep two, in their places. Where both of one lead to less than
-        # either of the other, the other's place takes the second.
+        # Of the four choices that two of those kept lead to keep two, in their places. Where both
+        # of one lead to less than either of the other, the other's place takes the second.
         other = np.arange(choices) ^ (1 << (pixel % (choices.bit_length() - 1)))
         better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
         taken = worse[other] < better
@@ -343,7 +370,8 @@ def _decide(
 def _turn_one_more(
     step: Float32Array, arm: Float32Array, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array
 ) -> None:
-    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm.
+    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other
+    sums the least harm.
 
     `step` and `arm` as in `_decide`, whose results are changed.
     """

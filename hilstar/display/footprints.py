@@ -1,6 +1,8 @@
-"""Footprints of stars as arrays: which pixels each star lights, how much, and what the monitor cannot show of it.
+"""Footprints of stars as arrays: which pixels each star lights, how much, and what the monitor
+cannot show of it.
 
-`PixelOrder` sorts a footprint's pixels by distance from the star, for each sub-pixel phase: `exact` decides them in that order.
+`PixelOrder` sorts a footprint's pixels by distance from the star, for each sub-pixel phase: `exact`
+decides them in that order.
 """
 
 from dataclasses import dataclass, replace
@@ -19,20 +21,25 @@ from hilstar.optics.sprites import Sprites
 
 PlaceArray = npt.NDArray[np.int32]  # half the memory of intp: these arrays are the method's largest
 PHASES = 8  # sub-pixel phases per axis for which the order is tabulated
-# Radius within which `exact` may light pixels that the star's own light leaves dark; 3 doubles the error of a 267-step star.
+# Radius within which `exact` may light pixels that the star's own light leaves dark; 3 doubles the
+# error of a 267-step star.
 REACH_SIGMA = 3.4
 MIN_REACH_PX = 1.6  # narrower stars still get their eight neighbours, to choose among
-# Share of a step below which a pixel stays dark; 0.1 adds 20 % to the error of stars of 17 steps, 0.02 gains nothing.
+# Share of a step below which a pixel stays dark; 0.1 adds 20 % to the error of stars of 17 steps,
+# 0.02 gains nothing.
 LEAST_LIGHT = 0.07
 FEWEST = 9  # minimum number of pixels to choose among
 
 
 class PixelOrder:
-    """The order for sprites of one PSF: `size` is the footprint's side, the first `near` pixels lie within reach.
+    """The order for sprites of one PSF: `size` is the footprint's side, the first `near` pixels lie
+    within reach.
 
-    `first` is the footprint's first column (and row), in whole pixels from the star's own; `row` and `column`
-    (size^2, PHASES^2) count from there, nearest first. `bias` is added to a star's place in its pixel for its phase, and
-    `area_px2` is 2 pi times the product of the sigmas, a pixel's width among them.
+    `first` is the footprint's first column (and row), in whole pixels from the star's own; `row`
+    and `column`
+    (size^2, PHASES^2) count from there, nearest first. `bias` is added to a star's place in its
+    pixel for its phase, and `area_px2` is 2 pi times the product of the sigmas, a pixel's width
+    among them.
     """
 
     def __init__(self, psf: Psf) -> None:
@@ -57,21 +64,26 @@ class PixelOrder:
         return (np.arange(PHASES) + 0.5) / PHASES - self.bias
 
     def near_sigmas(self, more_px: float = 0.0) -> float:
-        """Distance of the farthest near pixel of any phase in sigmas (a pixel's width included), plus `more_px`.
+        """Distance of the farthest near pixel of any phase in sigmas (a pixel's width included),
+        plus `more_px`.
 
         All phases have as many near pixels: where few lie within reach, some lie beyond it.
         """
         return self._farthest_sigmas + more_px / self._least_spread_px
 
     def reach(self, steps: Float32Array) -> IntArray:
-        """Number of nearest pixels (n,) that hold enough light to choose among, for stars of `steps` (n,) steps of light."""
+        """Number of nearest pixels (n,) that hold enough light to choose among, for stars of
+        `steps` (n,) steps of light.
+        """
         # A Gaussian's k-th nearest pixel has exp(-k / area) of its peak.
         least = np.float32(1 / (self.area_px2 * LEAST_LIGHT))
         pixels = np.float32(self.area_px2) * np.log(np.maximum(steps * least, np.float32(1)))
         return np.asarray(np.clip(pixels.astype(np.intp), min(FEWEST, self.near), self.near))
 
     def places(self) -> IntArray:
-        """The pixels of a footprint from the star's own, nearest first, by phase: x and y (2, PHASES^2, pixels)."""
+        """The pixels of a footprint from the star's own, nearest first, by phase: x and y (2,
+        PHASES^2, pixels).
+        """
         return np.stack([self.column.T, self.row.T]).astype(np.intp) + self.first
 
     @property
@@ -82,11 +94,14 @@ class PixelOrder:
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """Pixels of n stars, nearest first, each (pixels, n). A pixel that several stars light belongs to the brightest there.
+    """Pixels of n stars, nearest first, each (pixels, n). A pixel that several stars light belongs
+    to the brightest there.
 
-    `light` is the whole light in the pixel, electrons per second, 0 where it is another star's or off the image, and
-    `place` its place in the flat image, there one past the end. `offset_px` (2, pixels, n) are x and y in whole pixels from
-    the star's own, `fraction_px` (2, n) is the star's centre from there. `rate_e_per_s` (n,) is the star's own light.
+    `light` is the whole light in the pixel, electrons per second, 0 where it is another star's or
+    off the image, and
+    `place` its place in the flat image, there one past the end. `offset_px` (2, pixels, n) are x
+    and y in whole pixels from the star's own, `fraction_px` (2, n) is the star's centre from there.
+    `rate_e_per_s` (n,) is the star's own light.
     """
 
     light: Float32Array
@@ -146,7 +161,9 @@ class FootprintMap:
         return place
 
     def _settle(self, light: Float32Array, place: PlaceArray) -> None:
-        """Assign each pixel that several stars touch to the brightest there, with the light of all."""
+        """Assign each pixel that several stars touch to the brightest there, with the light of
+        all.
+        """
         flat_light, flat_place = light.ravel(), place.ravel()
         entry = np.arange(flat_place.size, dtype=np.int32)
         self._last_entry[flat_place] = entry  # the last of several stays
@@ -167,11 +184,13 @@ class FootprintMap:
 
 
 def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Levels) -> FloatArray:
-    """How many magnitudes fainter than wanted each of n sprites is in `levels` (height, width), (n,).
+    """How many magnitudes fainter than wanted each of n sprites is in `levels` (height, width),
+    (n,).
 
-    Infinite for a star that shows nothing, NaN for one without a pixel on the image. A pixel that several stars light
-    counts for the brightest there, with the light of all. A star without a pixel of its own loses, in each of its pixels,
-    the share that the pixel's owner loses.
+    Infinite for a star that shows nothing, NaN for one without a pixel on the image. A pixel that
+    several stars light
+    counts for the brightest there, with the light of all. A star without a pixel of its own loses,
+    in each of its pixels, the share that the pixel's owner loses.
     """
     found = footprints.find(sprites)
     wanted = found.light.sum(axis=0, dtype=np.float64)

@@ -1,4 +1,6 @@
-"""The monitor behind its collimator as the camera that the tracker looks into, and the file of a geometric calibration."""
+"""The monitor behind its collimator as the camera that the tracker looks into, and the file of a
+geometric calibration.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,7 +29,9 @@ Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le
 
 
 class FieldTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """[field]: Chebyshev coefficients in px; entry [i][j] belongs to T_i of the column and T_j of the row."""
+    """[field]: Chebyshev coefficients in px; entry [i][j] belongs to T_i of the column and T_j
+    of the row.
+    """
 
     x_px: list[list[Finite]]
     y_px: list[list[Finite]]
@@ -44,10 +48,12 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
-    """[error]: of dots that were held out, and one sigma of a star's place: over the screen (-1 where unseen), rms and maximum.
+    """[error]: of dots that were held out, and one sigma of a star's place: over the screen (-1
+    where unseen), rms and maximum.
 
-    `modes_arcsec` times its transpose is the covariance of places: a mode has x and then y of the map, row by row. An alignment
-    adds the rms of what its rotation leaves, one axis, and the covariance of the rotation about x, y and z with its freedom.
+    `modes_arcsec` times its transpose is the covariance of places: a mode has x and then y of the
+    map, row by row. An alignment adds the rms of what its rotation leaves, one axis, and the
+    covariance of the rotation about x, y and z with its freedom.
     """
 
     model: str = ""
@@ -76,8 +82,8 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
 class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
     """[made]: by which version, when, and of how many poses of the tracker.
 
-    Of an alignment also how many pairs were given and used, the lines of the wild ones, the rotation that was taken out, and
-    where the lens is from.
+    Of an alignment also how many pairs were given and used, the lines of the wild ones, the
+    rotation that was taken out, and where the lens is from.
     """
 
     by: str = ""
@@ -92,7 +98,9 @@ class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """Notes of a geometry file: one sigma of each parameter, how well it is known, how it was made, and on which monitor."""
+    """Notes of a geometry file: one sigma of each parameter, how well it is known, how it was
+    made, and on which monitor.
+    """
 
     sigma: dict[str, float]
     error: ErrorTable
@@ -101,9 +109,11 @@ class Notes:
 
 
 class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole file. `max_field_deg` is the angle from the axis to which it was calibrated, where that is less than the screen.
+    """A whole file. `max_field_deg` is the angle from the axis to which it was calibrated, where
+    that is less than the screen.
 
-    `sigma`, `error` and `made` say how well it is known and how it was made; nothing is computed from them.
+    `sigma`, `error` and `made` say how well it is known and how it was made; nothing is computed
+    from them.
     """
 
     kind: str
@@ -179,7 +189,9 @@ def load_distortion(path: Path, camera: Camera) -> Camera:
 
 
 def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: Notes) -> None:
-    """Write a camera and its notes as a geometry file. Raises InputError where it cannot be written."""
+    """Write a camera and its notes as a geometry file. Raises InputError where it cannot be
+    written.
+    """
     lens = camera.lens or Lens()
     field = None
     if lens.field is not None:
@@ -213,8 +225,10 @@ def monitor_camera(
 ) -> Camera:
     """The camera that maps cam directions to monitor pixels.
 
-    `mon` has the axes of cam (x right, y down, as the tracker sees it); `q_cam_to_mon` is the alignment of the
-    tracker on the bench. The collimator's axis meets the monitor at `principal_point_px`, by default its middle.
+    `mon` has the axes of cam (x right, y down, as the tracker sees it); `q_cam_to_mon` is the
+    alignment of the
+    tracker on the bench. The collimator's axis meets the monitor at `principal_point_px`, by
+    default its middle.
     """
     width, height = resolution_px
     middle = ((width - 1) / 2, (height - 1) / 2)

@@ -1,4 +1,6 @@
-"""Which monitor, in which mode and with which settings: what calibration files carry, and how two of them differ."""
+"""Which monitor, in which mode and with which settings: what calibration files carry, and how
+two of them differ.
+"""
 
 import hashlib
 import re
@@ -13,7 +15,8 @@ from hilstar.basics.toml_tables import Table
 
 TABLE = "monitor_identity"  # in a calibration or geometry file
 STRAIGHT = "straight"
-# What makers write who number nothing: 0, 1, or a number of one byte repeated (0x01010101, 0x20202020), which is told
+# What makers write who number nothing: 0, 1, or a number of one byte repeated (0x01010101,
+# 0x20202020), which is told
 # apart from a count by its size; digits in a row; words, with or without digits behind them.
 NO_SERIALS = frozenset({0, 1})
 DIGITS_IN_A_ROW = ("01234567890", "12345678901234567890", "9876543210")
@@ -35,12 +38,13 @@ SHOWN_DIGITS = 20  # a SHA-256 in a line; names and modes are shorter
 
 
 class MonitorIdentity(Table, frozen=True):
-    """The monitor of a calibration: what it says of itself, how it is connected and driven, and its own settings.
+    """The monitor of a calibration: what it says of itself, how it is connected and driven, and its
+    own settings.
 
-    Empty, or None, is what is not known. `gamma_ramp` is "straight" or the SHA-256 of the ramp that the window system has set
-    (hilstar's own full-screen window sets a straight one for its time). `brightness`, `contrast`, `colour_preset` and `hours`
-    are by DDC/CI; hours are not compared. `window_system` has what stands between a frame and the panel, as the start-up gate
-    words it.
+    Empty, or None, is what is not known. `gamma_ramp` is "straight" or the SHA-256 of the ramp that
+    the window system has set (hilstar's own full-screen window sets a straight one for its time).
+    `brightness`, `contrast`, `colour_preset` and `hours` are by DDC/CI; hours are not compared.
+    `window_system` has what stands between a frame and the panel, as the start-up gate words it.
     """
 
     maker: str = ""
@@ -81,7 +85,9 @@ class MonitorIdentity(Table, frozen=True):
 
 
 def edid_identity(edid: bytes) -> MonitorIdentity:
-    """What an EDID says (VESA E-EDID 1.4, section 3), with its SHA-256; that alone where it is damaged, nothing for none."""
+    """What an EDID says (VESA E-EDID 1.4, section 3), with its SHA-256; that alone where it is
+    damaged, nothing for none.
+    """
     known = MonitorIdentity(edid_sha256=sha256_of(edid))
     if not edid:
         return known
@@ -105,7 +111,9 @@ def edid_identity(edid: bytes) -> MonitorIdentity:
 
 
 def _stated_serial(text: str) -> str:
-    """The serial number that a text holds; "" where it is a placeholder, which each monitor of its kind has."""
+    """The serial number that a text holds; "" where it is a placeholder, which each monitor of
+    its kind has.
+    """
     plain = "".join(character for character in text.casefold() if character.isalnum())
     is_placeholder = _is_placeholder_number(plain) or _is_placeholder_word(text, plain)
     if len(plain) >= MIN_IN_A_ROW:
@@ -116,7 +124,9 @@ def _stated_serial(text: str) -> str:
 
 
 def _is_placeholder_number(plain: str) -> bool:
-    """Whether a text is a number that is none: in decimal; or in hex, as 0x01010101, 01010101h, or its eight digits."""
+    """Whether a text is a number that is none: in decimal; or in hex, as 0x01010101, 01010101h,
+    or its eight digits.
+    """
     try:
         if plain.startswith("0x"):
             return _is_no_serial(int(plain[2:], 16))
@@ -129,7 +139,9 @@ def _is_placeholder_number(plain: str) -> bool:
 
 
 def _is_placeholder_word(text: str, plain: str) -> bool:
-    """Whether a text is words that say that there is no number, with or without digits behind them."""
+    """Whether a text is words that say that there is no number, with or without digits behind
+    them.
+    """
     letters = "".join(character for character in plain if not character.isdigit())
     if not plain or letters in NO_SERIAL_WORDS:
         return True
@@ -157,7 +169,8 @@ def sha256_of(data: bytes) -> str:
 def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
     """How the present monitor differs from the one of a file, in words that give both.
 
-    A setting that one of them does not know is passed over; but a monitor that said what it was, and says nothing now, differs.
+    A setting that one of them does not know is passed over; but a monitor that said what it was,
+    and says nothing now, differs.
     """
     if was.edid_sha256 != now.edid_sha256:
         same = was.serial and (was.maker, was.model, was.serial) == (now.maker, now.model, now.serial)

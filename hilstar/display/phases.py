@@ -1,4 +1,6 @@
-"""One star at every sub-pixel phase through a quantisation method: the errors of its flux and centroid."""
+"""One star at every sub-pixel phase through a quantisation method: the errors of its flux and
+centroid.
+"""
 
 import math
 from dataclasses import dataclass
@@ -17,14 +19,18 @@ from hilstar.optics.sprites import Sprites, pack_sprites
 USUAL_PSF = GaussianPsf((0.85, 0.85))
 WHITE = 1.0
 MARGIN_PX = 2  # dark pixels between two stars
-FRAMES_BEFORE = 2  # frames of `temporal` before an exposure: the first of a sequence is no special case
+# frames of `temporal` before an exposure: the first of a sequence is no special case
+FRAMES_BEFORE = 2
 MIDDLES = (0.5, 0.5)
-UNLIKE = (0.25, 0.375)  # no star is another's mirror image: with MIDDLES only one of eight is like no other
+# no star is another's mirror image: with MIDDLES only one of eight is like no other
+UNLIKE = (0.25, 0.375)
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Over all phases: rms and largest flux error, mag, and centroid error, px; infinite where a star showed nothing."""
+    """Over all phases: rms and largest flux error, mag, and centroid error, px; infinite where a
+    star showed nothing.
+    """
 
     flux_rms_mag: float
     flux_max_mag: float
@@ -33,7 +39,8 @@ class Errors:
 
 
 def phase_grid(count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MIDDLES) -> tuple[Sprites, int]:
-    """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px.
+    """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel;
+    and the tile's side, px.
 
     The first phase along x and y is `first`, in steps of 1 / count px.
     """
@@ -46,13 +53,17 @@ def phase_grid(count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MI
 
 
 def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
-    """Where a `phase_grid` has the stars of each column of tiles, x (count,) in px, and of each row, y."""
+    """Where a `phase_grid` has the stars of each column of tiles, x (count,) in px, and of each
+    row, y.
+    """
     count = math.isqrt(len(sprites))
     return sprites.x_px[:count], sprites.y_px[::count]
 
 
 def phase_image(sprites: Sprites, psf: Psf) -> FloatArray:
-    """The light (h, w) of the stars of a `phase_grid`: all are as bright, and stand in columns and rows."""
+    """The light (h, w) of the stars of a `phase_grid`: all are as bright, and stand in columns
+    and rows.
+    """
     count = math.isqrt(len(sprites))
     at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     pixels, offsets = [], []
@@ -95,7 +106,8 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 def shown_by(
     method: Quantisation, exposure_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, balance: Balance
 ) -> FloatArray:
-    """The light (h, w) that a method shows for a linear image, with `temporal` the mean of `exposure_frames` frames.
+    """The light (h, w) that a method shows for a linear image, with `temporal` the mean of
+    `exposure_frames` frames.
 
     `balance` is that of `exact`, with the sprites' PSF.
     """

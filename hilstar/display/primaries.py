@@ -1,6 +1,8 @@
-"""A monitor's primaries and a tracker's channels: the electrons of each channel by each primary, one matrix from spectra.
+"""A monitor's primaries and a tracker's channels: the electrons of each channel by each primary,
+one matrix from spectra.
 
-The spectra come from a table, from an ArgyllCMS file of the display's own samples, or from CIE chromaticities.
+The spectra come from a table, from an ArgyllCMS file of the display's own samples, or from CIE
+chromaticities.
 """
 
 import itertools
@@ -23,15 +25,18 @@ COLUMNS = ("wavelength_nm", *PRIMARIES)
 ADVICE = "write wavelength_nm,r,g,b: each primary's relative spectral power at full drive"
 CCSS_ADVICE = "give a .ccss of this display (ccxxmake -S), or a CSV of wavelength_nm,r,g,b"
 MAX_SAMPLES = 40
-MIXED_WITHIN = 0.03  # relative rms: a spectrometer's repeatability, and a display whose primaries add up
-MAX_EXCESS = 0.15  # light of white over that of its primaries: screens that dim with what they show are off by less
+# relative rms: a spectrometer's repeatability, and a display whose primaries add up
+MIXED_WITHIN = 0.03
+# light of white over that of its primaries: screens that dim with what they show are off by less
+MAX_EXCESS = 0.15
 DARK_SHARE = 0.02  # relative to the brightest sample: black and near it
 SINGULAR = 1e-12  # for a Gram matrix
 D65_XY = (0.3127, 0.3290)
 FAR_XY = 0.08  # the blue of sRGB is 0.03 from a Gaussian of 30 nm
 FWHM_SIGMAS = 2.3548
 XY_NM = np.arange(380.0, 781.0, 1.0)
-# CIE 1931 2 degrees, as sums of Gaussians with two sides (Wyman, Sloan and Shirley 2013, JCGT 2, 1): times, middle, 1 / sigma.
+# CIE 1931 2 degrees, as sums of Gaussians with two sides (Wyman, Sloan and Shirley 2013, JCGT 2,
+# 1): times, middle, 1 / sigma.
 MATCHING = (
     ((0.362, 442.0, 0.0624, 0.0374), (1.056, 599.8, 0.0264, 0.0323), (-0.065, 501.1, 0.0490, 0.0382)),
     ((0.821, 568.8, 0.0213, 0.0247), (0.286, 530.9, 0.0613, 0.0322)),
@@ -41,10 +46,11 @@ MATCHING = (
 
 @dataclass(frozen=True, slots=True)
 class ChannelMatrix:
-    """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a pixel at full light.
+    """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a
+    pixel at full light.
 
-    By `condition` times as much as the channels' light can the primaries' be wrong, both relative; None where two channels, or
-    two primaries, have the same colour.
+    By `condition` times as much as the channels' light can the primaries' be wrong, both relative;
+    None where two channels, or two primaries, have the same colour.
     """
 
     channels: tuple[str, ...]
@@ -53,7 +59,8 @@ class ChannelMatrix:
 
 
 def read_primaries(path: Path) -> tuple[Curve, ...]:
-    """The spectra of red, green and blue in a CSV file or a .ccss, per nm in one unit, zero outside its wavelengths.
+    """The spectra of red, green and blue in a CSV file or a .ccss, per nm in one unit, zero outside
+    its wavelengths.
 
     Raises InputError.
     """
@@ -82,10 +89,12 @@ def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
 
 
 def read_ccss(path: Path) -> tuple[Curve, ...]:
-    """The primaries of an ArgyllCMS .ccss (CGATS text): those three samples of which all others are mixtures.
+    """The primaries of an ArgyllCMS .ccss (CGATS text): those three samples of which all others are
+    mixtures.
 
-    Of samples of one colour the brightest counts; red and blue are those of the longest and the shortest mean wavelength.
-    Raises InputError for another file, and where no three samples make the others, as of a panel with a fourth subpixel.
+    Of samples of one colour the brightest counts; red and blue are those of the longest and the
+    shortest mean wavelength. Raises InputError for another file, and where no three samples make
+    the others, as of a panel with a fourth subpixel.
     """
     nm, samples = _samples(path)
     power = samples.sum(axis=1)
@@ -143,7 +152,8 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tuple[Curve, ...]:
-    """Gaussian spectra whose chromaticities are nearest to `xy` of red, green and blue; all three together are D65.
+    """Gaussian spectra whose chromaticities are nearest to `xy` of red, green and blue; all three
+    together are D65.
 
     Raises InputError where none is near.
     """
@@ -181,10 +191,12 @@ def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
 
 
 def channel_matrix(primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float) -> ChannelMatrix:
-    """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels together.
+    """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels
+    together.
 
-    An entry is in proportion to the integral of power, quantum efficiency, transmission and wavelength: photons are counted.
-    Raises InputError where the tracker detects no light of the primaries.
+    An entry is in proportion to the integral of power, quantum efficiency, transmission and
+    wavelength: photons are counted. Raises InputError where the tracker detects no light of the
+    primaries.
     """
     matrix = np.array([[_electrons(primary, optics) for primary in primaries] for optics in channels.values()])
     if not matrix.any():
@@ -201,10 +213,12 @@ def _electrons(primary: Curve, optics: Optics) -> float:
 
 
 def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = False) -> FloatArray:
-    """The mixtures s (n, 3), none below 0, with the least s gram s - 2 s wanted: non-negative least squares by its products.
+    """The mixtures s (n, 3), none below 0, with the least s gram s - 2 s wanted: non-negative least
+    squares by its products.
 
-    `gram` (3, 3) has the products of the three parts, `wanted` (n, 3) those of each with what is wanted; `whole` holds the sum
-    of a mixture to 1. Every set of parts is tried: the best of those without a negative part is the solution.
+    `gram` (3, 3) has the products of the three parts, `wanted` (n, 3) those of each with what is
+    wanted; `whole` holds the sum of a mixture to 1. Every set of parts is tried: the best of those
+    without a negative part is the solution.
     """
     scale = np.trace(gram)
     gram, wanted = gram / scale, wanted / scale

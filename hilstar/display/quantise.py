@@ -1,10 +1,14 @@
-"""What a quantisation is, and those that look at pixels alone: `round` and `dither` (`exact` and `temporal` look at stars).
+"""What a quantisation is, and those that look at pixels alone: `round` and `dither` (`exact` and
+`temporal` look at stars).
 
-A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. `dither` works in light, not
-in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
+A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one.
+`dither` works in light, not
+in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light
+wanted.
 All compute in float32 like the renderer, which has to give every pixel the same level.
 
-Counting thresholds is fast by a table: the bits of a positive float rise with its value, so its leading bits are an index.
+Counting thresholds is fast by a table: the bits of a positive float rise with its value, so its
+leading bits are an index.
 """
 
 from abc import ABC, abstractmethod
@@ -26,20 +30,25 @@ from hilstar.optics.sprites import Sprites
 
 MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
 
-EXPOSURE_FRAMES = 6  # over which `temporal` is judged unless a bench says otherwise: 100 ms at 60 Hz
+# over which `temporal` is judged unless a bench says otherwise: 100 ms at 60 Hz
+EXPOSURE_FRAMES = 6
 MASK_TURNS = 4096  # the mask has no more distinct thresholds
 MANTISSA_BITS = 23
 MAX_FINER = 4
-MS_A_STAR = 0.002  # a whole frame of 2500 to 5000 stars, for each: 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores
+# a whole frame of 2500 to 5000 stars, for each: 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe
+# cores
+MS_A_STAR = 0.002
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A monitor as light becomes levels on it: its response, the light of white, and the relative light of each pixel.
+    """A monitor as light becomes levels on it: its response, the light of white, and the relative
+    light of each pixel.
 
-    `uniformity` float32 (height, width) is each pixel's light relative to what the response says (None: 1 everywhere).
-    `primaries` are the panels of red, green and blue alone where they are driven apart; `response` is then that of grey.
-    Raises InputError where the uniformity is not positive and finite.
+    `uniformity` float32 (height, width) is each pixel's light relative to what the response says
+    (None: 1 everywhere). `primaries` are the panels of red, green and blue alone where they are
+    driven apart; `response` is then that of grey. Raises InputError where the uniformity is not
+    positive and finite.
     """
 
     response: Response
@@ -54,7 +63,8 @@ class Panel:
             )
 
     def gain(self) -> Float32Array | None:
-        """The factor of the wanted light before it is quantised, float32 (height, width), or None for 1.
+        """The factor of the wanted light before it is quantised, float32 (height, width), or None
+        for 1.
 
         A product and not a quotient: of the two only the product is rounded the same by every GL.
         """
@@ -67,9 +77,11 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class FrameLight:
-    """The light of one frame: its sprites (None: black), and functions that draw it all, and its discs and stray light alone.
+    """The light of one frame: its sprites (None: black), and functions that draw it all, and its
+    discs and stray light alone.
 
-    Those give float32 (height, width), electrons per second, when a quantiser asks. `number` counts the frames shown.
+    Those give float32 (height, width), electrons per second, when a quantiser asks. `number` counts
+    the frames shown.
     """
 
     sprites: Sprites | None
@@ -80,20 +92,24 @@ class FrameLight:
 
 @dataclass(frozen=True, slots=True)
 class LevelCost:
-    """The time of a whole frame for each of its stars, ms, and why it is long ("" where it is not)."""
+    """The time of a whole frame for each of its stars, ms, and why it is long ("" where it is
+    not).
+    """
 
     a_star_ms: float
     why: str = ""
 
 
 class Quantiser(ABC):
-    """A quantisation: its class says what it needs, costs and means; an instance is its NumPy oracle for one panel.
+    """A quantisation: its class says what it needs, costs and means; an instance is its NumPy
+    oracle for one panel.
 
-    `words` describe it in the bench file's reference. `shader` is its own part of the GL pass (in shaders/, "" for none).
-    `other_codes` is the largest share of a frame's lit pixels whose codes may be one off where another renderer draws the same
-    light. Measured with light that is off by 2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of
-    `exact`, 1.9e-3 of `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other pixels with
-    it.
+    `words` describe it in the bench file's reference. `shader` is its own part of the GL pass (in
+    shaders/, "" for none). `other_codes` is the largest share of a frame's lit pixels whose codes
+    may be one off where another renderer draws the same light. Measured with light that is off by
+    2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of `exact`, 1.9e-3
+    of `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other
+    pixels with it.
     """
 
     words: ClassVar[str]
@@ -101,7 +117,9 @@ class Quantiser(ABC):
     other_codes: ClassVar[float] = 1e-4
 
     def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
-        """For images of `resolution_px`, sprites of `psf`, and a tracker that sees the monitor as `seen`."""
+        """For images of `resolution_px`, sprites of `psf`, and a tracker that sees the monitor
+        as `seen`.
+        """
         self._panel = panel
 
     @abstractmethod
@@ -115,7 +133,9 @@ class Quantiser(ABC):
     @classmethod
     @abstractmethod
     def by_pixel(cls) -> "type[PixelQuantiser]":
-        """The quantiser that the GL draws before it looks at stars: a PixelQuantiser itself, `round` for the others."""
+        """The quantiser that the GL draws before it looks at stars: a PixelQuantiser itself,
+        `round` for the others.
+        """
 
     @classmethod
     def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
@@ -124,24 +144,32 @@ class Quantiser(ABC):
 
     @classmethod
     def lit_from_e_per_s(cls, panel: Panel) -> float:
-        """The light that a star needs in a pixel to light it from a level of 0; 0 where any may do."""
+        """The light that a star needs in a pixel to light it from a level of 0; 0 where any may
+        do.
+        """
         return float(panel.response.threshold[0]) * panel.flux_at_white_e_per_s
 
     @classmethod
     def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
-        """The rate below which a single star lights no pixel at any phase; 0 where it always may."""
+        """The rate below which a single star lights no pixel at any phase; 0 where it always
+        may.
+        """
         return 0.0
 
     @classmethod
     def exposure(cls, before: int, count: int) -> range:
-        """The frames of a still sky whose mean an exposure of `count` frames after `before` others shows: the first for all."""
+        """The frames of a still sky whose mean an exposure of `count` frames after `before`
+        others shows: the first for all.
+        """
         return range(1)
 
 
 class PixelQuantiser(Quantiser):
-    """Looks at each pixel alone: a table counts the `edges_e_per_s` at or below its light, and that is its level.
+    """Looks at each pixel alone: a table counts the `edges_e_per_s` at or below its light, and that
+    is its level.
 
-    A `shader` may add one: `bool rises(ivec2 pixel, float light, float low, float high)`, of the edges about the light.
+    A `shader` may add one: `bool rises(ivec2 pixel, float light, float low, float high)`, of the
+    edges about the light.
     """
 
     @abstractmethod
@@ -162,7 +190,9 @@ class PixelQuantiser(Quantiser):
 
     @classmethod
     def edges_e_per_s(cls, panel: Panel) -> Float32Array:
-        """The rising lights of levels 1, 2, ... or what else pixels are counted by, float32 (levels - 1,)."""
+        """The rising lights of levels 1, 2, ... or what else pixels are counted by, float32
+        (levels - 1,).
+        """
         return panel.light_e_per_s()[1:]
 
     @classmethod
@@ -233,14 +263,18 @@ def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
 
 
 def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Levels:
-    """The nearest level of each pixel, (height, width) as `linear_e_per_s`; light over white becomes white."""
+    """The nearest level of each pixel, (height, width) as `linear_e_per_s`; light over white
+    becomes white.
+    """
     return encode(_wanted(linear_e_per_s, panel), panel.response, panel.flux_at_white_e_per_s)
 
 
 def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0) -> Levels:
-    """One of the two levels about each pixel's light, as a blue-noise mask turned by `shift` (0 to 1) decides.
+    """One of the two levels about each pixel's light, as a blue-noise mask turned by `shift` (0
+    to 1) decides.
 
-    The mean light over all thresholds of the mask is the wanted light within 1/8192 of a step of levels.
+    The mean light over all thresholds of the mask is the wanted light within 1/8192 of a step of
+    levels.
     """
     light = panel.light_e_per_s()
     rows, columns = np.nonzero(linear_e_per_s)
@@ -256,7 +290,9 @@ def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0
 
 @lru_cache(maxsize=1)
 def blue_noise() -> Float32Array:
-    """Thresholds strictly between 0 and 1, float32 (64, 64): the middles of 4096 equal parts, each once."""
+    """Thresholds strictly between 0 and 1, float32 (64, 64): the middles of 4096 equal parts,
+    each once.
+    """
     ranks = np.load(MASK_FILE)
     mask = ((ranks + 0.5) / ranks.size).astype(np.float32)
     mask.setflags(write=False)
@@ -270,9 +306,11 @@ def turned_mask(shift: float) -> Float32Array:
 
 
 def mask_turn(frame: int) -> float:
-    """The mask's turn in a frame, for extended light in `temporal`: van der Corput's sequence in base 2.
+    """The mask's turn in a frame, for extended light in `temporal`: van der Corput's sequence in
+    base 2.
 
-    The turns of each aligned block of 2^m frames divide [0, 1) evenly; after MASK_TURNS frames it begins again.
+    The turns of each aligned block of 2^m frames divide [0, 1) evenly; after MASK_TURNS frames it
+    begins again.
     """
     place, turn, weight = frame % MASK_TURNS, 0.0, 0.5
     while place:
@@ -283,7 +321,8 @@ def mask_turn(frame: int) -> float:
 
 
 def shown_light(levels: Levels, panel: Panel) -> FloatArray:
-    """The light of levels (height, width) on a monitor: electrons per second above the black level, float64.
+    """The light of levels (height, width) on a monitor: electrons per second above the black level,
+    float64.
 
     Of levels (height, width, 3) it is the sum of the primaries'.
     """
@@ -295,7 +334,9 @@ def shown_light(levels: Levels, panel: Panel) -> FloatArray:
 
 
 class LitLight(NamedTuple):
-    """The pixels of an image that have light: their places in the flat image and their electrons per second, (n,) each."""
+    """The pixels of an image that have light: their places in the flat image and their electrons
+    per second, (n,) each.
+    """
 
     place: IntArray
     e_per_s: FloatArray
@@ -312,27 +353,35 @@ class LitLight(NamedTuple):
 
 
 def lit_light(levels: Levels, panel: Panel) -> LitLight:
-    """`shown_light` of levels (height, width) where they are not 0, which has no light above black."""
+    """`shown_light` of levels (height, width) where they are not 0, which has no light above
+    black.
+    """
     place = np.flatnonzero(levels)
     light = panel.response.light[levels.ravel()[place]] * panel.flux_at_white_e_per_s
     return LitLight(place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place])
 
 
 def primary_levels(levels: Levels, panel: Panel) -> list[tuple[Levels, Panel]]:
-    """The levels (height, width) of each primary of levels (height, width, 3) with its panel; others as they are."""
+    """The levels (height, width) of each primary of levels (height, width, 3) with its panel;
+    others as they are.
+    """
     if levels.ndim == 2:
         return [(levels, panel)]
     return [(Levels(levels[..., k]), one) for k, one in enumerate(panel.primaries)]
 
 
 def primary_lights(levels: Levels, panel: Panel) -> list[FloatArray]:
-    """The light (height, width) of each primary of levels (height, width, 3); of levels (height, width) all light together."""
+    """The light (height, width) of each primary of levels (height, width, 3); of levels (height,
+    width) all light together.
+    """
     return [shown_light(*each) for each in primary_levels(levels, panel)]
 
 
 @dataclass(frozen=True, slots=True)
 class CodeTable:
-    """Thresholds, and the code at the lower edge of each bin of the light's leading bits (see encode.frag)."""
+    """Thresholds, and the code at the lower edge of each bin of the light's leading bits (see
+    encode.frag).
+    """
 
     threshold: Float32Array
     first_code: npt.NDArray[np.uint32]
@@ -340,14 +389,16 @@ class CodeTable:
     first_bin: int
 
     def steps(self) -> npt.NDArray[np.uint32] | None:
-        """Each bin in a word: its first code, and the lower bits of its only threshold in `bin_shift` + 1 bits.
+        """Each bin in a word: its first code, and the lower bits of its only threshold in
+        `bin_shift` + 1 bits.
 
-        Those are 1 << bin_shift where it has none, which no light reaches. Before the first bin there is an empty one, for all
-        light below it. None where a bin has several thresholds.
+        Those are 1 << bin_shift where it has none, which no light reaches. Before the first bin
+        there is an empty one, for all light below it. None where a bin has several thresholds.
         """
         bits, none = self.threshold.view(np.uint32), np.uint32(1 << self.bin_shift)
         place, lower = (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin, bits & (none - 1)
-        asked = (lower > 0) | (place == 0)  # the first code of a later bin counts a threshold at its very edge
+        # the first code of a later bin counts a threshold at its very edge
+        asked = (lower > 0) | (place == 0)
         place, lower = place[asked], lower[asked]
         if (place[1:] == place[:-1]).any():  # thresholds rise
             return None
@@ -360,8 +411,8 @@ class CodeTable:
 def code_table(thresholds: Float32Array) -> CodeTable:
     """The table for rising, positive `thresholds`.
 
-    There are as many bins per octave as thresholds, at most 4096, so that few bins hold more than one threshold; up to
-    MAX_FINER times as many where then none does.
+    There are as many bins per octave as thresholds, at most 4096, so that few bins hold more than
+    one threshold; up to MAX_FINER times as many where then none does.
     """
     bits = min(12, len(thresholds).bit_length())
     tables = (_table(thresholds, MANTISSA_BITS - bits - finer) for finer in range(MAX_FINER.bit_length()))
@@ -372,14 +423,17 @@ def code_table(thresholds: Float32Array) -> CodeTable:
 def _table(thresholds: Float32Array, shift: int) -> CodeTable:
     bits = thresholds.view(np.int32)
     first_bin, last_bin = (int(end) >> shift for end in (bits[0], bits[-1]))
-    first_edge = ((bits + ((1 << shift) - 1)) >> shift) - first_bin  # the first bin that begins at or above each threshold
+    # the first bin that begins at or above each threshold
+    first_edge = ((bits + ((1 << shift) - 1)) >> shift) - first_bin
     first_code = np.cumsum(np.bincount(first_edge)[: last_bin - first_bin + 1]).astype(np.uint32)
     first_code[0] = 0
     return CodeTable(thresholds, first_code, shift, first_bin)
 
 
 class ThresholdCounter:
-    """Counts thresholds by a CodeTable, as encode.frag does: ten times as fast as a binary search of unsorted light."""
+    """Counts thresholds by a CodeTable, as encode.frag does: ten times as fast as a binary
+    search of unsorted light.
+    """
 
     def __init__(self, thresholds: Float32Array) -> None:
         table = code_table(thresholds)

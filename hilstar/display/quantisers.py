@@ -14,4 +14,5 @@ QUANTISERS: dict[Quantisation, type[Quantiser]] = {
     "exact": ExactQuantiser,
     "temporal": TemporalQuantiser,
 }
-BY_COST: tuple[Quantisation, ...] = ("round", "exact")  # what `auto` chooses among, from the cheapest to the most accurate
+# what `auto` chooses among, from the cheapest to the most accurate
+BY_COST: tuple[Quantisation, ...] = ("round", "exact")

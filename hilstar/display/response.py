@@ -16,7 +16,8 @@ Codes = npt.NDArray[np.unsignedinteger[Any]]
 Levels = NewType("Levels", np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]])
 Weights = tuple[float, float, float]
 
-# Lights closer than this to each other (relative) are one level: a step of the renderer's float32 is 6e-8.
+# Lights closer than this to each other (relative) are one level: a step of the renderer's float32
+# is 6e-8.
 SAME_LIGHT = 1e-6
 MAX_LEVELS = 2**16  # the range of uint16
 TRIPLES = 7  # grey k and the six mixed triples above it
@@ -33,10 +34,11 @@ def srgb_light(signal: FloatArray) -> FloatArray:
 class Response:
     """The light of each level, and the thresholds between levels.
 
-    A level is a code value or, with bit stealing, a triple of codes. `light` (levels,) is the light above the black level,
-    relative to white above black: 0 at level 0, strictly rising, 1 at white. Light from `threshold[k - 1]` up to
-    `threshold[k]` is shown by level k; there are (levels - 1,) of them. `black` is the light of level 0 in the same unit.
-    `rgb` (levels, 3) holds the codes of each level; where it is None, level k is code k in all three channels.
+    A level is a code value or, with bit stealing, a triple of codes. `light` (levels,) is the light
+    above the black level, relative to white above black: 0 at level 0, strictly rising, 1 at white.
+    Light from `threshold[k - 1]` up to `threshold[k]` is shown by level k; there are (levels - 1,)
+    of them. `black` is the light of level 0 in the same unit. `rgb` (levels, 3) holds the codes of
+    each level; where it is None, level k is code k in all three channels.
     """
 
     bits: int
@@ -61,21 +63,27 @@ class Response:
 
 
 def srgb_response(bits: int) -> Response:
-    """The response of an sRGB monitor without black level; its thresholds are the light at the half codes."""
+    """The response of an sRGB monitor without black level; its thresholds are the light at the
+    half codes.
+    """
     white = 2**bits - 1
     codes = np.arange(2**bits, dtype=np.float64)
     return Response(bits, srgb_light(codes / white), srgb_light((codes[:-1] + 0.5) / white))
 
 
 def gamma_response(bits: int, gamma: float = 2.2) -> Response:
-    """The response of a monitor with a plain power law, without black level; its thresholds are the light at the half codes."""
+    """The response of a monitor with a plain power law, without black level; its thresholds are
+    the light at the half codes.
+    """
     white = 2**bits - 1
     codes = np.arange(2**bits, dtype=np.float64)
     return Response(bits, (codes / white) ** gamma, ((codes[:-1] + 0.5) / white) ** gamma)
 
 
 def table_response(bits: int, light: FloatArray, black: float = 0.0) -> Response:
-    """The response of a table of light (2^bits,), 0 to 1 above black; its thresholds lie midway between two lights."""
+    """The response of a table of light (2^bits,), 0 to 1 above black; its thresholds lie midway
+    between two lights.
+    """
     return Response(bits, light, _midway(light), black)
 
 
@@ -87,16 +95,19 @@ def mixed_response(channels: tuple[Response, Response, Response], weights: Weigh
 
 
 def bit_stealing_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
-    """Levels between the greys: the six triples of codes k and k + 1 between grey k and grey k + 1, by rising light.
+    """Levels between the greys: the six triples of codes k and k + 1 between grey k and grey k + 1,
+    by rising light.
 
-    `weights` are the primaries' shares of white as the tracker sees them, any scale. Triples of the same light are one
-    level, so 8 bits have 255 * 7 + 1 levels at most (Tyler 1997, Spatial Vision 10, 369). Raises InputError beyond 13 bits.
+    `weights` are the primaries' shares of white as the tracker sees them, any scale. Triples of the
+    same light are one level, so 8 bits have 255 * 7 + 1 levels at most (Tyler 1997, Spatial Vision
+    10, 369). Raises InputError beyond 13 bits.
     """
     bits = channels[0].bits
     if (2**bits - 1) * TRIPLES + 1 > MAX_LEVELS:
         raise InputError(f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most 13 bits")
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
-    steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]  # (0, 0, 0) first; (1, 1, 1) is the next grey
+    # (0, 0, 0) first; (1, 1, 1) is the next grey
+    steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]
     rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)
     rgb = np.concatenate([rgb, np.full((1, 3), 2**bits - 1)])
     light = np.stack([channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1) @ share
@@ -122,7 +133,9 @@ def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
 
 
 def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Levels:
-    """Nearest levels of a linear image, same shape, uint8 up to 256 levels; light over white becomes white."""
+    """Nearest levels of a linear image, same shape, uint8 up to 256 levels; light over white
+    becomes white.
+    """
     thresholds = response.thresholds_e_per_s(flux_at_white_e_per_s)
     levels = np.searchsorted(thresholds, linear_e_per_s, side="right")
     return Levels(levels.astype(np.uint8 if len(response.light) <= 256 else np.uint16))

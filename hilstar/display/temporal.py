@@ -1,11 +1,14 @@
-"""`temporal`: `exact` from frame to frame, so that a star's light and place are right over any exposure of several frames.
+"""`temporal`: `exact` from frame to frame, so that a star's light and place are right over any
+exposure of several frames.
 
-What a frame leaves of the ten sums of `balance` the same star has to make up for in the next one. The errors of any N frames
-in a row add up to the difference of two such remainders, each about as large as the error of one frame of `exact`: their mean
-falls as 1/N, whichever frame the exposure begins with, and with parts of a frame at its ends. A remainder is about the star's
-own centre and moves with it. A star too faint to light a pixel in every frame lights one in some: its light is then a rate of
-pulses (a sigma-delta modulation), and each star begins at a place of its own in that cycle, so that alike stars do not blink
-in step. A star keeps its remainder for as long as every frame has it, and begins anew when it comes back.
+What a frame leaves of the ten sums of `balance` the same star has to make up for in the next one.
+The errors of any N frames in a row add up to the difference of two such remainders, each about as
+large as the error of one frame of `exact`: their mean falls as 1/N, whichever frame the exposure
+begins with, and with parts of a frame at its ends. A remainder is about the star's own centre and
+moves with it. A star too faint to light a pixel in every frame lights one in some: its light is
+then a rate of pulses (a sigma-delta modulation), and each star begins at a place of its own in that
+cycle, so that alike stars do not blink in step. A star keeps its remainder for as long as every
+frame has it, and begins anew when it comes back.
 """
 
 import numpy as np
@@ -19,10 +22,11 @@ from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites
 
-# What a star is given to make up for, in its largest steps: more than the 3 that occur, little enough for one that cannot (its
-# pixels are white) to be right again a few frames after it can.
+# What a star is given to make up for, in its largest steps: more than the 3 that occur, little
+# enough for one that cannot (its pixels are white) to be right again a few frames after it can.
 MAX_CARRIED_STEPS = 8.0
-GOLDEN = 2654435769  # 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
+# 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
+GOLDEN = 2654435769
 NONE_BEFORE = -1
 
 
@@ -48,7 +52,9 @@ class TemporalQuantiser(ExactQuantiser):
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
-        """All pixels: those that stay dark are off the same way in each frame, and the others cannot make up for it."""
+        """All pixels: those that stay dark are off the same way in each frame, and the others
+        cannot make up for it.
+        """
         return order.near
 
     @classmethod
@@ -92,7 +98,8 @@ def ends_of_paths(sprites: Sprites) -> tuple[IntArray, IntArray]:
 
 
 def places_before(before: IntArray | None, star: IntArray) -> IntArray:
-    """Where each of `star` (n,) was among those of the frame before, int32 (n,); NONE_BEFORE for new ones.
+    """Where each of `star` (n,) was among those of the frame before, int32 (n,); NONE_BEFORE for
+    new ones.
 
     Of several of one number the last counts.
     """
@@ -104,6 +111,8 @@ def places_before(before: IntArray | None, star: IntArray) -> IntArray:
 
 
 def first_phases(star: IntArray, before: IntArray) -> Float32Array:
-    """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were there before."""
+    """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were
+    there before.
+    """
     turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(np.float64) / 2**32 - 0.5
     return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)

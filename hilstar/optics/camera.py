@@ -1,9 +1,11 @@
-"""From directions to pixels and back, in float64: a pinhole (thesis eq. 4.1, 4.2), or one with a real lens and a tilted screen.
+"""From directions to pixels and back, in float64: a pinhole (thesis eq. 4.1, 4.2), or one with a
+real lens and a tilted screen.
 
-A direction (u, v, 1) in image axes is bent by Brown's polynomials (Brown 1966, eq. 13, in Conrady's form), meets a plane that
-is tilted about the foot of the axis, and is moved by a smooth residual field over the pixels. All three are closed forms from
-direction to pixel, which every frame uses; `Camera.tangents` is the inverse. The renderer's rays are a pinhole's in closed
-form plus the lens's shift on a coarse grid.
+A direction (u, v, 1) in image axes is bent by Brown's polynomials (Brown 1966, eq. 13, in Conrady's
+form), meets a plane that is tilted about the foot of the axis, and is moved by a smooth residual
+field over the pixels. All three are closed forms from direction to pixel, which every frame uses;
+`Camera.tangents` is the inverse. The renderer's rays are a pinhole's in closed form plus the lens's
+shift on a coarse grid.
 """
 
 from dataclasses import dataclass, replace
@@ -15,18 +17,22 @@ import numpy as np
 from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 
-FIELD_EDGE = 1.1  # in half images: beyond it the residual field is held constant, because its polynomials diverge
+# in half images: beyond it the residual field is held constant, because its polynomials diverge
+FIELD_EDGE = 1.1
 
 ANY_TANGENT = (-1e9, 1e9)  # finite, so that products stay finite
-# Between nodes the shift is linear. A lens that shifts the corner of 1920 x 1080 px by 50 px, growing with the cube of the
-# radius, bends by 3e-4 px per px squared there: 8^2 / 8 of that is 0.002 px.
+# Between nodes the shift is linear. A lens that shifts the corner of 1920 x 1080 px by 50 px,
+# growing with the cube of the radius, bends by 3e-4 px per px squared there: 8^2 / 8 of that is
+# 0.002 px.
 NODE_STEP_PX = 8
 SPEED_PLACES = 9  # along each side of the image: a speed's components are quadratic in the place
 BORDER_PLACES = 33  # along each side of the image
-BOW = 1 / BORDER_PLACES**2  # margin around all sides: twice the sag of a parabola between two places, whatever its curvature
+# margin around all sides: twice the sag of a parabola between two places, whatever its curvature
+BOW = 1 / BORDER_PLACES**2
 FOLD_PLACES = 41  # across the disc in which a lens must not fold
 NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild lens needs one
-# In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough.
+# In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10,
+# which is enough.
 NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
@@ -36,7 +42,8 @@ MAX_TANGENT = 1e3  # a longer step has diverged
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualField:
-    """A smooth shift of pixels: sums of Chebyshev polynomials over the image, `x` and `y` (n, n) coefficients in px.
+    """A smooth shift of pixels: sums of Chebyshev polynomials over the image, `x` and `y` (n, n)
+    coefficients in px.
 
     Entry (i, j) belongs to T_i of the column and T_j of the row, both from -1 to 1 over the image.
     """
@@ -94,10 +101,12 @@ def _polynomials(
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Distortion k1 to k3 and p1, p2 (of tangents of field angles), the plane's tilt about its x and y axes, and the field.
+    """Distortion k1 to k3 and p1, p2 (of tangents of field angles), the plane's tilt about its x
+    and y axes, and the field.
 
-    `max_tangent` bounds the directions that it is used for: the largest radius of (u, v) that reaches the image, or that was
-    calibrated. Farther out the polynomials turn back, and would show stars that are not in view. `box` bounds u and v.
+    `max_tangent` bounds the directions that it is used for: the largest radius of (u, v) that
+    reaches the image, or that was calibrated. Farther out the polynomials turn back, and would show
+    stars that are not in view. `box` bounds u and v.
     """
 
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -108,7 +117,9 @@ class Lens:
     box: tuple[tuple[float, float], tuple[float, float]] = (ANY_TANGENT, ANY_TANGENT)
 
     def bent(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places on the tilted plane, in focal lengths from the foot of the axis, of directions (u, v, 1); NaN beyond."""
+        """Places on the tilted plane, in focal lengths from the foot of the axis, of directions
+        (u, v, 1); NaN beyond.
+        """
         k1, k2, k3 = self.radial
         p1, p2 = self.tangential
         r2 = u * u + v * v
@@ -131,7 +142,9 @@ class Lens:
 
 @lru_cache(maxsize=16)
 def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
-    """The matrix (3, 3) that maps rays to homogeneous places on a plane through (0, 0, 1), turned about x and then about y."""
+    """The matrix (3, 3) that maps rays to homogeneous places on a plane through (0, 0, 1),
+    turned about x and then about y.
+    """
     a, b = tilt_rad
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
@@ -142,10 +155,11 @@ def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
 
 
 def ray_shifts(camera: "Camera") -> Float32Array:
-    """The difference between a lens and a pinhole: tangents (u, v), float32 (rows, columns, 2), at nodes over the image.
+    """The difference between a lens and a pinhole: tangents (u, v), float32 (rows, columns, 2), at
+    nodes over the image.
 
-    The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's likewise. Where the lens
-    has no direction the shift is 0.
+    The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's
+    likewise. Where the lens has no direction the shift is 0.
     """
     places = [np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1) for size in camera.resolution_px]
     x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
@@ -166,10 +180,11 @@ class Slopes(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
+    """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y
+    down.
 
-    `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its normal). A `lens` of None is
-    the ideal pinhole.
+    `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its
+    normal). A `lens` of None is the ideal pinhole.
     """
 
     resolution_px: tuple[int, int]
@@ -179,7 +194,9 @@ class Camera:
     lens: Lens | None = None
 
     def project(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the camera."""
+        """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the
+        camera.
+        """
         z = image_vectors[:, 2]
         if self.lens is None:
             scale = _over(self.focal_length_px, z)
@@ -192,7 +209,9 @@ class Camera:
         return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
 
     def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `project`, but beyond the lens on straight lines away from the image: a path may begin and end there."""
+        """As `project`, but beyond the lens on straight lines away from the image: a path may
+        begin and end there.
+        """
         if self.lens is None:
             return self.project(image_vectors)
         near = _over(1.0, image_vectors[:, 2])
@@ -231,7 +250,8 @@ class Camera:
         return x_px + dx_px, y_px + dy_px
 
     def tangents(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The direction (u, v, 1) in image axes of each pixel, (n,) each: the inverse of `places_px`, to 1e-8 px.
+        """The direction (u, v, 1) in image axes of each pixel, (n,) each: the inverse of
+        `places_px`, to 1e-8 px.
 
         By Newton's method; NaN where it finds none, and beyond the lens.
         """
@@ -240,7 +260,8 @@ class Camera:
         u, v = (x_px - cx) / self.focal_length_px, (y_px - cy) / self.focal_length_px
         if self.lens is None:
             return u, v
-        free = replace(self, lens=replace(self.lens, max_tangent=np.inf))  # a step may go beyond the bound
+        # a step may go beyond the bound
+        free = replace(self, lens=replace(self.lens, max_tangent=np.inf))
         size = np.full_like(u, np.inf)
         for _ in range(NEWTON_ROUNDS):
             if not (size > NEWTON_DONE).any():
@@ -279,7 +300,9 @@ class Camera:
         return np.asarray(1 / ((a * d - b * c) * (1 + u * u + v * v) ** 1.5))
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
-        """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %."""
+        """The fastest that a direction crosses the image at a rate (3,) of the camera in image
+        axes, px/s; within 2 %.
+        """
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         step = -np.cross(rate_image_rad_s, np.stack([u, v, np.ones_like(u)], axis=-1))
         du, dv = step[..., 0] - u * step[..., 2], step[..., 1] - v * step[..., 2]
@@ -289,12 +312,15 @@ class Camera:
         return float(np.nanmax(np.hypot(a * du + b * dv, c * du + d * dv)))
 
     def scales_px_rad(self) -> tuple[float, float]:
-        """The smallest and the largest number of pixels to a radian anywhere on the image; a pinhole's are both its axis's."""
+        """The smallest and the largest number of pixels to a radian anywhere on the image; a
+        pinhole's are both its axis's.
+        """
         if self.lens is None:
             return self.focal_length_px, self.focal_length_px
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         a, b, c, d = self.slopes(u, v)
-        # A tangent's step (du, dv) is an angle by the metric of the sphere, whose inverse is (1 + r^2) (1 + w w^T), w = (u, v).
+        # A tangent's step (du, dv) is an angle by the metric of the sphere, whose inverse is (1 +
+        # r^2) (1 + w w^T), w = (u, v).
         along_x, along_y, wide = a * u + b * v, c * u + d * v, 1 + u * u + v * v
         xx, yy = wide * (a * a + b * b + along_x**2), wide * (c * c + d * d + along_y**2)
         xy = wide * (a * c + b * d + along_x * along_y)
@@ -302,13 +328,17 @@ class Camera:
         return float(np.sqrt(np.nanmin(middle - spread))), float(np.sqrt(np.nanmax(middle + spread)))
 
     def grid_px(self, count: int | tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Places over the whole image, its edges among them: `count` to a row and a column, or (columns, rows)."""
+        """Places over the whole image, its edges among them: `count` to a row and a column, or
+        (columns, rows).
+        """
         counts = (count, count) if isinstance(count, int) else count
         x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(self.resolution_px, counts, strict=True)))
         return x.ravel(), y.ravel()
 
     def pixels_from(self, other: "Camera", x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """This camera's pixels at pixels (n,) of another; NaN behind this camera, and beyond a lens."""
+        """This camera's pixels at pixels (n,) of another; NaN behind this camera, and beyond a
+        lens.
+        """
         if other is self:
             return np.asarray(x_px, dtype=np.float64), np.asarray(y_px, dtype=np.float64)
         return self.project(other.rays(x_px, y_px) @ self.cam_to_image.T)
@@ -320,9 +350,11 @@ class Camera:
             return np.asarray((np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2))
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
-        """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the image, and some more.
+        """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the
+        image, and some more.
 
-        A direction comes there if one within `reach_rad` of it is there (with a lens, within its own margin).
+        A direction comes there if one within `reach_rad` of it is there (with a lens, within its
+        own margin).
         """
         radius = float(np.tan(self.field_radius_rad(margin_px)))
         angle_rad = np.arctan(radius) + reach_rad
@@ -337,7 +369,9 @@ class Camera:
         return np.flatnonzero(inside)
 
     def _box(self, margin_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The smallest and the largest u, and v, of directions (u, v, 1) within `margin_px` of the image."""
+        """The smallest and the largest u, and v, of directions (u, v, 1) within `margin_px` of
+        the image.
+        """
         if self.lens is not None:
             return self.lens.box
         pairs = zip(self.principal_point_px, self.resolution_px, strict=True)
@@ -347,7 +381,8 @@ class Camera:
         return x, y
 
     def edges(self, margin_px: float) -> FloatArray:
-        """The planes of the image's sides, `margin_px` outside it: their inward unit normals (4, 3) in image axes.
+        """The planes of the image's sides, `margin_px` outside it: their inward unit normals (4, 3)
+        in image axes.
 
         With a lens they are those of the box around its directions.
         """
@@ -356,11 +391,15 @@ class Camera:
         return np.asarray(normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)))
 
     def field(self, margin_px: float) -> tuple[float, FloatArray]:
-        """`field_radius_rad` and `edges`, which are the same for every frame, of the last few margins."""
+        """`field_radius_rad` and `edges`, which are the same for every frame, of the last few
+        margins.
+        """
         return _field(self, margin_px)
 
     def field_radius_rad(self, margin_px: float) -> float:
-        """The angle from the image's normal to its farthest corner, `margin_px` outside it (with a lens, its own margin)."""
+        """The angle from the image's normal to its farthest corner, `margin_px` outside it (with
+        a lens, its own margin).
+        """
         if self.lens is not None:
             return float(np.arctan(self.lens.max_tangent))
         width, height = self.resolution_px
@@ -371,7 +410,9 @@ class Camera:
 
 
 def linear_shares(size: int, count: int) -> FloatArray:
-    """The share (size, count) of each place of `grid_px` in each pixel of a row: linear between neighbours."""
+    """The share (size, count) of each place of `grid_px` in each pixel of a row: linear between
+    neighbours.
+    """
     at = (np.arange(size) + 0.5) * (count - 1) / size
     return np.asarray(np.maximum(0.0, 1 - np.abs(at[:, None] - np.arange(count))))
 
@@ -391,9 +432,11 @@ def _over(size: float, z: FloatArray) -> FloatArray:
 
 
 def bounded(camera: Camera, margin_px: float) -> Camera:
-    """The camera with its lens bounded to what reaches the image, `margin_px` around it included, and to what it is known for.
+    """The camera with its lens bounded to what reaches the image, `margin_px` around it included,
+    and to what it is known for.
 
-    Raises InputError for a lens that folds within those directions: two of them would share a pixel.
+    Raises InputError for a lens that folds within those directions: two of them would share a
+    pixel.
     """
     lens = camera.lens
     if lens is None:
@@ -418,6 +461,8 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
 
 
 def _wide(tangents: FloatArray) -> tuple[float, float]:
-    """The smallest and the largest, and a little more: a side may bow between two of its places; all, where one is unknown."""
+    """The smallest and the largest, and a little more: a side may bow between two of its places;
+    all, where one is unknown.
+    """
     low, high = float(tangents.min()), float(tangents.max())
     return (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT

@@ -1,10 +1,12 @@
 """Stars seen by a camera that turns during its exposure: each star's path as a chain of sprites.
 
-The mean of a star's light over the exposure is an integral over time; Gauss-Legendre quadrature turns it into a sum of
-sprites whose light adds up to the star's. It is exact in the limit, so each star gets only the sprites that its path needs.
+The mean of a star's light over the exposure is an integral over time; Gauss-Legendre quadrature
+turns it into a sum of sprites whose light adds up to the star's. It is exact in the limit, so each
+star gets only the sprites that its path needs.
 
-Where rows are exposed one after the other, time on a path is that of the row on which the star is. A star that runs with the
-rows is exposed for longer, by 1 / (1 - the rows that it crosses while one is read). Its PSF is as wide as at one moment.
+Where rows are exposed one after the other, time on a path is that of the row on which the star is.
+A star that runs with the rows is exposed for longer, by 1 / (1 - the rows that it crosses while one
+is read). Its PSF is as wide as at one moment.
 """
 
 import itertools
@@ -22,16 +24,19 @@ from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import Stars
 
-# With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's flux (measured for sigma
-# 0.3 to 3 px and r up to 300; tests/unit/optics/test_exposure_motion.py holds it). A path under 0.005 sigma is a point to 1e-6.
-# results/tradeoff.csv, smear: evenly spaced sprites are slower and worse.
+# With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's
+# flux (measured for sigma 0.3 to 3 px and r up to 300; tests/unit/optics/test_exposure_motion.py
+# holds it). A path under 0.005 sigma is a point to 1e-6. results/tradeoff.csv, smear: evenly spaced
+# sprites are slower and worse.
 NODES_PER_SIGMA = 1.02
 NODES_AT_REST = 3
 MIN_PATH_SIGMA = 0.005
-# A longer turn is cut into pieces of this angle, so that each is short compared with the field and has enough nodes.
+# A longer turn is cut into pieces of this angle, so that each is short compared with the field and
+# has enough nodes.
 MAX_PIECE_RAD = 0.05
 MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
-# An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes farther apart.
+# An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes
+# farther apart.
 MAX_PIECES = 20_000
 MAX_SPRITES = 2_000_000
 COARSER = 0.25
@@ -44,7 +49,8 @@ ROUNDS, SETTLED_S = 40, 1e-10
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """An exposure: the attitude in its middle, the rate of cam in icrs (3,) in cam components, how long it lasts, and when.
+    """An exposure: the attitude in its middle, the rate of cam in icrs (3,) in cam components, how
+    long it lasts, and when.
 
     `t_ns` is the time of its middle, None where it has none.
     """
@@ -55,7 +61,8 @@ class Motion:
     t_ns: int | None = None
 
     def icrs_to_image(self, seconds: FloatArray, camera: Camera) -> FloatArray:
-        """Matrices (k, 3, 3) from ICRS to image axes at `seconds` (k,) after the middle of the exposure.
+        """Matrices (k, 3, 3) from ICRS to image axes at `seconds` (k,) after the middle of the
+        exposure.
 
         A constant rate turns about one axis: Rodrigues' formula on the attitude in the middle.
         """
@@ -68,7 +75,8 @@ class Motion:
 
 
 def own_row_s(paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan) -> tuple[FloatArray, FloatArray]:
-    """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt / ds: how much longer that is.
+    """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt /
+    ds: how much longer that is.
 
     Seconds count from the middle of the middle row's exposure.
     """
@@ -88,8 +96,9 @@ def own_row_s(paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: S
 def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan: Scan = AT_ONCE) -> Sprites:
     """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
 
-    `scan` says over how long rows begin, and in which direction. `capped` stars are drawn coarser than NODES_PER_SIGMA where
-    all would be more than MAX_SPRITES. Raises InputError for a turn too long to be drawn at all.
+    `scan` says over how long rows begin, and in which direction. `capped` stars are drawn coarser
+    than NODES_PER_SIGMA where all would be more than MAX_SPRITES. Raises InputError for a turn too
+    long to be drawn at all.
     """
     if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
         return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px)
@@ -101,7 +110,8 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan
         raise InputError(
             f"the camera turns by {fastest_px_s * row_s:.3g} px while a row is read; shorten row_time_us or turn more slowly"
         )
-    # Each piece of the turn is short compared with the field and, anywhere on the image, with its nodes.
+    # Each piece of the turn is short compared with the field and, anywhere on the image, with its
+    # nodes.
     angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
     path_sigma = fastest_px_s * motion.exposure_s / min(psf.width_px)
     needed = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)

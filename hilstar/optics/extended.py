@@ -1,8 +1,10 @@
-"""Light that is no star's sprite: discs of bodies and maps of light, added to the linear image before levels are chosen.
+"""Light that is no star's sprite: discs of bodies and maps of light, added to the linear image
+before levels are chosen.
 
-Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's `Sprites.extended` and is
-drawn in order, before the sprites. Compared by identity: one object drawn twice is the same light. A small disc is a map of
-its spread places, a larger one is drawn ray by ray.
+Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's
+`Sprites.extended` and is drawn in order, before the sprites. Compared by identity: one object drawn
+twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray by
+ray.
 """
 
 from dataclasses import dataclass, replace
@@ -17,26 +19,32 @@ from hilstar.sky.bodies.disc import AIR_TOP, Disc
 
 REACH_SIGMAS = 4.0  # as in disc.frag
 LIMB_PLACES = 128
-BEHIND = 0.05  # minimum z of a unit direction: a limb nearer to the camera's plane has no useful outline
+# minimum z of a unit direction: a limb nearer to the camera's plane has no useful outline
+BEHIND = 0.05
 BOW = 1.01  # margin for the outline's curvature between its places
 Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
-# Below this radius (PSF and pixel combined) a disc's limb and centre cannot be told apart; disc.frag is off by 1 % at 5.5.
+# Below this radius (PSF and pixel combined) a disc's limb and centre cannot be told apart;
+# disc.frag is off by 1 % at 5.5.
 SMALL_SIGMAS = 8.0
 NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
-WHOLE = 0.999  # coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times white
+# coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times
+# white
+WHOLE = 0.999
 MAX_NODES = 64  # enough for a Gaussian ten times as wide along one axis as along the other
 MIN_NODES = 10  # 1e-4 of the light
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightMap:
-    """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px` (x, y) of the image.
+    """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px`
+    (x, y) of the image.
 
-    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing. `name` is the
-    body's whose disc it is; other light has the colour of its `bv_mag`, None: of the stars.
+    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None
+    hides nothing. `name` is the body's whose disc it is; other light has the colour of its
+    `bv_mag`, None: of the stars.
 
-    Keep one array for as long as the light is the same, and do not write to it: it is uploaded once. What a single frame has is
-    not `lasting`.
+    Keep one array for as long as the light is the same, and do not write to it: it is uploaded
+    once. What a single frame has is not `lasting`.
     """
 
     image: Float32Array
@@ -56,7 +64,8 @@ class LightMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlowLight:
-    """A glow about a direction (3,), unit, image axes: `peak_e_per_s` (1 + (angle / scale)^2)^(-exponent / 2) in each pixel.
+    """A glow about a direction (3,), unit, image axes: `peak_e_per_s` (1 + (angle /
+    scale)^2)^(-exponent / 2) in each pixel.
 
     The direction may be off the image, or behind the camera.
     """
@@ -75,9 +84,11 @@ class GlowLight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shear:
-    """A camera that turns at `rate_image_rad_s` (3,), image axes, while pixels light up one after the other.
+    """A camera that turns at `rate_image_rad_s` (3,), image axes, while pixels light up one after
+    the other.
 
-    A pixel is lit `s_per_px` (x, y) times its distance from `middle_px` after the moment of the attitude.
+    A pixel is lit `s_per_px` (x, y) times its distance from `middle_px` after the moment of the
+    attitude.
     """
 
     rate_image_rad_s: FloatArray
@@ -94,7 +105,8 @@ class Shear:
 class DiscLight:
     """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
 
-    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `disc_lights`
+    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it.
+    `disc_lights`
     chooses between it and, for a small disc, a map.
     """
 
@@ -112,7 +124,9 @@ class DiscLight:
         return self.disc.name
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
-        """The pixels within the outline of its limb, its air and the Gaussian's reach; all where that is partly behind."""
+        """The pixels within the outline of its limb, its air and the Gaussian's reach; all where
+        that is partly behind.
+        """
         air = 1 + AIR_TOP * self.disc.air_radii
         seen = self.disc.limb(LIMB_PLACES, air) @ self.icrs_to_image.T
         if (seen[:, 2] < BEHIND).any():
@@ -161,7 +175,9 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
 
 
 def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
-    """The pixels of an image within left, top, right and bottom (the last two excluded); None where there is none."""
+    """The pixels of an image within left, top, right and bottom (the last two excluded); None
+    where there is none.
+    """
     (left, right), (top, bottom) = (
         np.clip((np.floor(edges_px[k]), np.ceil(edges_px[k + 2])), 0, resolution_px[k]).astype(int).tolist() for k in (0, 1)
     )
@@ -170,7 +186,9 @@ def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[in
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """The camera at one moment of a frame: the map (3, 3) of ICRS to image axes, and the moment's share of the light."""
+    """The camera at one moment of a frame: the map (3, 3) of ICRS to image axes, and the
+    moment's share of the light.
+    """
 
     icrs_to_image: FloatArray
     share: float = 1.0
@@ -178,7 +196,9 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class DiscView:
-    """A camera and the PSF that spreads its image, at the poses of a frame, and how it turns meanwhile."""
+    """A camera and the PSF that spreads its image, at the poses of a frame, and how it turns
+    meanwhile.
+    """
 
     camera: Camera
     psf: Psf
@@ -187,13 +207,16 @@ class DiscView:
 
 
 def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]:
-    """A body's disc at all poses, none of it where it does not touch the image; where it `covers`, it hides what is behind."""
+    """A body's disc at all poses, none of it where it does not touch the image; where it
+    `covers`, it hides what is behind.
+    """
     if len(view.poses) == 1:
         pose = view.poses[0]
         return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, covers, view.shear))
     lights: list[ExtendedLight] = []
     if covers:
-        # Poses hide together what one in the middle hides: each after the other would hide the light of those before.
+        # Poses hide together what one in the middle hides: each after the other would hide the
+        # light of those before.
         middle = view.poses[len(view.poses) // 2].icrs_to_image
         lights += _at_pose(DiscLight(disc, middle, view.camera, view.psf, 0.0, True, view.shear))
     for pose in view.poses:
@@ -222,7 +245,9 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
 
 
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
-    """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
+    """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be
+    seen.
+    """
     disc, camera, reach_px = light.disc, light.camera, light.psf.footprint_px / 2
     lit = _places(light, disc, nodes)
     whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else lit
@@ -246,7 +271,9 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
 
 
 class FacePlaces(NamedTuple):
-    """Places of a disc's face in pixels, and the value of its law times the steradians of each, (n,) each."""
+    """Places of a disc's face in pixels, and the value of its law times the steradians of each,
+    (n,) each.
+    """
 
     x_px: FloatArray
     y_px: FloatArray

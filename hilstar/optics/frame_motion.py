@@ -1,9 +1,10 @@
 """Stars of one frame of a screen that lights row by row, while the camera turns.
 
-Row y of a screen lights up a part of a refresh period later than the first row, and holds its light until it is written
-again. So a star is drawn where it is while its row is lit: on its path from the moment when that row lights up until the row
-that it has reached by then is written again, as a chain of sprites. Frame by frame the paths join to one streak. A star that
-runs with the scan meets fewer frames in a second, and has more light in each: 1 % at 10 deg/s, which would else be missing.
+Row y of a screen lights up a part of a refresh period later than the first row, and holds its light
+until it is written again. So a star is drawn where it is while its row is lit: on its path from the
+moment when that row lights up until the row that it has reached by then is written again, as a
+chain of sprites. Frame by frame the paths join to one streak. A star that runs with the scan meets
+fewer frames in a second, and has more light in each: 1 % at 10 deg/s, which would else be missing.
 """
 
 from dataclasses import dataclass, replace
@@ -18,15 +19,17 @@ from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
-# With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
-# 0.5 to 2 px and r to 30; tests/unit/optics/test_frame_motion.py holds it): its flux and centroid are exact with any number.
+# With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's
+# flux (measured for sigma 0.5 to 2 px and r to 30; tests/unit/optics/test_frame_motion.py holds
+# it): its flux and centroid are exact with any number.
 NODES_PER_SIGMA = 0.6
 # A path of this many sigmas is a point to 1e-3 of the star's flux.
 POINT_SIGMA = 0.27
-# A frame's work is bounded: beyond one sprite per star all paths together get EXTRA_SPRITES (of EXTRA_PX pixels), and no
-# path is longer than MAX_TURN_FIELD of the field's radius. Beyond that, paths have fewer nodes or are those of a slower turn,
-# and the stars are counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
-# (python -m tests.benchmarks.bench_motion).
+# A frame's work is bounded: beyond one sprite per star all paths together get EXTRA_SPRITES (of
+# EXTRA_PX pixels), and no path is longer than MAX_TURN_FIELD of the field's radius. Beyond that,
+# paths have fewer nodes or are those of a slower turn, and the stars are counted. With 1000 stars
+# in view the longest frame then takes at most 1.8 times as long as a still one (python -m
+# tests.benchmarks.bench_motion).
 EXTRA_SPRITES = 1000
 EXTRA_PX = 400_000
 MAX_TURN_FIELD = 0.5
@@ -47,7 +50,9 @@ class Orientation:
 
     @property
     def down(self) -> tuple[int, int]:
-        """The direction of the screen's rows, from first to last, in image axes (x right, y down)."""
+        """The direction of the screen's rows, from first to last, in image axes (x right, y
+        down).
+        """
         x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
         return (-x, -y) if self.flip_y else (x, y)
 
@@ -63,7 +68,8 @@ class Orientation:
 class Scan:
     """How a screen lights up: its rows in turn over `scanout_s`, each for `hold_s`.
 
-    `down` is the direction of the screen's rows in image axes (x right, y down), one of the four along an axis.
+    `down` is the direction of the screen's rows in image axes (x right, y down), one of the four
+    along an axis.
     """
 
     down: tuple[int, int] = (0, 1)
@@ -77,11 +83,15 @@ class Scan:
 
     @property
     def longest_s(self) -> float:
-        """The longest time that a star of the frame may have moved, counted from the middle row's first light."""
+        """The longest time that a star of the frame may have moved, counted from the middle
+        row's first light.
+        """
         return self.scanout_s / 2 + self.hold_s
 
     def late_s(self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
-        """How long after the middle row the row of a pixel lights up; off the image as at its edge."""
+        """How long after the middle row the row of a pixel lights up; off the image as at its
+        edge.
+        """
         middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
         rows = resolution_px[0] if self.down[0] else resolution_px[1]
         place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
@@ -90,7 +100,9 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class CameraTurn:
-    """The attitude when the middle row lights up, and the rate of cam in icrs (3,), cam components, constant over the frame."""
+    """The attitude when the middle row lights up, and the rate of cam in icrs (3,), cam
+    components, constant over the frame.
+    """
 
     q_icrs_to_cam: FloatArray
     rate_cam_rad_s: FloatArray
@@ -102,9 +114,11 @@ class CameraTurn:
 
 
 def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, psf: Psf) -> Sprites:
-    """Sprites of each star on its path while its row is lit; the sprites of a star follow each other.
+    """Sprites of each star on its path while its row is lit; the sprites of a star follow each
+    other.
 
-    `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
+    `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn
+    makes them.
     """
     turn, is_slower = slowed(turn, scan, camera)
     middle = CameraTurn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
@@ -120,22 +134,26 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
     paths = _paths(seen[close], turn, scan, camera)
     late_s = np.zeros(len(paths))  # how long after the middle row each star's own row lights up
     for _ in range(2 if scan.scanout_s else 0):
-        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
+        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5
+        # of it for 5 px in 1080 rows.
         x_px, y_px = paths.places_px(EVERY, late_s)
         late_s = scan.late_s(x_px, y_px, camera.resolution_px)
     late_s = np.where(np.isfinite(late_s), late_s, 0.0)
     ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
     chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
-    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
+    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the
+    # turn.
     bulge_px = paths.speed_rad_s * scan.hold_s * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
-    # From the first light of the row where a path begins until the row where it ends is written again: a star that falls by a
-    # share s of the rows that the panel lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
+    # From the first light of the row where a path begins until the row where it ends is written
+    # again: a star that falls by a share s of the rows that the panel lights meanwhile is overtaken
+    # by the panel hold / (1 - s) after the first.
     span_s = np.zeros(len(late_s))
     if scan.hold_s:
         share = (scan.late_s(*ends[1], camera.resolution_px) - late_s) / scan.hold_s
         span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
         chords = chords.to(span_s / scan.hold_s)
-    first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)  # the part of each path, 0 to 1
+    # the part of each path, 0 to 1
+    first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)
     wanted = node_counts(chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA)
     wanted[last <= first] = 0  # the path misses the image
     chosen, wanting = wanted, np.flatnonzero(wanted)
@@ -160,7 +178,8 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
 def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
     """The stars' paths while their rows are lit, seconds from the middle row's first light."""
     exact = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
-    # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the star's.
+    # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the
+    # star's.
     wrong_px = bend_px(camera) + turn.speed_rad_s * scan.longest_s * camera.focal_length_px
     half_s = scan.hold_s / 2 + scan.scanout_s * min(1.0, wrong_px / min(camera.resolution_px))
     points = points_within(camera, turn.speed_rad_s * half_s)
@@ -171,7 +190,9 @@ def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Pa
 
 
 def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
-    """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
+    """The turn itself, or one about the same axis that takes no star farther than
+    MAX_TURN_FIELD; and whether it is slower.
+    """
     angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:
         return turn, False

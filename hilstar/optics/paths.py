@@ -1,8 +1,10 @@
-"""A star's path across the image as sprites: the part on the image, and the number of its Gauss-Legendre nodes.
+"""A star's path across the image as sprites: the part on the image, and the number of its
+Gauss-Legendre nodes.
 
 Paths of stars over a short turn as polynomials in time, through a few places that are exact.
 
-A place on such a path costs two short sums, where an exact one costs a rotation and, behind a real lens, a hundred operations.
+A place on such a path costs two short sums, where an exact one costs a rotation and, behind a real
+lens, a hundred operations.
 """
 
 from bisect import bisect_left
@@ -17,30 +19,41 @@ import numpy.typing as npt
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.optics.camera import Camera, Lens
 
-MAX_NODES = 64  # on one path: leggauss is an eigenvalue problem, 1 ms for 64 nodes and minutes for 10 000
-# A place may be off by the larger of these: px, and of the path's length within the turn. Either changes a pixel of a star of
-# sigma 0.5 px by 5e-4 of its flux, half of what the nodes may: the longer a path, the fainter it is.
+# on one path: leggauss is an eigenvalue problem, 1 ms for 64 nodes and minutes for 10 000
+MAX_NODES = 64
+# A place may be off by the larger of these: px, and of the path's length within the turn. Either
+# changes a pixel of a star of sigma 0.5 px by 5e-4 of its flux, half of what the nodes may: the
+# longer a path, the fainter it is.
 LIMIT_PX = 1e-3
 LIMIT_SHARE = 5e-4
 POINTS = (2, 3)
-# Through a lens one place, with slopes and curvature of the lens there, costs less than two exact ones and reaches farther.
+# Through a lens one place, with slopes and curvature of the lens there, costs less than two exact
+# ones and reaches farther.
 LENS_POINTS = (1, 3)
-TABLE_STEPS = 240  # across the wider side of a lens's table, which reaches BESIDE_TABLE of a side beyond the lens's box
+# across the wider side of a lens's table, which reaches BESIDE_TABLE of a side beyond the lens's
+# box
+TABLE_STEPS = 240
 BESIDE_TABLE = 0.05
 TABLE_PX = LIMIT_PX / 2  # what a table may be off on the image
 WIDEST_TABLE = 2.5  # largest tangent: beyond it a path may begin behind the camera
-# Half a turn that 3 points draw through 350 mm and a strong lens with a field of degree 6: 0.29 deg, 28 deg/s at 60 Hz.
+# Half a turn that 3 points draw through 350 mm and a strong lens with a field of degree 6: 0.29
+# deg, 28 deg/s at 60 Hz.
 MAX_HALF_TURN_RAD = 0.04
-NARROWER = 2**-0.25  # from one half turn that is tried to the next; the error falls with its power of the number of points
+# from one half turn that is tried to the next; the error falls with its power of the number of
+# points
+NARROWER = 2**-0.25
 TRIES = 40
 TRIED_PLACES, TRIED_MOMENTS = 13, 9  # along each side of the image, and within a turn
 TRIED_AXES = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (0.0, 1.0) if (x, y, z) != (0.0, 0.0, 0.0)]
-# A path may begin or end beyond what its lens is known for. Straight lines from there would put a kink into it.
+# A path may begin or end beyond what its lens is known for. Straight lines from there would put a
+# kink into it.
 BEYOND_LENS = 1.05
 
 
 class NodeTable(NamedTuple):
-    """Gauss-Legendre nodes and weights over -1 to 1 for all counts to MAX_NODES, end to end; each count's begin at `first`."""
+    """Gauss-Legendre nodes and weights over -1 to 1 for all counts to MAX_NODES, end to end;
+    each count's begin at `first`.
+    """
 
     first: IntArray
     places: FloatArray
@@ -56,7 +69,9 @@ def _node_table() -> NodeTable:
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """Nodes of several paths, end to end: the path of each, its place from -1 to 1 on it, and its share of the path's light."""
+    """Nodes of several paths, end to end: the path of each, its place from -1 to 1 on it, and
+    its share of the path's light.
+    """
 
     path: IntArray
     place: FloatArray
@@ -73,7 +88,8 @@ def nodes_of(counts: IntArray) -> Nodes:
 
 
 def within_budget(wanted: IntArray, extra: int) -> IntArray:
-    """The nodes (n,) that paths get of those they want: at most MAX_NODES each, and at most `extra` beyond one each.
+    """The nodes (n,) that paths get of those they want: at most MAX_NODES each, and at most `extra`
+    beyond one each.
 
     What exceeds `extra` is reduced in proportion; a path that wants any keeps one.
     """
@@ -86,7 +102,8 @@ def within_budget(wanted: IntArray, extra: int) -> IntArray:
 
 
 class Paths:
-    """Directions (n, 3) in image axes, seen by a camera that turns with a constant rate (3,) in the same axes, rad/s.
+    """Directions (n, 3) in image axes, seen by a camera that turns with a constant rate (3,) in the
+    same axes, rad/s.
 
     By Rodrigues' formula; seconds count from the moment when the directions are those given.
     """
@@ -111,17 +128,23 @@ class Paths:
         return paths
 
     def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,); NaN behind the camera."""
+        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,);
+        NaN behind the camera.
+        """
         return self._places_px(self._seen[:, star], self._cross[:, star], self._along[:, star], seconds)
 
     def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN behind the camera."""
+        """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN
+        behind the camera.
+        """
         shape = len(seconds), len(self)
         x_px, y_px = self._places_px(self._seen[:, None], self._cross[:, None], self._along[:, None], seconds)
         return x_px.reshape(shape), y_px.reshape(shape)
 
     def tangents_at(self, seconds: FloatArray, unit_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of the change of that."""
+        """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of
+        the change of that.
+        """
         angle, turn = self.speed_rad_s * seconds, self.speed_rad_s * unit_s
         cosine, sine = np.cos(angle), np.sin(angle)
         across, faster = self._seen - self._along, self._cross * cosine
@@ -149,7 +172,9 @@ class Paths:
 
 @dataclass(frozen=True, slots=True)
 class Chords:
-    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind the camera."""
+    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind
+    the camera.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -160,15 +185,19 @@ class Chords:
         return Chords(x_px, y_px)
 
     def length_sigma(self, width_px: tuple[float, float]) -> FloatArray:
-        """How long each is in widths of a PSF (see `Psf.width_px`); NaN where an end is behind the camera."""
+        """How long each is in widths of a PSF (see `Psf.width_px`); NaN where an end is behind
+        the camera.
+        """
         return np.asarray(
             np.hypot(*(np.diff(ends, axis=0)[0] / s for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)))
         )
 
     def on_image(self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Begin and end (n,) of the part of each, 0 to 1, that is within `margin_px` of the image; 1 and 0 for none.
+        """Begin and end (n,) of the part of each, 0 to 1, that is within `margin_px` of the image;
+        1 and 0 for none.
 
-        (Liang and Barsky 1984.) A chord with one end behind the camera counts whole where the other end is on the image.
+        (Liang and Barsky 1984.) A chord with one end behind the camera counts whole where the other
+        end is on the image.
         """
         begin, end = np.zeros(self.x_px.shape[1]), np.ones(self.x_px.shape[1])
         for ends, size in ((self.x_px, resolution_px[0]), (self.y_px, resolution_px[1])):
@@ -200,9 +229,11 @@ def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shorte
 
 
 class ShortPaths:
-    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of its places as `points`.
+    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of
+    its places as `points`.
 
-    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature are the path's too.
+    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature
+    are the path's too.
     Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
     """
 
@@ -236,10 +267,11 @@ class ShortPaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensTable:
-    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over its box.
+    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over
+    its box.
 
-    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and vv / 2. On the image places
-    are off by up to `off_px`.
+    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and
+    vv / 2. On the image places are off by up to `off_px`.
     """
 
     first: FloatArray
@@ -249,7 +281,9 @@ class LensTable:
     off_px: float = 0.0
 
     def along(self, at: FloatArray, by: FloatArray, bend: FloatArray) -> FloatArray:
-        """The terms (3, 2, n) of 1, t and t^2 of the pixels of tangents at + by t + bend t^2, each (2, n)."""
+        """The terms (3, 2, n) of 1, t and t^2 of the pixels of tangents at + by t + bend t^2,
+        each (2, n).
+        """
         off = (at - self.first) * self.steps
         node = np.rint(off)
         for of_side, size in zip(node, self.shape, strict=True):
@@ -275,12 +309,15 @@ def _mapping(camera: Camera) -> tuple[tuple[int, int], float, tuple[float, float
 
 @lru_cache(maxsize=4)
 def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens) -> LensTable:
-    """The table of a bounded lens: its places at the grid's nodes, their slopes and bends by differences."""
+    """The table of a bounded lens: its places at the grid's nodes, their slopes and bends by
+    differences.
+    """
     camera = _beyond(Camera(size_px, focal_px, principal_px, np.eye(3), lens))
     low, high = np.clip(np.array(lens.box).T, -lens.max_tangent, lens.max_tangent)
     low, high = low - BESIDE_TABLE * (high - low), high + BESIDE_TABLE * (high - low)
     step = float((high - low).max()) / TABLE_STEPS
-    across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)  # one more node at each end
+    # one more node at each end
+    across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)
     u, v = np.meshgrid(low[0] + step * across, low[1] + step * down)
     at = np.stack(camera.places_outward_px(u.ravel(), v.ravel())).reshape(2, *u.shape)
     middle, row, column = at[:, 1:-1, 1:-1], at[:, 1:-1], at[..., 1:-1]
@@ -295,7 +332,9 @@ def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[f
 
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
-    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle; None where no few do."""
+    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle;
+    None where no few do.
+    """
     for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
         if 0 < half_turn_rad <= longest_rad:
             return points
@@ -316,7 +355,9 @@ def bend_px(camera: Camera) -> float:
 def _longest_half_turns_rad(
     size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens | None
 ) -> tuple[tuple[int, float], ...]:
-    """Numbers of points, and the longest half turn that each can draw, tried on such a camera; 0 where none is short enough."""
+    """Numbers of points, and the longest half turn that each can draw, tried on such a camera; 0
+    where none is short enough.
+    """
     camera = Camera(size_px, focal_px, principal_px, np.eye(3), lens)
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
     few = POINTS
@@ -327,7 +368,9 @@ def _longest_half_turns_rad(
 
 
 def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
-    """The largest error on the image, about several axes, as a multiple of what it may be: of paths that begin on the image."""
+    """The largest error on the image, about several axes, as a multiple of what it may be: of
+    paths that begin on the image.
+    """
     camera = _beyond(camera)
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
     seen = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]

@@ -1,9 +1,10 @@
 """Point spread functions: how the light of a point spreads over pixels.
 
-A `Psf` says what share of a star's light falls into a pixel at any offset, how far that reaches, and gives the shaders the
-same arithmetic (shaders/shares.glsl). `GaussianPsf` is the Gaussian of thesis eq. 4.7: along one axis a pixel's share is
-(erf((d + 1/2)/(s sqrt 2)) - erf((d - 1/2)/(s sqrt 2)))/2, d from the star's centre to the pixel's centre and s the sigma,
-both in pixels. `SampledPsf` is an image on a fine grid: its shares are tabulated by offset and interpolated.
+A `Psf` says what share of a star's light falls into a pixel at any offset, how far that reaches,
+and gives the shaders the same arithmetic (shaders/shares.glsl). `GaussianPsf` is the Gaussian of
+thesis eq. 4.7: along one axis a pixel's share is (erf((d + 1/2)/(s sqrt 2)) - erf((d - 1/2)/(s sqrt
+2)))/2, d from the star's centre to the pixel's centre and s the sigma, both in pixels. `SampledPsf`
+is an image on a fine grid: its shares are tabulated by offset and interpolated.
 """
 
 import math
@@ -22,43 +23,53 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import read_bytes
 
-# The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would be enough for the
-# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the cost of one pixel.
-# results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
+# The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
+# be enough for the
+# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the
+# cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
+# tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 MAX_GAUSSIAN_PX = 100_000
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
 SQRT2 = math.sqrt(2.0)
-# Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is 4.4e-7 off.
+# Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is
+# 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200
-# A sampled PSF. Its footprint leaves out so much of its light at the worst phase; what is left is scaled to the star's rate.
+# A sampled PSF. Its footprint leaves out so much of its light at the worst phase; what is left is
+# scaled to the star's rate.
 MAX_SAMPLED_CUT = 1e-4
-MAX_NEGATIVE = 0.02  # share of a PSF's light below zero, of noise or of a spline's overshoot: it is set to zero
+# share of a PSF's light below zero, of noise or of a spline's overshoot: it is set to zero
+MAX_NEGATIVE = 0.02
 MAX_UNEVEN = 0.05  # by which the light of a star's pixels may change with its place in a pixel
 SPLINE_DEGREE: Final = 5  # the spline through the samples
 BLACK_SAMPLES = 12  # so many stand round them
-# Shares are tabulated at most so finely, and with so many places along a side, or twice as many for FINE_STEPS_A_PX.
-# Interpolated linearly they are off by an eighth of the squared step times their curvatures: 7e-5 of a star's light in a pixel
-# at a sigma of 0.5 px. An Airy pattern with a core of 0.6 px is off by 3e-4 in a footprint of 100 px, by 1.2e-3 in one of 200.
+# Shares are tabulated at most so finely, and with so many places along a side, or twice as many for
+# FINE_STEPS_A_PX. Interpolated linearly they are off by an eighth of the squared step times their
+# curvatures: 7e-5 of a star's light in a pixel at a sigma of 0.5 px. An Airy pattern with a core of
+# 0.6 px is off by 3e-4 in a footprint of 100 px, by 1.2e-3 in one of 200.
 MAX_STEPS_A_PX, FINE_STEPS_A_PX, MAX_TABLE_SIDE = 64, 20, 1024
 MAX_FOOTPRINT_PX = 255  # as any OpenGL draws
-MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # the Gaussian nearest to a sampled PSF; how often it is fitted anew
-# Gaussians along the side of a lit square, in sides, in place of its light. Thirds of it: against squares a star's centroid is
-# off by 3e-6 px and its flux by 1e-9 mag on the demo's bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by
-# 1e-5 px with a PSF of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench
-# too, for their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
+# the Gaussian nearest to a sampled PSF; how often it is fitted anew
+MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60
+# Gaussians along the side of a lit square, in sides, in place of its light. Thirds of it: against
+# squares a star's centroid is off by 3e-6 px and its flux by 1e-9 mag on the demo's bench (a
+# monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 1e-5 px with a PSF of 0.3, by 1e-4
+# px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench too, for
+# their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
 TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
-# A Gaussian's side of a wide square: its edge is then softer than the PSF's by 2 % of sigma. By thirds of 4.2 tracker pixels
-# before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to dots takes for the PSF's own. What is sharper than
-# SHARPEST_PX is summed up by pixels anyway.
+# A Gaussian's side of a wide square: its edge is then softer than the PSF's by 2 % of sigma. By
+# thirds of 4.2 tracker pixels before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to
+# dots takes for the PSF's own. What is sharper than SHARPEST_PX is summed up by pixels anyway.
 FINE_SIGMAS, MIN_PARTS, MAX_PARTS, SHARPEST_PX = 0.7, 3, 16, 0.2
 
 
 class ShareShader(NamedTuple):
-    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w, channels)."""
+    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w,
+    channels).
+    """
 
     defines: tuple[str, ...]
     uniforms: dict[str, tuple[float, float]]
@@ -68,8 +79,8 @@ class ShareShader(NamedTuple):
 class Reach(NamedTuple):
     """How far a share of light may lie from its star: an ellipse.
 
-    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` under
-    log(`factor` / s).
+    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 /
+    `axes_px2[1]` under log(`factor` / s).
     """
 
     axes_px2: tuple[float, float]
@@ -77,19 +88,23 @@ class Reach(NamedTuple):
 
 
 class Psf(ABC):
-    """How the light of a point spreads over pixels. Offsets are pixel centre minus star, px, x right and y down.
+    """How the light of a point spreads over pixels. Offsets are pixel centre minus star, px, x
+    right and y down.
 
     `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum.
     """
 
     by_place = False
     by_colour = False
-    separable = False  # whether a share is the product of one along x and one along y, as exact.comp takes it
+    # whether a share is the product of one along x and one along y, as exact.comp takes it
+    separable = False
 
     @property
     @abstractmethod
     def width_px(self) -> tuple[float, float]:
-        """The sigma of the Gaussian nearest to it, before the pixel, along x and y: paths and windows are sized by it."""
+        """The sigma of the Gaussian nearest to it, before the pixel, along x and y: paths and
+        windows are sized by it.
+        """
 
     @property
     @abstractmethod
@@ -108,13 +123,16 @@ class Psf(ABC):
 
     @abstractmethod
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """Shares of a star's light in pixels at these offsets, which are broadcast against each other."""
+        """Shares of a star's light in pixels at these offsets, which are broadcast against each
+        other.
+        """
 
     @abstractmethod
     def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
         """The light of n stars in squares of pixels (side, side, n): rows, columns, stars.
 
-        `fraction_px` (2, n) is each star's x and y from the middle of its pixel, which is the (side - 1) // 2-th of its square.
+        `fraction_px` (2, n) is each star's x and y from the middle of its pixel, which is the
+        (side - 1) // 2-th of its square.
         """
 
     @abstractmethod
@@ -125,11 +143,15 @@ class Psf(ABC):
 
     @abstractmethod
     def cut_share(self, size_px: int) -> float:
-        """The flux outside a square of `size_px`, for a star half a pixel off its centre (the worst)."""
+        """The flux outside a square of `size_px`, for a star half a pixel off its centre (the
+        worst).
+        """
 
     @abstractmethod
     def outside_share(self, size_px: int) -> float:
-        """The largest share of a star's light in one pixel outside a square sprite, at the worst phase."""
+        """The largest share of a star's light in one pixel outside a square sprite, at the worst
+        phase.
+        """
 
     @abstractmethod
     def shader(self, side_px: int) -> ShareShader:
@@ -160,7 +182,9 @@ class GaussianPsf(Psf):
 
     @cached_property
     def footprint_px(self) -> int:
-        """The side of the smallest square that cuts at most MAX_CUT of a star's flux. InputError where none is enough."""
+        """The side of the smallest square that cuts at most MAX_CUT of a star's flux. InputError
+        where none is enough.
+        """
         sizes = range(1, MAX_GAUSSIAN_PX + 1)
         place = bisect_left(sizes, -MAX_CUT, key=lambda size: -self.cut_share(size))
         if place == len(sizes):
@@ -223,7 +247,9 @@ class GaussianPsf(Psf):
         return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
 
     def shader(self, side_px: int) -> ShareShader:
-        """A polynomial for each axis where one is exact enough (`share_polynomial`), else error functions."""
+        """A polynomial for each axis where one is exact enough (`share_polynomial`), else error
+        functions.
+        """
         inverse_x, inverse_y = (1 / (sigma * SQRT2) for sigma in self.sigma_px)
         uniforms = {"inverse_sigma_sqrt2": (inverse_x, inverse_y)}
         axes = [share_polynomial(sigma, side_px / 2 + 0.5) for sigma in self.sigma_px]
@@ -242,11 +268,13 @@ class GaussianPsf(Psf):
 
 @dataclass(frozen=True, eq=False)
 class SampledPsf(Psf):
-    """An image of a PSF, `per_px` samples a pixel along each axis, the chief ray in the middle of its middle sample.
+    """An image of a PSF, `per_px` samples a pixel along each axis, the chief ray in the middle of
+    its middle sample.
 
-    `samples` (height, width), odd sides, x right and y down, is relative light. That of an image that is `pixel_integrated` is
-    what pixels centred there would get. Between samples runs a spline, and beyond them all is black. A star's pixels sum to
-    its rate: the light outside the footprint is shared out among them. Raises InputError for an image that is no PSF.
+    `samples` (height, width), odd sides, x right and y down, is relative light. That of an image
+    that is `pixel_integrated` is what pixels centred there would get. Between samples runs a
+    spline, and beyond them all is black. A star's pixels sum to its rate: the light outside the
+    footprint is shared out among them. Raises InputError for an image that is no PSF.
     """
 
     samples: FloatArray
@@ -264,7 +292,8 @@ class SampledPsf(Psf):
             raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")
         if not np.isfinite(samples).all() or samples.sum() <= 0:
             raise InputError("a PSF has samples that are not finite, or no light; write finite ones with a positive sum")
-        # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the largest of those below zero
+        # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
+        # largest of those below zero
         phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
         least, negative = min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
         if negative > self.max_negative:
@@ -281,8 +310,11 @@ class SampledPsf(Psf):
             raise InputError(f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies further out")
 
     def _before_cut(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """Shares of pixels at these columns and rows, (len(y_px), len(x_px)), of all the light of the image."""
-        from scipy.interpolate import make_interp_spline  # 0.2 s of every command that needs none of it
+        """Shares of pixels at these columns and rows, (len(y_px), len(x_px)), of all the light
+        of the image.
+        """
+        # 0.2 s of every command that needs none of it
+        from scipy.interpolate import make_interp_spline
 
         found = self.samples / self.samples.sum() * self.per_px**2
         for axis, at_px in ((0, y_px), (1, x_px)):
@@ -310,7 +342,8 @@ class SampledPsf(Psf):
         """Adaptive moments (Bernstein and Jarvis 2002), less a pixel's own variance."""
         at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
         middle, variance = np.zeros(2), np.ones(2)
-        for _ in range(WIDTH_ROUNDS):  # a Gaussian weight as wide as the PSF halves its variance and its distance
+        # a Gaussian weight as wide as the PSF halves its variance and its distance
+        for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
             across, down = (powers * np.exp(-((at_px - m) ** 2) / (2 * v)) for m, v in zip(middle, variance, strict=True))
             sums = down @ self._table @ across.T  # powers of y, powers of x
@@ -333,9 +366,11 @@ class SampledPsf(Psf):
 
     @cached_property
     def _table(self) -> Float32Array:
-        """Shares by offset, 1 / `_steps` px apart, from -footprint / 2 px: those of a star's pixels sum to 1 at each phase.
+        """Shares by offset, 1 / `_steps` px apart, from -footprint / 2 px: those of a star's pixels
+        sum to 1 at each phase.
 
-        Linear interpolation keeps their sum, and their centroid, at all phases between. At the edges they are 0.
+        Linear interpolation keeps their sum, and their centroid, at all phases between. At the
+        edges they are 0.
         """
         side_px, steps = self.footprint_px, self._steps
         at_px = np.arange(side_px * steps) / steps - side_px / 2
@@ -352,14 +387,17 @@ class SampledPsf(Psf):
 
     @cached_property
     def reach(self) -> Reach:
-        """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth of the largest."""
+        """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth
+        of the largest.
+        """
         squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
         logs = np.log(np.maximum(self._table, 1e-30))
 
         found = []
         for scale in 2 * np.geomspace(1.0, 300.0, 20):
             x, y = (float(scale) * variance for variance in self.variance_px2)
-            log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01  # the table is interpolated
+            # the table is interpolated
+            log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
             found.append((scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y)))
         _, log_factor, axes_px2 = min(found)
         return Reach(axes_px2, math.exp(log_factor))
@@ -410,7 +448,9 @@ class SampledPsf(Psf):
         return max(float(self._table[far].max(initial=1e-30)), float(self._table[:, far].max(initial=1e-30)))
 
     def shader(self, side_px: int) -> ShareShader:
-        """The same table: in each cell between four places what its bilinear interpolation is made of."""
+        """The same table: in each cell between four places what its bilinear interpolation is
+        made of.
+        """
         near, right, down, both = self._table[:-1, :-1], self._table[:-1, 1:], self._table[1:, :-1], self._table[1:, 1:]
         cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
         return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
@@ -430,7 +470,8 @@ FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in it
 
 
 def read_psf(path: Path) -> SampledPsf:
-    """The PSF of a FITS file's first image, by OVERSAMP (1) and PIXINT (F) of its header; its first row is the top one.
+    """The PSF of a FITS file's first image, by OVERSAMP (1) and PIXINT (F) of its header; its first
+    row is the top one.
 
     The same file again is the same PSF. Raises InputError for a file that is no such image.
     """
@@ -460,7 +501,8 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
 
 
 def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
-    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and the PSF of each.
+    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and
+    the PSF of each.
 
     The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
     """
@@ -475,9 +517,11 @@ def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
 
 
 def pixel_share(offset_px: float, sigma_px: float) -> float:
-    """The share of a Gaussian star's light, along one axis, in the pixel `offset_px` from its centre.
+    """The share of a Gaussian star's light, along one axis, in the pixel `offset_px` from its
+    centre.
 
-    The complement erfc of both edges keeps the far wings positive and exact where erf differences cancel.
+    The complement erfc of both edges keeps the far wings positive and exact where erf differences
+    cancel.
     """
     near, far = abs(offset_px) - 0.5, abs(offset_px) + 0.5
     return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
@@ -495,12 +539,15 @@ def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | None:
-    """Coefficients, constant first, of log2 of a pixel's share as a polynomial of its distance squared (px^2).
+    """Coefficients, constant first, of log2 of a pixel's share as a polynomial of its distance
+    squared (px^2).
 
-    Within `reach_px` its power of two is within MAX_SHARE_ERROR of `pixel_share`: one power for both axes takes half the time
-    of four error functions. None where no degree up to MAX_DEGREE is enough: under a sigma of 0.5 px.
+    Within `reach_px` its power of two is within MAX_SHARE_ERROR of `pixel_share`: one power for
+    both axes takes half the time of four error functions. None where no degree up to MAX_DEGREE is
+    enough: under a sigma of 0.5 px.
     """
-    distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))  # close together at the edge, as Chebyshev's
+    # close together at the edge, as Chebyshev's
+    distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))
     shares = np.array([pixel_share(float(place), sigma_px) for place in distance_px])
     wanted, scaled = np.log2(np.maximum(shares, shares[0] * 1e-12)), (distance_px / reach_px) ** 2
     for degree in range(MIN_DEGREE, MAX_DEGREE + 1):
@@ -512,5 +559,6 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
             if error.max() <= MAX_SHARE_ERROR:
                 power = np.polynomial.Chebyshev(found, domain=[0.0, reach_px**2]).convert(kind=np.polynomial.Polynomial)
                 return tuple(power.coef.tolist())
-            weight = weight * np.sqrt(error / error.max() + 1e-3)  # Lawson (1961): towards the smallest maximum
+            # Lawson (1961): towards the smallest maximum
+            weight = weight * np.sqrt(error / error.max() + 1e-3)
     return None

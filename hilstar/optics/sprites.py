@@ -1,7 +1,8 @@
 """From stars and an attitude to sprites: the only thing that crosses from mathematics to the GPU.
 
-Candidates, the stars about a field, are kept from frame to frame, because most frames turn the field by a fraction of a degree.
-`clipped_sprites` finds the stars that need more light than one monitor pixel has.
+Candidates, the stars about a field, are kept from frame to frame, because most frames turn the
+field by a fraction of a degree. `clipped_sprites` finds the stars that need more light than one
+monitor pixel has.
 """
 
 import math
@@ -18,26 +19,32 @@ from hilstar.optics.extended import ExtendedLight, GlowLight, times
 from hilstar.optics.psf import Psf
 from hilstar.sky.stars import BV_MAG, Stars
 
-# How far the field may turn before its stars are looked for again. A frame's work grows with it by the stars around the image.
+# How far the field may turn before its stars are looked for again. A frame's work grows with it by
+# the stars around the image.
 KEPT_TURN_RAD = math.radians(1.0)
-# The square of the chord between two attitudes is right to 1e-15, so an angle this near to the limit is over it.
+# The square of the chord between two attitudes is right to 1e-15, so an angle this near to the
+# limit is over it.
 ROUNDING_RAD = 1e-6
-# A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px further out.
-# results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
+# A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px
+# further out. results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
 SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
 
-# The work and memory of a frame are bounded by the pixels that its sprites cover: 250 000 stars of sigma 0.85 px. Of more
-# stars only the brightest are drawn.
+# The work and memory of a frame are bounded by the pixels that its sprites cover: 250 000 stars of
+# sigma 0.85 px. Of more stars only the brightest are drawn.
 MAX_COVERED_PX = 25_000_000
 # A star over white by no more than this is not called clipped: flux and white pass through float32.
 CLIP_TOLERANCE = 1e-6
-# Number of sprites (the brightest) that are tested for clipping with the light of others: the work is bounded.
+# Number of sprites (the brightest) that are tested for clipping with the light of others: the work
+# is bounded.
 MAX_DOUBTFUL = 512
-FEW_PAIRS = 4096  # pairs of pixels and sprites near them: up to so many are tested all at once, without sorting
+# pairs of pixels and sprites near them: up to so many are tested all at once, without sorting
+FEW_PAIRS = 4096
 
 
 class NearStars(NamedTuple):
-    """Stars about a field: their places in `Stars`, rising, directions (3, n), ICRS, and electrons per second (n,)."""
+    """Stars about a field: their places in `Stars`, rising, directions (3, n), ICRS, and
+    electrons per second (n,).
+    """
 
     star: IntArray
     directions: FloatArray
@@ -45,24 +52,30 @@ class NearStars(NamedTuple):
 
 
 class Candidates:
-    """The stars near a camera's field, looked for again once it has turned by KEPT_TURN_RAD from where they were.
+    """The stars near a camera's field, looked for again once it has turned by KEPT_TURN_RAD from
+    where they were.
 
-    No direction of the field moves farther than the field turns, so none that comes into view is missed. Stars among which
-    bodies are moved, or whose observer moves, are looked for in every frame.
+    No direction of the field moves farther than the field turns, so none that comes into view is
+    missed. Stars among which bodies are moved, or whose observer moves, are looked for in every
+    frame.
     """
 
     def __init__(self) -> None:
-        # The stars, the camera and the margin that were asked about, the attitude then, and what was found
+        # The stars, the camera and the margin that were asked about, the attitude then, and what
+        # was found
         self._kept: tuple[Stars, Camera, float, FloatArray, NearStars] | None = None
 
     def near(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> NearStars:
-        """The stars within `margin_px` of the image, and some more. The caller must not change the arrays."""
+        """The stars within `margin_px` of the image, and some more. The caller must not change
+        the arrays.
+        """
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
             same = stars.vectors is last.vectors and stars.electrons_per_s is last.electrons_per_s and stars.grid is last.grid
             difference = (icrs_to_image - last_icrs_to_image).ravel()
-            # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from R to S: roll counts as well.
+            # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
+            # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
             if same and camera is last_camera and margin_px == last_margin_px and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
@@ -75,7 +88,9 @@ class Candidates:
 
 
 def stars_about(stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float, reach_rad: float = 0.0) -> IntArray:
-    """Every star that can come within `margin_px` of the image by a turn of `reach_rad`, and some more; rising."""
+    """Every star that can come within `margin_px` of the image by a turn of `reach_rad`, and
+    some more; rising.
+    """
     radius_rad, edges = camera.field(margin_px)
     return stars.near(icrs_to_image[2], radius_rad, edges @ icrs_to_image, reach_rad)
 
@@ -92,16 +107,20 @@ class AddedLight:
 
 @dataclass(frozen=True, slots=True)
 class Sprites:
-    """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in `Stars`.
+    """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in
+    `Stars`.
 
-    A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
-    divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
-    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
-    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field; None draws all by its mean.
-    `extended` is the frame's light other than stars, in the order in which it is drawn; `discs` names the bodies among it, and
-    `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
-    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the extended
-    light of each, moved to where that primary has to be drawn.
+    A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1)
+    // 2`. A star's light is divided among up to `per_star` sprites. `capped` stars are drawn
+    coarser than they should be, or not at all, because
+    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as
+    paths, None for points. `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that
+    changes over the field; None draws all by its mean. `extended` is the frame's light other than
+    stars, in the order in which it is drawn; `discs` names the bodies among it, and `over_white`
+    those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for
+    `star`.
+    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each,
+    and `lights` the extended light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]
@@ -134,8 +153,8 @@ def make_sprites(
 ) -> Sprites:
     """The sprites of every star whose footprint touches the image, centres off the edge included.
 
-    `icrs_to_image` (3, 3) turns ICRS components into image components. With `candidates` of the last frame stars need not be
-    looked for anew; the sprites are the same.
+    `icrs_to_image` (3, 3) turns ICRS components into image components. With `candidates` of the
+    last frame stars need not be looked for anew; the sprites are the same.
     """
     margin_px = footprint_px / 2 + 1
     if candidates is None:
@@ -177,12 +196,14 @@ def pack_sprites(
     size_px: tuple[int, int],
     footprint_px: int,
 ) -> Sprites:
-    """Sprites of the stars at `x_px`, `y_px` (n,) whose footprints touch an image of `size_px` (width, height).
+    """Sprites of the stars at `x_px`, `y_px` (n,) whose footprints touch an image of `size_px`
+    (width, height).
 
     `footprint_px` is the side of a footprint. A star at NaN touches no image.
     """
     width, height = size_px
-    # An odd footprint has the star in its middle pixel, an even one within half a pixel of its middle corner.
+    # An odd footprint has the star in its middle pixel, an even one within half a pixel of its
+    # middle corner.
     bias = 0.5 if footprint_px % 2 else 0.0
     before = (footprint_px - 1) // 2
     after = footprint_px - 1 - before
@@ -224,13 +245,16 @@ def without_stars(sprites: Sprites) -> Sprites:
 
 
 def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
-    """Sprites and those of `parts`, which have the same footprint, end to end; the rest stays that of the first."""
+    """Sprites and those of `parts`, which have the same footprint, end to end; the rest stays
+    that of the first.
+    """
     joined = join_sprites([sprites, *parts], sprites.footprint_px)
     return replace(sprites, data=joined.data, star=joined.star, x_px=joined.x_px, y_px=joined.y_px)
 
 
 def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
-    """The sprites of each channel of the tracker: every light times its share there; the sprites themselves where it has one.
+    """The sprites of each channel of the tracker: every light times its share there; the sprites
+    themselves where it has one.
 
     `stars` are those among which `sprites.star` has its places.
     """
@@ -238,13 +262,17 @@ def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
 
 
 def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
-    """The shares (columns,) of all stars' light together, without bodies', by those of each (n, columns)."""
+    """The shares (columns,) of all stars' light together, without bodies', by those of each (n,
+    columns).
+    """
     rates = stars.rates_e_per_s
     return np.asarray(rates @ shares[: len(rates)] / (rates.sum() or 1.0))
 
 
 def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
-    """Shares (n, columns) of stars at places (n,); below 0, where light is no star's, their `mean_share`."""
+    """Shares (n, columns) of stars at places (n,); below 0, where light is no star's, their
+    `mean_share`.
+    """
     found, own = np.empty((len(places), shares.shape[1])), places >= 0
     found[own] = shares[places[own]]
     if not own.all():
@@ -267,14 +295,18 @@ def shares_of_sprites(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv:
 
 
 def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
-    """The sprites of primary `k`, each where it is drawn so that its light, at its place (3, 2) within a pixel, lies there."""
-    data, bias = sprites.data.copy(), np.float32(0.5 if sprites.footprint_px % 2 else 0.0)  # as in pack_sprites
+    """The sprites of primary `k`, each where it is drawn so that its light, at its place (3, 2)
+    within a pixel, lies there.
+    """
+    # as in pack_sprites
+    data, bias = sprites.data.copy(), np.float32(0.5 if sprites.footprint_px % 2 else 0.0)
     if sprites.primaries is not None:
         data["electrons_per_s"] = sprites.primaries[:, k]
     for column, away_px in enumerate(places_px[k]):
         if not away_px:
             continue
-        part = data["fraction_px"][:, column] - np.float32(away_px)  # as in shaders/exact/stars.glsl
+        # as in shaders/exact/stars.glsl
+        part = data["fraction_px"][:, column] - np.float32(away_px)
         whole = np.floor(part + bias)
         data["pixel"][:, column] += whole.astype(np.int32)
         data["fraction_px"][:, column] = part - whole
@@ -284,9 +316,11 @@ def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
 
 
 def by_share(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None) -> list[Sprites]:
-    """The sprites once for each column of `shares` (stars, columns): every light times its star's or body's share.
+    """The sprites once for each column of `shares` (stars, columns): every light times its star's
+    or body's share.
 
-    Light that is neither a star's nor a body's, as a fault's, has that of its B-V, `by_bv`; without one the mean of the stars.
+    Light that is neither a star's nor a body's, as a fault's, has that of its B-V, `by_bv`; without
+    one the mean of the stars.
     """
     of_sprites = shares_of_sprites(sprites, stars, shares, by_bv).astype(np.float32)
     parts = []
@@ -318,15 +352,19 @@ def clipped_sprites(
     uniformity: Float32Array | None = None,
     darkest: float = 1.0,
 ) -> IntArray:
-    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
+    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light
+    included, is over white.
 
-    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), whose minimum is `darkest`.
+    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), whose minimum is
+    `darkest`.
 
-    Only stars that alone reach half of white in a pixel are tested: two fainter ones on one pixel are not reported.
+    Only stars that alone reach half of white in a pixel are tested: two fainter ones on one pixel
+    are not reported.
     """
     bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / psf.peak_share
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
-        return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
+        # most frames: no star is that bright, however its light is divided
+        return np.empty(0, dtype=np.intp)
     rates: Float32Array | FloatArray = sprites.data["electrons_per_s"]
     if sprites.per_star > 1:  # the light of each sprite's whole star
         _, star = np.unique(sprites.star, return_inverse=True)

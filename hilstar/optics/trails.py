@@ -1,9 +1,11 @@
 """Satellites of one image: each a chain of sprites along its own path while the camera turns.
 
-The light of such a path is not even: a satellite flashes, and goes into the Earth's shadow or behind the Earth. So a path is
-cut into equal times, each with a sprite in its middle that has the mean light of that time: the sum is exact for any flash.
+The light of such a path is not even: a satellite flashes, and goes into the Earth's shadow or
+behind the Earth. So a path is cut into equal times, each with a sprite in its middle that has the
+mean light of that time: the sum is exact for any flash.
 
-Satellites wide enough to have a face: diffuse spheres along their paths, which hide the stars behind them.
+Satellites wide enough to have a face: diffuse spheres along their paths, which hide the stars
+behind them.
 """
 
 import math
@@ -24,15 +26,16 @@ from hilstar.sky.bodies.disc import Disc
 if TYPE_CHECKING:
     from hilstar.sky.bodies.passes import Pass
 
-# At this spacing no pixel of a streak is wrong by more than 1e-3 of the satellite's light: spacing^2 / 24 times the slope at
-# its end (held by tests/unit/optics/test_trails.py).
+# At this spacing no pixel of a streak is wrong by more than 1e-3 of the satellite's light:
+# spacing^2 / 24 times the slope at its end (held by tests/unit/optics/test_trails.py).
 SPACING_SIGMA = 0.3
 LIGHT_S = 0.25  # the longest time of one sprite; a low orbit enters the shadow in 8 s
 SAMPLES = 9  # samples of a path that give its length and its part on the image
 REACH = 2.0  # times the speed at a moment, as a bound for some seconds about it
 BULGE = 2.0  # how much farther than its samples a path may be from the line between its ends
 EVERY = slice(None)
-STEPS_A_RADIUS = 4.0  # places of a disc along its path: its edge is then uneven by 1 % of the radius
+# places of a disc along its path: its edge is then uneven by 1 % of the radius
+STEPS_A_RADIUS = 4.0
 AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 NORTH = np.array([0.0, 0.0, 1.0])
 M_PER_KM = 1000.0
@@ -40,9 +43,11 @@ M_PER_KM = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class TrailView:
-    """A camera that turns: `icrs_to_image` (3, 3) and the rate (3,) in image axes, rad/s, both at the moment of a pass.
+    """A camera that turns: `icrs_to_image` (3, 3) and the rate (3,) in image axes, rad/s, both at
+    the moment of a pass.
 
-    `velocity_km_s` (3,) is the observer's against that for which directions are aberrated (see `Stars`), None for the same.
+    `velocity_km_s` (3,) is the observer's against that for which directions are aberrated (see
+    `Stars`), None for the same.
     """
 
     camera: Camera
@@ -51,14 +56,18 @@ class TrailView:
     velocity_km_s: FloatArray | None = None
 
     def places_px(self, seen: "Pass", which: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of satellites `which` (k,) of a pass, each at its own of `seconds` (k,); NaN behind the camera."""
+        """Pixel x and y of satellites `which` (k,) of a pass, each at its own of `seconds` (k,);
+        NaN behind the camera.
+        """
         turned = seen.directions(which, seconds, self.velocity_km_s) @ self.icrs_to_image.T
         if not self.rate_image_rad_s.any():
             return self.camera.project_outward(turned)
         return Paths(turned, self.rate_image_rad_s, self.camera).places_px(EVERY, seconds)
 
     def in_reach(self, seen: "Pass", longest_s: float, margin_px: float) -> IntArray:
-        """Places of the satellites that can come within a margin of the image within that time of the moment, and some more."""
+        """Places of the satellites that can come within a margin of the image within that time
+        of the moment, and some more.
+        """
         turned = seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
         reach_rad = (float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))) * longest_s
         return self.camera.in_view(turned, margin_px, REACH * reach_rad)
@@ -66,7 +75,8 @@ class TrailView:
 
 @dataclass(frozen=True, slots=True)
 class Brush:
-    """A sprite's PSF, and the maximum number for all satellites together; above it sprites are spaced more widely.
+    """A sprite's PSF, and the maximum number for all satellites together; above it sprites are
+    spaced more widely.
 
     A satellite that is a disc is drawn at up to `poses` places.
     """
@@ -78,7 +88,9 @@ class Brush:
 
 @dataclass(frozen=True, slots=True)
 class Lit:
-    """When satellites (n,) send light to an image, seconds: each from its own `begin_s` for `length_s`."""
+    """When satellites (n,) send light to an image, seconds: each from its own `begin_s` for
+    `length_s`.
+    """
 
     begin_s: FloatArray
     length_s: float
@@ -91,16 +103,21 @@ class Lit:
 
 @dataclass(frozen=True, slots=True)
 class Trails:
-    """Sprites of satellites, their `star` the place in the list, and those in the image: `index`, their mean rates (k,)."""
+    """Sprites of satellites, their `star` the place in the list, and those in the image:
+    `index`, their mean rates (k,).
+    """
 
     sprites: Sprites
     index: IntArray
     electrons_per_s: FloatArray
-    middle: FloatArray  # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
+    # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
+    middle: FloatArray
 
 
 def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
-    """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
+    """The satellites of a pass along their paths; one whose mean rate is fainter than
+    `faintest_e_per_s` is left out.
+    """
     wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
     counts, total = wanted, int(wanted.sum())
     if total > brush.most:  # in proportion, one at least
@@ -124,7 +141,9 @@ def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per
 
 
 def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
-    """How many sprites each path should have (0: it misses the image), and its part on the image."""
+    """How many sprites each path should have (0: it misses the image), and its part on the
+    image.
+    """
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
     x_px, y_px = view.places_px(seen, which, (lit.begin_s + at * lit.length_s).ravel())
@@ -143,7 +162,9 @@ def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tupl
 
 
 def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
-    """Stars' sprites and after them those of satellites, whose places in `Stars` begin at `first`."""
+    """Stars' sprites and after them those of satellites, whose places in `Stars` begin at
+    `first`.
+    """
     own = found.sprites
     whole = with_sprites(sprites, [replace(own, star=own.star + first)])
     return replace(whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped)
@@ -151,7 +172,8 @@ def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
 
 @dataclass(frozen=True, slots=True)
 class DiscTrail:
-    """One satellite in an image: its place in the list, its mean rate, its discs, one after the other, and the share of each.
+    """One satellite in an image: its place in the list, its mean rate, its discs, one after the
+    other, and the share of each.
 
     `lights` draw them in this order, `brightest_e_per_s` is about their brightest pixel.
     """
@@ -189,7 +211,9 @@ def disc_of(seen: "Pass", name: str, second: float, velocity_km_s: FloatArray | 
 
 
 def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
-    """The only satellite of a pass along its path; None where it misses the image or has no light."""
+    """The only satellite of a pass along its path; None where it misses the image or has no
+    light.
+    """
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
     radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.psf.width_px)
     coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
@@ -204,7 +228,8 @@ def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush)
     bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s.tolist()]
     lights: list[ExtendedLight] = []
     if count > 1:
-        # Together they hide what the one in the middle hides: each after the other would hide the light of those before.
+        # Together they hide what the one in the middle hides: each after the other would hide the
+        # light of those before.
         lights += _lights(bare[count // 2], view, middles_s[count // 2], brush, 0.0, covers=True)
     along = tuple(disc.of_rate(float(rate)) for disc, rate in zip(bare, rates, strict=True))
     for disc, second in zip(along, middles_s.tolist(), strict=True):
@@ -226,7 +251,9 @@ def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: flo
 
 
 def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprites:
-    """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a satellite hides."""
+    """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a
+    satellite hides.
+    """
     left = np.ones(len(sprites))
     for disc, share in zip(found.along, found.shares, strict=True):
         left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))

@@ -1,1 +1,3 @@
-"""The display server: a bench file to its parts; frames paced, drawn, shown and recorded; the console."""
+"""The display server: a bench file to its parts; frames paced, drawn, shown and recorded; the
+console.
+"""

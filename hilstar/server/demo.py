@@ -33,9 +33,11 @@ SEND_HZ = 100.0
 SLEW_LOG = "slew.jsonl"
 # From Orion's belt to Sirius and on to Procyon, with the roll that a real manoeuvre drags along.
 WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
-# To and fro about the first of them, as a tracker at work: degrees, and the seconds of a turn, of RA, declination and roll.
+# To and fro about the first of them, as a tracker at work: degrees, and the seconds of a turn, of
+# RA, declination and roll.
 SCAN = ((2.0, 67.0), (2.0, 47.0), (10.0, 91.0))
-LEAST_SLEW_S = 5.0  # 40 deg/s at most; a shorter run ends within the slew. Receivers refuse 60 deg/s
+# 40 deg/s at most; a shorter run ends within the slew. Receivers refuse 60 deg/s
+LEAST_SLEW_S = 5.0
 SETTLE_FRACTION = 0.15  # share of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time
@@ -46,7 +48,9 @@ LISTENER_WITHIN_S = 120.0
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """The result of the demo: its summary, and the codes of a few frames, of `bits` each, by frame number."""
+    """The result of the demo: its summary, and the codes of a few frames, of `bits` each, by
+    frame number.
+    """
 
     summary: RunSummary
     kept: dict[int, Codes]
@@ -54,7 +58,9 @@ class Demo:
 
 
 def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with jitter, then REST_S at rest."""
+    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with jitter, then
+    REST_S at rest.
+    """
     points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
 
     def slew(t_s: float) -> FloatArray:
@@ -67,7 +73,9 @@ def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
 
 
 def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """A slow scan about the first of WAYPOINTS_DEG, 0.3 deg/s and less across the boresight, with jitter."""
+    """A slow scan about the first of WAYPOINTS_DEG, 0.3 deg/s and less across the boresight,
+    with jitter.
+    """
 
     def scan(t_s: float) -> FloatArray:
         turns = [size_deg * math.sin(2 * math.pi * t_s / period_s) for size_deg, period_s in SCAN]
@@ -98,7 +106,9 @@ Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet
 
 @dataclass(frozen=True, slots=True)
 class Shows:
-    """What a demo shows: its bench file, the attitudes that are sent, and whether all who watch are there before they are."""
+    """What a demo shows: its bench file, the attitudes that are sent, and whether all who watch
+    are there before they are.
+    """
 
     bench_file: Path
     samples: list[AttitudeSample]
@@ -108,8 +118,9 @@ class Shows:
 def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watching) -> Demo:
     """Stream attitudes from a process of their own through a loopback socket, and serve them.
 
-    The sender begins once the loop has drawn its first frame, and the run once an attitude has come. `watching` opens the sink
-    of all frames and the run's outlet, for a bench and its endpoint. Raises InputError or MachineError.
+    The sender begins once the loop has drawn its first frame, and the run once an attitude has
+    come. `watching` opens the sink of all frames and the run's outlet, for a bench and its
+    endpoint. Raises InputError or MachineError.
     """
     make_directory(directory)
     log_path = directory / SLEW_LOG
@@ -156,7 +167,9 @@ class _DemoSender(Closing):
 
 
 def write_pictures(directory: Path, demo: Demo, advance: Callable[[int], None]) -> None:
-    """Two pictures of each frame that was kept: its codes, and a preview; `advance` is told how many are written."""
+    """Two pictures of each frame that was kept: its codes, and a preview; `advance` is told how
+    many are written.
+    """
     for written, (number, codes) in enumerate(demo.kept.items()):
         exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
         write_codes_png(exact, codes, demo.bits)

@@ -1,7 +1,8 @@
 """What this machine has and what it lacks: GL, displays, links, files.
 
-Its row in the table *Tested with* (docs/where-it-fails.md) has parts and versions, nothing private: no host or user name, no
-path and no serial number. Of a monitor's EDID only its maker, model, size and year are read.
+Its row in the table *Tested with* (docs/where-it-fails.md) has parts and versions, nothing private:
+no host or user name, no path and no serial number. Of a monitor's EDID only its maker, model, size
+and year are read.
 """
 
 import contextlib
@@ -61,7 +62,9 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class OutputReport:
-    """An output of the X server: its line, what is wrong with it and what mends that, and all that RandR says of it."""
+    """An output of the X server: its line, what is wrong with it and what mends that, and all
+    that RandR says of it.
+    """
 
     line: str
     faults: list[str]
@@ -74,7 +77,9 @@ class OutputReport:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """The JSON object of `hilstar doctor`: whether everything required is there, the checks, and the displays' outputs."""
+    """The JSON object of `hilstar doctor`: whether everything required is there, the checks, and
+    the displays' outputs.
+    """
 
     ok: bool
     checks: list[Check]
@@ -100,7 +105,9 @@ def examine() -> Examination:
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a bench's screen and tracker see, how wide a star is then, and its monitor against its files."""
+    """What a bench's screen and tracker see, how wide a star is then, and its monitor against
+    its files.
+    """
 
     fields: FieldsOfView
     star: StarSize
@@ -118,7 +125,8 @@ class BenchReport:
     def lines(self, name: str) -> Iterator[str]:
         """For a person, by the bench file's name."""
         state = "ok" if self.fields.warning is None else "check"
-        yield f"{state:8}{name + ' ':12}{self.fields.line()}"  # a name of any length stands apart from the text
+        # a name of any length stands apart from the text
+        yield f"{state:8}{name + ' ':12}{self.fields.line()}"
         yield f"{'check' if self.star.too_wide else 'ok':8}{'star':12}{self.star.line()}"
         fault, remedy = self.star.fault(), self.star.would_do
         if fault is not None and remedy is not None:

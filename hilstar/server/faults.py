@@ -1,7 +1,8 @@
-"""Faults over ZeroMQ: a message is a JSON object with the keys of a scenario's `[[fault]]`, or starts or stops one by name.
+"""Faults over ZeroMQ: a message is a JSON object with the keys of a scenario's `[[fault]]`, or
+starts or stops one by name.
 
-`{"start": "NAME"}` begins a fault of the scenario, `{"stop": "NAME"}` ends any. A message that is wrong, or one too many, is
-refused and counted; nothing of it is kept.
+`{"start": "NAME"}` begins a fault of the scenario, `{"stop": "NAME"}` ends any. A message that is
+wrong, or one too many, is refused and counted; nothing of it is kept.
 """
 
 import threading
@@ -36,13 +37,16 @@ STREAM = "stream"
 POLL_MS = 50
 RETRY_S = 0.5
 MAX_MESSAGE_BYTES = 16_384
-# A fault costs time to prepare and room in the ledger: that many at once, and that many each second after.
+# A fault costs time to prepare and room in the ledger: that many at once, and that many each second
+# after.
 MAX_BURST, MAX_PER_S = 50, 10
 FORM = 'write a JSON object with kind and name, {"start": "NAME"} or {"stop": "NAME"}'
 
 
 def act(schedule: FaultSchedule, raw: bytes) -> None:
-    """Do what a message asks for. Raises InputError for one that is wrong, or that cannot be done."""
+    """Do what a message asks for. Raises InputError for one that is wrong, or that cannot be
+    done.
+    """
     try:
         message: Any = msgspec.json.decode(raw)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
@@ -60,7 +64,9 @@ def act(schedule: FaultSchedule, raw: bytes) -> None:
 
 
 class FaultStream:
-    """Listens on a thread of its own while it is open. Raises InputError where the endpoint cannot be used."""
+    """Listens on a thread of its own while it is open. Raises InputError where the endpoint
+    cannot be used.
+    """
 
     def __init__(self, schedule: FaultSchedule, endpoint: str, **options: Unpack[SocketOptions]) -> None:
         self.messages = 0
@@ -160,7 +166,9 @@ MAX_NAMES = 100  # in the summary: a stream may make up names
 
 
 class RunFaults:
-    """The faults of a run: `schedule` starts them, `frames` is the loop's. Raises InputError for one that cannot be drawn."""
+    """The faults of a run: `schedule` starts them, `frames` is the loop's. Raises InputError for
+    one that cannot be drawn.
+    """
 
     def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None) -> None:
         self._scenario, self._notices, self._ledger = scenario, notices, ledger
@@ -206,12 +214,15 @@ class RunFaults:
         )
 
     def begin(self, zero_ns: int) -> None:
-        """Set the time of the timeline from which a scenario counts; by default that of the first frame with an attitude."""
+        """Set the time of the timeline from which a scenario counts; by default that of the
+        first frame with an attitude.
+        """
         self.schedule.begin(zero_ns)
 
     @contextmanager
     def listening(self, settings: FaultSettings, folder: Path) -> Iterator[str]:
-        """Take faults from the stream that a bench file names; says where it listens, "" where it names none.
+        """Take faults from the stream that a bench file names; says where it listens, "" where it
+        names none.
 
         Raises InputError where the endpoint cannot be used.
         """
@@ -226,7 +237,9 @@ class RunFaults:
             self._stream.close()
 
     def summary(self) -> dict[str, Any]:
-        """What was on in the run: names and how often each began, frames dropped and frozen, and the stream's messages."""
+        """What was on in the run: names and how often each began, frames dropped and frozen, and
+        the stream's messages.
+        """
         told: dict[str, Any] = {
             "scenario": str(self._scenario.path) if self._scenario.faults else None,
             "started": dict(self._started),
@@ -239,7 +252,9 @@ class RunFaults:
 
 
 class ReplayedFaults:
-    """The faults of an earlier run that is drawn and recorded again. Raises InputError for one that cannot be drawn."""
+    """The faults of an earlier run that is drawn and recorded again. Raises InputError for one
+    that cannot be drawn.
+    """
 
     def __init__(self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> None:
         view = display_view(bench, recording.scenario)
@@ -257,7 +272,8 @@ class ReplayedFaults:
     def recall(self, record: FrameRecord) -> None:
         """Take the faults of the frame that is drawn next: those of light, and what freezes it.
 
-        A recorded attitude is the one that was shown: a wrong one is not made wrong again. A dropped frame was never recorded.
+        A recorded attitude is the one that was shown: a wrong one is not made wrong again. A
+        dropped frame was never recorded.
         """
         recorded = zip(record.faults, record.fault_since_ns, strict=False)
         known = ((number, self._faults[number], since_ns) for number, since_ns in recorded if number in self._faults)

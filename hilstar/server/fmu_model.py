@@ -1,7 +1,9 @@
-"""The model inside a co-simulation FMU: it sends attitudes to `hilstar serve` over UDP, and takes what comes back.
+"""The model inside a co-simulation FMU: it sends attitudes to `hilstar serve` over UDP, and takes
+what comes back.
 
-This file is copied into the FMU. There it has the standard library and PythonFMU alone, whatever Python the simulation tool
-has: it imports nothing of hilstar. The packets are those of firmware_protocol/protocol.toml, to which a test holds them.
+This file is copied into the FMU. There it has the standard library and PythonFMU alone, whatever
+Python the simulation tool has: it imports nothing of hilstar. The packets are those of
+firmware_protocol/protocol.toml, to which a test holds them.
 """
 
 import contextlib
@@ -31,7 +33,8 @@ CRC = struct.Struct("<I")
 NS_PER_S = 1_000_000_000
 LISTEN_S = 0.2
 NORM_TOLERANCE = 1e-3
-COMMUNICATION_POINT = -1.0  # the start value of `t_s`: the attitude's time is the communication point's
+# the start value of `t_s`: the attitude's time is the communication point's
+COMMUNICATION_POINT = -1.0
 Q = ("q_w", "q_x", "q_y", "q_z")
 RATE = ("rate_x", "rate_y", "rate_z")
 ANSWERED = ("answered_q_w", "answered_q_x", "answered_q_y", "answered_q_z")
@@ -51,7 +54,9 @@ def unpacked(packet: bytes) -> tuple[int, ...] | None:
 
 
 class StarDisplay(Fmi2Slave):  # type: ignore[misc]
-    """A star display as a block of a simulation: attitude in; frame, health and the tracker's answered attitude out."""
+    """A star display as a block of a simulation: attitude in; frame, health and the tracker's
+    answered attitude out.
+    """
 
     description = "A star tracker's display on a bench (hilstar serve), driven over UDP"
     license = "MIT"
@@ -70,8 +75,10 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         self._register()
         self._socket: socket.socket | None = None
         self._sequence = 0
-        self._zero: tuple[int, int] | None = None  # a time of the model, ns, and of the host's monotonic clock
-        self._begun: tuple[float, float] | None = None  # a communication point, s, and when it was there
+        # a time of the model, ns, and of the host's monotonic clock
+        self._zero: tuple[int, int] | None = None
+        # a communication point, s, and when it was there
+        self._begun: tuple[float, float] | None = None
 
     def _register(self) -> None:
         parameter = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
@@ -100,7 +107,9 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         )
 
     def to_xml(self, *options: object) -> Element:
-        """The model's description; outputs are also its initial unknowns (FMI 2.0, 2.2.8), which PythonFMU leaves out."""
+        """The model's description; outputs are also its initial unknowns (FMI 2.0, 2.2.8), which
+        PythonFMU leaves out.
+        """
         root: Element = super().to_xml(*options)
         structure = root.find("ModelStructure")
         if structure is not None and (outputs := structure.find("Outputs")) is not None:

@@ -1,7 +1,9 @@
-"""The frames of a run, handed to whoever watches (`--frames ENDPOINT`), off the frame loop's critical path.
+"""The frames of a run, handed to whoever watches (`--frames ENDPOINT`), off the frame loop's
+critical path.
 
-The loop copies a frame's levels into one of few buffers: 0.1 ms at 1080p, and nothing where nobody watches. A thread finds the
-lit pixels and sends them. Where it has not done so with all buffers, the frame is not handed on.
+The loop copies a frame's levels into one of few buffers: 0.1 ms at 1080p, and nothing where nobody
+watches. A thread finds the lit pixels and sends them. Where it has not done so with all buffers,
+the frame is not handed on.
 """
 
 import queue
@@ -35,8 +37,8 @@ class _Copied:
 class FrameFeed(Closing):
     """Hands on each frame that `see` is given, while somebody watches.
 
-    `swap_to_light_ns` is the time from a swap to the middle row's light. Without a screen that holds it, a frame stands for the
-    half refresh period before its moment and the one after it.
+    `swap_to_light_ns` is the time from a swap to the middle row's light. Without a screen that
+    holds it, a frame stands for the half refresh period before its moment and the one after it.
     """
 
     def __init__(self, sender: FrameSender, bench: Bench, swap_to_light_ns: Callable[[], int] = lambda: 0) -> None:
@@ -117,7 +119,9 @@ class FrameFeed(Closing):
 
 
 def lit_pixels(levels: npt.NDArray[np.unsignedinteger[Any]]) -> npt.NDArray[np.intp]:
-    """The flat indices (n,) of levels over 0, rising: by words of eight bytes, in a sixth of the time where few are."""
+    """The flat indices (n,) of levels over 0, rising: by words of eight bytes, in a sixth of the
+    time where few are.
+    """
     flat = levels.ravel()
     each = WORD_BYTES // flat.itemsize
     whole = len(flat) // each * each

@@ -1,4 +1,6 @@
-"""A trigger pulse for the tracker at each frame, from a separate thread, because a line may be slow."""
+"""A trigger pulse for the tracker at each frame, from a separate thread, because a line may be
+slow.
+"""
 
 import threading
 import time
@@ -16,7 +18,8 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.bench.config import SyncSettings
 from hilstar.server.sync import SyncSummary
 
-# A frame waits this long for the thread to take over, which would otherwise wait 0.5 ms or more for Python's lock.
+# A frame waits this long for the thread to take over, which would otherwise wait 0.5 ms or more for
+# Python's lock.
 HANDOVER_S = 0.0005
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.1, 2.0
 END_S = 1.0
@@ -24,10 +27,12 @@ LAST_S = 0.25  # for the last pulse of a run: what follows has a second, after a
 
 
 class FramePulse(Closing):
-    """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame waiting. End it with `close`.
+    """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame
+    waiting. End it with `close`.
 
-    A frame that comes while the line is still busy, or lost, has no pulse; a lost line is opened again, with back-off.
-    `counted` hears what becomes of each, from any thread: "sent", "skipped" or "lost".
+    A frame that comes while the line is still busy, or lost, has no pulse; a lost line is opened
+    again, with back-off. `counted` hears what becomes of each, from any thread: "sent", "skipped"
+    or "lost".
     """
 
     def __init__(self, line: RtsLine, settings: SyncSettings, notices: Notices) -> None:
@@ -52,7 +57,9 @@ class FramePulse(Closing):
         return cls(RtsLine(str(settings.port), settings.active == "high"), settings, notices)
 
     def frame(self, number: int, frame_ns: int) -> None:
-        """Start the pulse of frame `number`, whose time stamp (host, ns) is `frame_ns`; waits at most HANDOVER_S."""
+        """Start the pulse of frame `number`, whose time stamp (host, ns) is `frame_ns`; waits at
+        most HANDOVER_S.
+        """
         if number % self._every:
             return
         if not self._idle.is_set():
@@ -85,7 +92,8 @@ class FramePulse(Closing):
             begin_ns = time.monotonic_ns()
             self._line.set(True)
             set_ns = time.monotonic_ns()
-            # From when the line is known to be raised: a trigger may be wider than asked for, but not narrower.
+            # From when the line is known to be raised: a trigger may be wider than asked for, but
+            # not narrower.
             time.sleep(max(set_ns + self._pulse_ns - time.monotonic_ns(), 0) / NS_PER_S)
             self._line.set(False)
         except LOST as error:
@@ -131,7 +139,9 @@ class FramePulse(Closing):
         )
 
     def close(self) -> None:
-        """End the pulse that lasts, and close the port with the line at rest; one that hangs is left to the process's end."""
+        """End the pulse that lasts, and close the port with the line at rest; one that hangs is
+        left to the process's end.
+        """
         self._idle.wait(END_S)
         self._ends = True
         self._wanted.set()

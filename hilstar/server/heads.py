@@ -1,6 +1,8 @@
-"""Several heads beside one source: what arrives goes to a process for each head, which is restarted where it ends early.
+"""Several heads beside one source: what arrives goes to a process for each head, which is restarted
+where it ends early.
 
-A head reports as a systemd service does (sd_notify): ready once it draws, then a sign of life each second while frames go on.
+A head reports as a systemd service does (sd_notify): ready once it draws, then a sign of life each
+second while frames go on.
 """
 
 import contextlib
@@ -50,8 +52,8 @@ BODY = (1.0, 0.0, 0.0, 0.0)
 class HeadProcess:
     """A head's process, restarted whenever it ends early or gives no sign of life.
 
-    `command(number, drawn_s)` is the command of its start `number`, `drawn_s` after it first drew (0 where it never did). It
-    sends its signs of life to the socket `life`.
+    `command(number, drawn_s)` is the command of its start `number`, `drawn_s` after it first drew
+    (0 where it never did). It sends its signs of life to the socket `life`.
     """
 
     def __init__(self, name: str, command: Command, say: Say, life: Path, secrets: Mapping[str, str] = NOTHING) -> None:
@@ -59,7 +61,8 @@ class HeadProcess:
         self.restarts = 0
         self.code: int | None = None  # None before its end
         self.output = b""  # what it wrote to stdout, the last time
-        self._command, self._say, self._secrets = command, say, secrets  # not on a command line, which all users see
+        # not on a command line, which all users see
+        self._command, self._say, self._secrets = command, say, secrets
         self._address = str(life)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.bind(self._address)
@@ -97,7 +100,8 @@ class HeadProcess:
 
     def _keep(self, stream: IO[bytes]) -> None:
         self.output = stream.read(MAX_OUTPUT)
-        while stream.read(MAX_LINE):  # further output is discarded, so that the head does not block on it
+        # further output is discarded, so that the head does not block on it
+        while stream.read(MAX_LINE):
             pass
 
     def _drain(self) -> bool:
@@ -117,7 +121,9 @@ class HeadProcess:
         return time.monotonic() - self._first_ready_s if self._first_ready_s else 0.0
 
     def tend(self) -> bool:
-        """Begin it again where it ended in error or stalled; whether it still has something to do. Never waits."""
+        """Begin it again where it ended in error or stalled; whether it still has something to
+        do. Never waits.
+        """
         if self.code is not None:
             return False
         now_s = time.monotonic()
@@ -141,7 +147,8 @@ class HeadProcess:
     def _ended(self, code: int, now_s: float) -> bool:
         for reader in self._readers:
             reader.join(1.0)
-        # A head ended by a signal or an unforeseen error is restarted; one that exits with 0 to 4 has finished.
+        # A head ended by a signal or an unforeseen error is restarted; one that exits with 0 to 4
+        # has finished.
         if 0 <= code <= 4 and (self._ready or code != 0):
             self.code = code
             return False
@@ -182,7 +189,8 @@ class HeadProcess:
 
 @dataclass(frozen=True, slots=True)
 class HeadsRun:
-    """What a run of heads is asked for: `options` go to each head's `serve`, with its own ledger beside `ledger`.
+    """What a run of heads is asked for: `options` go to each head's `serve`, with its own ledger
+    beside `ledger`.
 
     `consoles` are the addresses of their pages, if any, which a browser is let into by `token`.
     """
@@ -208,7 +216,9 @@ def head_ledger(ledger: Path, name: str, number: int = 0) -> Path:
 
 
 def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
-    """Show each head until its end, or until a signal; what each one said of itself (--json), by its name."""
+    """Show each head until its end, or until a signal; what each one said of itself (--json), by
+    its name.
+    """
     stop = threading.Event()
     with temporary_folder("heads") as folder, stop_on_signal(stop):
         endpoint = f"ipc://{folder}/{SOCKET}"

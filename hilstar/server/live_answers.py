@@ -1,7 +1,9 @@
-"""The tracker in the loop of a run: its answers, taken beside the frame loop, judged, recorded and told.
+"""The tracker in the loop of a run: its answers, taken beside the frame loop, judged, recorded and
+told.
 
-The frame loop only leaves each frame here. One thread takes what the reader's process has decoded, fifty times a second and at
-most MAX_JUDGED_HZ answers a second. Those beyond that are counted and recorded without a verdict, as one that judging fails on.
+The frame loop only leaves each frame here. One thread takes what the reader's process has decoded,
+fifty times a second and at most MAX_JUDGED_HZ answers a second. Those beyond that are counted and
+recorded without a verdict, as one that judging fails on.
 """
 
 import math
@@ -51,8 +53,10 @@ class LiveAnswers:
     ) -> None:
         self.figures = TrackerFigures()
         self.newest: Judged | None = None
-        self.heard: Callable[[LiveAnswers], None] = lambda answers: None  # called with new figures of a new answer
-        self.passed_on: Callable[[Answer, int], None] = lambda answer, middle_ns: None  # called with each, as it is judged
+        # called with new figures of a new answer
+        self.heard: Callable[[LiveAnswers], None] = lambda answers: None
+        # called with each, as it is judged
+        self.passed_on: Callable[[Answer, int], None] = lambda answer, middle_ns: None
         self._source, self._notices, self._ledger, self._clock = source, notices, ledger, clock
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._on_screen = screen is not None
@@ -66,7 +70,9 @@ class LiveAnswers:
         self._thread = threading.Thread(target=self._run, name="hilstar-answers", daemon=True)
 
     def frame(self, shown: Shown, light_ns: int) -> None:
-        """Take a frame whose light leaves at `light_ns` of the sender's clock. Called by the frame loop."""
+        """Take a frame whose light leaves at `light_ns` of the sender's clock. Called by the
+        frame loop.
+        """
         attitude, on_screen = shown.attitude, shown.on_screen
         seen = attitude is not None and not on_screen.operator and not on_screen.hidden
         host_ns = shown.swap_ns + self._light_ns if self._on_screen else shown.draw_ns
@@ -114,7 +120,9 @@ class LiveAnswers:
             self.heard(self)
 
     def _told(self, figures: TrackerFigures, now_ns: int) -> TrackerFigures:
-        """The figures, once it is told who is silent where no answer comes: the tracker, or what reads it here."""
+        """The figures, once it is told who is silent where no answer comes: the tracker, or what
+        reads it here.
+        """
         reason = self._source.unread
         if reason:
             self._unread, self._unread_ns = reason, now_ns
@@ -133,7 +141,8 @@ class LiveAnswers:
     def _judged(self, answer: Answer) -> Judged:
         try:
             return self._judge.judge(answer)
-        except Exception as error:  # an answer that cannot be judged is counted and recorded all the same
+        except Exception as error:
+            # an answer that cannot be judged is counted and recorded all the same
             self._failed(error)
             return self._judge.pass_over(answer)
 

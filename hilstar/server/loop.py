@@ -1,7 +1,9 @@
 """The frame loop: an attitude at each frame's moment of light, drawn, counted, handed on.
 
-It knows neither screens nor links: a pacer says when frames are due and shows them, and the caller supplies
-the attitudes. `FaultyFrames` says which frames a fault drops, freezes or blanks; a fault of light is a layer of the frame.
+It knows neither screens nor links: a pacer says when frames are due and shows them, and the caller
+supplies
+the attitudes. `FaultyFrames` says which frames a fault drops, freezes or blanks; a fault of light
+is a layer of the frame.
 """
 
 import math
@@ -36,7 +38,8 @@ GIVEN_UP_PERIODS = 2.0
 class Limit:
     """When a paced run ends: after a number of refresh periods, or of frames drawn.
 
-    With `from_first_attitude` a live run draws blank frames until an attitude has come, and counts from then on.
+    With `from_first_attitude` a live run draws blank frames until an attitude has come, and counts
+    from then on.
     """
 
     slots: float = math.inf
@@ -60,7 +63,9 @@ class Held:
 
 
 class FaultyFrames:
-    """The faults of a run, frame by frame; `source` says which are on in the frame whose light begins at a time, ns."""
+    """The faults of a run, frame by frame; `source` says which are on in the frame whose light
+    begins at a time, ns.
+    """
 
     def __init__(self, source: Callable[[int], tuple[Now, ...]], view: FaultView) -> None:
         self.dropped = self.frozen = 0
@@ -69,7 +74,9 @@ class FaultyFrames:
         self._held: Held | None = None
 
     def at(self, t_ns: int, attitude: Attitude | None) -> FaultLayer | None:
-        """The faults of a frame as a layer; None without any, and before the run's first attitude."""
+        """The faults of a frame as a layer; None without any, and before the run's first
+        attitude.
+        """
         if attitude is None and self._held is None:
             return None
         now = self.now = self._source(t_ns)
@@ -104,7 +111,9 @@ class FaultyFrames:
     def shown(
         self, effects: FaultLayer | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
     ) -> tuple[Now, ...]:
-        """Remember a shown frame, and return its faults: of one that `stays` its first ones, and what freezes it now."""
+        """Remember a shown frame, and return its faults: of one that `stays` its first ones, and
+        what freezes it now.
+        """
         now = () if effects is None else effects.now
         if stays and self._held is not None:
             return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
@@ -115,9 +124,9 @@ class FaultyFrames:
 class FrameLoop:
     """Draws frames; a slow frame is missed, and never delays those after it.
 
-    `moving` says whether stars are drawn along their paths; by default as the bench file has it, which is on a screen only.
-    `on_frame` is called with each frame's number and time stamp, host ns: on a screen after its swap, else when it is due, and
-    in an unpaced run once it is drawn.
+    `moving` says whether stars are drawn along their paths; by default as the bench file has it,
+    which is on a screen only. `on_frame` is called with each frame's number and time stamp, host
+    ns: on a screen after its swap, else when it is due, and in an unpaced run once it is drawn.
     """
 
     def __init__(
@@ -147,7 +156,8 @@ class FrameLoop:
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
 
-        None for a frame that is given up because its moment passed while its sprites were computed, or that a fault drops.
+        None for a frame that is given up because its moment passed while its sprites were computed,
+        or that a fault drops.
         """
         if moment.due_ns is None:  # else `paced` looks, between the frames
             self._gpu.look()
@@ -256,7 +266,8 @@ class FrameLoop:
         return self.pacer.summary(self.tally.swaps.summary()) or UNSET
 
     def paced(self, limit: Limit, draw_slot: Callable[[Moment], Shown | None]) -> None:
-        """Call `draw_slot` at each of the pacer's moments up to `limit`; it returns what it drew, None for nothing.
+        """Call `draw_slot` at each of the pacer's moments up to `limit`; it returns what it drew,
+        None for nothing.
 
         A slot whose moment has passed when its turn comes is missed, counted, and not drawn.
         """
@@ -275,7 +286,9 @@ class FrameLoop:
                 self._gpu.look()
 
     def lead_in(self, draw_blank: Callable[[Moment], object], over: Callable[[], bool]) -> None:
-        """Call `draw_blank` at each of the pacer's moments until `over` is true; none of these frames is counted."""
+        """Call `draw_blank` at each of the pacer's moments until `over` is true; none of these
+        frames is counted.
+        """
         with self.pacer.steady():
             for moment in self.pacer.moments():
                 if over() or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
@@ -289,7 +302,8 @@ class FrameLoop:
             return 0
         between = int(min(slot, limit.slots)) - last.slot - 1
         self.tally.missed_frames += between + gave_up
-        return between + (last.missed_before + 1 if gave_up else 0)  # the slot of a frame given up had none either
+        # the slot of a frame given up had none either
+        return between + (last.missed_before + 1 if gave_up else 0)
 
 
 def policy_of(settings: AttitudeSettings) -> Policy:

@@ -34,8 +34,9 @@ def link_keys(settings: AttitudeSettings | FaultSettings, folder: Path) -> Curve
 def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None, *, apart: bool = False) -> AnyLink:
     """The link that the bench file in `folder` names. Raises InputError if it cannot be opened.
 
-    With `apart`, what the kernel does not stamp is read and stamped by a process of its own: OpenGL's calls hold Python's
-    lock, and a thread of a process that draws reads a packet some milliseconds late.
+    With `apart`, what the kernel does not stamp is read and stamped by a process of its own:
+    OpenGL's calls hold Python's lock, and a thread of a process that draws reads a packet some
+    milliseconds late.
     """
     settings = config.attitude
     sent = SentAttitudes(settings.convention, Mounting(config.tracker.q_body_to_cam))
@@ -43,7 +44,8 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
         return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices, sent=sent)
     if settings.source in {"udp", "scpi"}:
         link = UdpLink(*udp_road(settings), notices, sent=sent)
-        if settings.source == "scpi":  # hilstar's own process sends the packets: nobody else has a convention
+        # hilstar's own process sends the packets: nobody else has a convention
+        if settings.source == "scpi":
             link.conventions = replace(link.conventions, source="SCPI", of_packets=False)
         return link
     if settings.source == "vizard":
@@ -80,7 +82,9 @@ def _open_42(config: BenchConfig, notices: Notices | None) -> AnyLink:
 
 
 def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:
-    """The first attitude that arrives within `patience_s`. Raises InputError where none does, with the last refusal."""
+    """The first attitude that arrives within `patience_s`. Raises InputError where none does,
+    with the last refusal.
+    """
     deadline_s = time.monotonic() + patience_s
     refused = ""
     while time.monotonic() < deadline_s:
@@ -88,7 +92,8 @@ def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:
             match arrival.event:
                 case AttitudeSample() as sample:
                     return sample
-                case TimeRequest(sequence, t1_ns) if link.two_way:  # a sender may wait for the answer before it sends
+                # a sender may wait for the answer before it sends
+                case TimeRequest(sequence, t1_ns) if link.two_way:
                     back = arrival.back or link.send
                     back(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
                 case Refusal(reason, detail):

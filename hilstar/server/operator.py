@@ -1,6 +1,8 @@
-"""The operator of a run: switches over the sky (keys at the display, the page), who asks for them, and what they change.
+"""The operator of a run: switches over the sky (keys at the display, the page), who asks for them,
+and what they change.
 
-The frame loop turns switches and counts the frames that they change. Other threads ask through a queue of `SwitchRequest`.
+The frame loop turns switches and counts the frames that they change. Other threads ask through a
+queue of `SwitchRequest`.
 """
 
 from collections import deque
@@ -78,7 +80,9 @@ class Aids:
 
 @dataclass(eq=False, slots=True)
 class SwitchRequest:
-    """A request to turn one switch of `Aids`, and who asks. The frame loop sets `done`; `called_off` withdraws it."""
+    """A request to turn one switch of `Aids`, and who asks. The frame loop sets `done`;
+    `called_off` withdraws it.
+    """
 
     name: str
     on: bool
@@ -93,12 +97,14 @@ class SwitchRequest:
         return f"{self.name} {'on' if self.on else 'off'}"
 
 
-SwitchRequests = deque[SwitchRequest]  # from any thread; the frame loop empties it once a frame and never waits
+# from any thread; the frame loop empties it once a frame and never waits
+SwitchRequests = deque[SwitchRequest]
 
 
 @dataclass(frozen=True, slots=True)
 class OnScreen:
-    """What changes a frame on the screen: an operator's keys ("" for none), and why it is hidden ("" if it is not).
+    """What changes a frame on the screen: an operator's keys ("" for none), and why it is hidden
+    ("" if it is not).
 
     `sky` is false where the keys leave no sky at all.
     """
@@ -114,7 +120,8 @@ SKY_AGAIN = "the sky of the attitude again"
 
 
 class Operator:
-    """What covers the sky, and why the window is `hidden` ("" where it is visible, and without one).
+    """What covers the sky, and why the window is `hidden` ("" where it is visible, and without
+    one).
 
     `requests` come from other threads. Without a screen, the aids are drawn into the `levels`.
     """
@@ -130,12 +137,15 @@ class Operator:
         self.aids, self._notices, self._hidden, self._levels = aids, notices, hidden, levels
         self._requests = deque() if requests is None else requests
         self._told = HEADLESS
-        self._held: tuple[Attitude, int] | None = None  # what a paused screen shows, and the time that it was for
+        # what a paused screen shows, and the time that it was for
+        self._held: tuple[Attitude, int] | None = None
         self._last_swap_ns: int | None = None
         self._frames, self._lasted_ns = {"operator": 0, "hidden": 0}, {"operator": 0, "hidden": 0}
 
     def look(self) -> OnScreen:
-        """State of the switches and the window now, once what was requested is done. Reports what has changed."""
+        """State of the switches and the window now, once what was requested is done. Reports
+        what has changed.
+        """
         while self._requests:
             request = self._requests.popleft()
             if not request.called_off:
@@ -156,7 +166,9 @@ class Operator:
         return now
 
     def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
-        """Attitude to show: during a pause the one of its start, with a growing age; None where no sky is shown."""
+        """Attitude to show: during a pause the one of its start, with a growing age; None where
+        no sky is shown.
+        """
         if not self.aids.paused:
             self._held = None if attitude is None else (attitude, t_ns)
         elif self._held is None:
@@ -180,7 +192,9 @@ class Operator:
                 self._lasted_ns[name] += since_ns
 
     def summary(self) -> dict[str, Any]:
-        """Frames changed by the operator and frames hidden by the window: count, and duration in s."""
+        """Frames changed by the operator and frames hidden by the window: count, and duration in
+        s.
+        """
         return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}
 
 

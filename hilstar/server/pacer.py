@@ -1,7 +1,7 @@
 """Pacing: when each frame of a run is to be begun, when its light leaves, and how it was shown.
 
-A pacer hands the frame loop one moment after another. `Pacer` keeps a grid of this host's clock, for a run without a screen;
-`DisplayPacer` (`screen/screen.py`) follows a display's refresh.
+A pacer hands the frame loop one moment after another. `Pacer` keeps a grid of this host's clock,
+for a run without a screen; `DisplayPacer` (`screen/screen.py`) follows a display's refresh.
 """
 
 import threading
@@ -22,9 +22,10 @@ from hilstar.server.operator import HEADLESS, Aids, OnScreen, Operator
 class Moment:
     """When a frame is to be shown; host times, ns.
 
-    It is begun at `begin_ns` and late after `due_ns` (None: never late). `swap_ns` is its predicted swap onto a screen, and
-    `light_ns` when its middle row lights (None: as soon as it is begun). The pacer gives all of these; the frame loop counts
-    `missed_before`, the refresh periods just before it without a frame of their own, and whether it `may_be_given_up`.
+    It is begun at `begin_ns` and late after `due_ns` (None: never late). `swap_ns` is its predicted
+    swap onto a screen, and `light_ns` when its middle row lights (None: as soon as it is begun).
+    The pacer gives all of these; the frame loop counts `missed_before`, the refresh periods just
+    before it without a frame of their own, and whether it `may_be_given_up`.
     """
 
     slot: int = 0
@@ -41,7 +42,9 @@ class Moment:
 
     @property
     def starts_ns(self) -> int | None:
-        """When the frame starts where that is known before it is drawn: paced, and without a screen's swap to wait for."""
+        """When the frame starts where that is known before it is drawn: paced, and without a
+        screen's swap to wait for.
+        """
         return self.due_ns if self.swap_ns is None else None
 
 
@@ -50,7 +53,9 @@ AT_ONCE = Moment()
 
 @dataclass(frozen=True, slots=True)
 class Presented:
-    """How a frame was shown: when (host time, ns), by which clock, and the photodiode square's light in it."""
+    """How a frame was shown: when (host time, ns), by which clock, and the photodiode square's
+    light in it.
+    """
 
     swap_ns: int
     timestamp_source: str = "headless"
@@ -59,12 +64,14 @@ class Presented:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """One frame of a run: its number, its time on the timeline, its attitude (None: blank) and what was drawn.
+    """One frame of a run: its number, its time on the timeline, its attitude (None: blank) and what
+    was drawn.
 
-    Host times, ns: `draw_ns` when drawing began, `predicted_swap_ns` and `swap_ns` when the frame was to be swapped onto the
-    screen and when it was; headless, with nothing predicted, when its levels were ready. `missed_before` counts the refresh
-    periods just before it that had no frame of their own, and `marker` is the photodiode square's light, 0 or 1. `missing`
-    is true where no attitude has come yet; `attitude` is None too where an operator's key hides the sky.
+    Host times, ns: `draw_ns` when drawing began, `predicted_swap_ns` and `swap_ns` when the frame
+    was to be swapped onto the screen and when it was; headless, with nothing predicted, when its
+    levels were ready. `missed_before` counts the refresh periods just before it that had no frame
+    of their own, and `marker` is the photodiode square's light, 0 or 1. `missing` is true where no
+    attitude has come yet; `attitude` is None too where an operator's key hides the sky.
     """
 
     number: int
@@ -91,9 +98,11 @@ def ignore(shown: Shown) -> None:
 
 
 class Pacer:
-    """Says when frames are due, and shows them: here at a steady rate of the host's clock, their levels read back.
+    """Says when frames are due, and shows them: here at a steady rate of the host's clock, their
+    levels read back.
 
-    `stop` is set to end the run. `moves_stars`: whether stars move within a frame, as where rows of a screen light one by one.
+    `stop` is set to end the run. `moves_stars`: whether stars move within a frame, as where rows of
+    a screen light one by one.
     """
 
     moves_stars = False
@@ -105,7 +114,8 @@ class Pacer:
         self._period_ns = period_ns
 
     def moments(self) -> Iterator[Moment]:
-        """The moments of a run, without end, each the first that can be reached when it is asked for.
+        """The moments of a run, without end, each the first that can be reached when it is asked
+        for.
 
         One each period from now on; those already past when the next is asked for are skipped.
         """
@@ -118,11 +128,15 @@ class Pacer:
             slot = max(slot, passed) + 1
 
     def steady(self) -> AbstractContextManager[object]:
-        """A context in which frames have priority over other work; without a screen it does nothing."""
+        """A context in which frames have priority over other work; without a screen it does
+        nothing.
+        """
         return nullcontext()
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
-        """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each stage."""
+        """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each
+        stage.
+        """
         drawn.levels = self.operator.laid_over(drawn.levels)
         return Presented(self.clock.now_ns())
 

@@ -1,8 +1,9 @@
-"""Where the first attitude of a run points, in words that a person compares with what the simulator means.
+"""Where the first attitude of a run points, in words that a person compares with what the simulator
+means.
 
-Attitudes without rates, or at rest, cannot show that they are read in the wrong convention: every unit quaternion is one. So
-the place is said once, with the brightest star there. The frame loop only leaves the attitude here; a thread of its own looks
-for the star, in milliseconds.
+Attitudes without rates, or at rest, cannot show that they are read in the wrong convention: every
+unit quaternion is one. So the place is said once, with the brightest star there. The frame loop
+only leaves the attitude here; a thread of its own looks for the star, in milliseconds.
 """
 
 import threading
@@ -54,7 +55,9 @@ class Pointing:
 
 
 def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
-    """Right ascension, declination and roll of an attitude (4,), and the brightest star in the tracker's field."""
+    """Right ascension, declination and roll of an attitude (4,), and the brightest star in the
+    tracker's field.
+    """
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q_icrs_to_cam)
     ra, roll = turn_text(ra_deg, 3), turn_text(roll_deg, 3)
     text = f"the first attitude points at RA {ra}, Dec {dec_deg:+.3f}, roll {roll} deg"
@@ -71,7 +74,9 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
 
 
 def _brightest_in_view(bench: Bench, matrix: FloatArray) -> int | None:
-    """The place of the brightest star of the catalogue in the tracker's field; None where none is there."""
+    """The place of the brightest star of the catalogue in the tracker's field; None where none
+    is there.
+    """
     tracker, stars = bench.config.tracker, bench.stars
     width, height = (0.5 * pixels * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm for pixels in tracker.resolution_px)
     fixed = len(stars) - len(stars.bodies)

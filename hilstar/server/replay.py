@@ -1,4 +1,6 @@
-"""The replay of a log or of a ledger: which part of it, how fast, the run itself, and its frames as files."""
+"""The replay of a log or of a ledger: which part of it, how fast, the run itself, and its frames
+as files.
+"""
 
 import csv
 import math
@@ -46,14 +48,16 @@ from hilstar.server.serve import Outlet, Running
 from hilstar.server.summary import RunSummary
 
 MAX_FRAMES = 100_000_000
-# `exact` in NumPy is another program than its shader: of two choices that are as good it may take the other.
+# `exact` in NumPy is another program than its shader: of two choices that are as good it may take
+# the other.
 OTHER_CODES_BY_NUMPY = 0.35
 COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the command line asks of a replay: a factor of real time, infinite for as fast as possible, and seconds of the log.
+    """What the command line asks of a replay: a factor of real time, infinite for as fast as
+    possible, and seconds of the log.
 
     `start_s` and `stop_s` count from the log's first sample.
     """
@@ -66,7 +70,9 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class DrawnBy:
-    """Who draws a run's codes: the GL renderer and version as the driver names them, and the path (see `Backend.path`)."""
+    """Who draws a run's codes: the GL renderer and version as the driver names them, and the
+    path (see `Backend.path`).
+    """
 
     gl_renderer: str
     gl_version: str
@@ -77,7 +83,9 @@ class DrawnBy:
         return f"{self.gl_renderer}, OpenGL {self.gl_version}, by {self.path}"
 
     def other_codes(self, other: "DrawnBy", quantisation: Quantisation) -> float:
-        """The largest share of lit pixels whose codes the two may draw one off; 0: the same bit for bit."""
+        """The largest share of lit pixels whose codes the two may draw one off; 0: the same bit
+        for bit.
+        """
         if self == other:
             return 0.0
         by_numpy = (self.path == "NumPy") != (other.path == "NumPy")
@@ -85,7 +93,9 @@ class DrawnBy:
 
 
 class PlayedFrame(NamedTuple):
-    """Number, time and attitude of a frame to be replayed, and an earlier run's record; without an attitude it is blank."""
+    """Number, time and attitude of a frame to be replayed, and an earlier run's record; without
+    an attitude it is blank.
+    """
 
     number: int
     t_ns: int
@@ -95,14 +105,18 @@ class PlayedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Recorded frames, in order; `paced` as on a monitor, where late ones are missed, else as fast as possible.
+    """Recorded frames, in order; `paced` as on a monitor, where late ones are missed, else as fast
+    as possible.
 
-    `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
-    sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
-    `told` are events to report before it begins, `span` says how long a log is, and its step. `wrong_sky` is when the sky
-    of an earlier run was wrong: it is so again. Only an earlier run has faults in its `recording`, and a
-    renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer draws the same codes
-    from them bit for bit; another draws them within `DrawnBy.other_codes`.
+    `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its
+    seconds: the log's first sample, or the run's first frame. `moving` says whether stars are drawn
+    along their paths; None: as the bench file says. `told` are events to report before it begins,
+    `span` says how long a log is, and its step. `wrong_sky` is when the sky
+    of an earlier run was wrong: it is so again. Only an earlier run has faults in its `recording`,
+    and a
+    renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same
+    renderer draws the same codes from them bit for bit; another draws them within
+    `DrawnBy.other_codes`.
     """
 
     frame: Callable[[int], PlayedFrame]
@@ -124,7 +138,8 @@ class Play:
 def played_again(
     read: Callable[[], Iterator[FrameRecord]], count: int, packet_count: int, paced: bool, recording: Recording
 ) -> Play:
-    """The play of an earlier run's `count` frames, each with the attitude and the motion that it had.
+    """The play of an earlier run's `count` frames, each with the attitude and the motion that it
+    had.
 
     They are read as they are played, in order, so that memory does not grow with the run.
     """
@@ -147,10 +162,11 @@ def played_again(
 
 
 def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
-    """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a step is given.
+    """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a
+    step is given.
 
-    Of a ledger those that its run drew. `stated` is what the log does not say itself. Raises InputError for a speed, a span or
-    a step that gives no frame.
+    Of a ledger those that its run drew. `stated` is what the log does not say itself. Raises
+    InputError for a speed, a span or a step that gives no frame.
     """
     factor = wanted.speed
     check_stated(log, stated)
@@ -218,7 +234,9 @@ def _tell_of(play: Play, notices: Notices) -> None:
 
 
 def _recall_conditions(wrong_sky: WrongSky, past: FrameRecord | None, notices: Notices) -> None:
-    """Begin and end the conditions of the run that is replayed, as they were at the swap of its frame."""
+    """Begin and end the conditions of the run that is replayed, as they were at the swap of its
+    frame.
+    """
     held = {} if past is None else dict(wrong_sky.at(past.swap_ns))
     for condition in notices.wrong_sky.now():
         if condition.kind not in held:
@@ -245,7 +263,9 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
-    """Replay recorded frames: paced, where late ones are missed as on a monitor, or all of them as fast as possible."""
+    """Replay recorded frames: paced, where late ones are missed as on a monitor, or all of them
+    as fast as possible.
+    """
     outlet = outlet or Outlet()
     if outlet.faults is None and play.recording.faults:
         outlet = replace(outlet, faults=ReplayedFaults(bench, play.recording, outlet.ledger))

@@ -1,4 +1,6 @@
-"""The test sender: a log or a spin at a steady rate, with the faults of a bad cable, reproducible by a seed."""
+"""The test sender: a log or a spin at a steady rate, with the faults of a bad cable,
+reproducible by a seed.
+"""
 
 import threading
 import time
@@ -33,7 +35,9 @@ class Faults:
 
 @dataclass(slots=True)
 class SendTally:
-    """The fate of the packets: `sent` left intact and in order, `corrupted` and `reordered` left, `lost` did not."""
+    """The fate of the packets: `sent` left intact and in order, `corrupted` and `reordered`
+    left, `lost` did not.
+    """
 
     sent: int = 0
     lost: int = 0
@@ -58,7 +62,9 @@ class BadCable:
         return float(self._rng.uniform(0.0, self._faults.jitter_s)) if self._faults.jitter_s else 0.0
 
     def carry(self, packet: bytes) -> None:
-        """Send a packet, with its fault if it has one. A packet held back leaves right after the next."""
+        """Send a packet, with its fault if it has one. A packet held back leaves right after the
+        next.
+        """
         faults, tally = self._faults, self.tally
         dice = self._rng.random()
         if dice < faults.lose:
@@ -102,9 +108,11 @@ def spin_samples(
 
 
 def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterator[AttitudeSample]:
-    """A log from t = 0: its own samples, or resampled at `rate_hz`. A rate that the log lacks is taken from the next step.
+    """A log from t = 0: its own samples, or resampled at `rate_hz`. A rate that the log lacks is
+    taken from the next step.
 
-    Nothing is known within a gap: before it there is no such rate, and the sample after it is a discontinuity.
+    Nothing is known within a gap: before it there is no such rate, and the sample after it is a
+    discontinuity.
     """
     joins = log_joins(samples)
     after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
@@ -122,7 +130,9 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
 
 
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:
-    """The log at even times; the first sample after a break is marked, and rates are the log's where it has rates."""
+    """The log at even times; the first sample after a break is marked, and rates are the log's
+    where it has rates.
+    """
     timeline = log_timeline(samples, Policy(0, NS_PER_S))
     count = int((samples[-1].t_ns - samples[0].t_ns) * rate_hz / NS_PER_S + 1e-6) + 1
     if count > MAX_RESAMPLED:

@@ -1,4 +1,6 @@
-"""The sending end of every road to hilstar (ZeroMQ, serial line, UDP), and `Sender`, a simulator in Python over any of them."""
+"""The sending end of every road to hilstar (ZeroMQ, serial line, UDP), and `Sender`, a simulator
+in Python over any of them.
+"""
 
 from __future__ import annotations  # docs/python-api.md shows annotations as they are written
 
@@ -42,7 +44,9 @@ Numbers = Sequence[float] | FloatArray
 
 
 def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
-    """The end that `to` names: serial line, UDP, or else ZeroMQ; `clock` (ns) stamps its time replies. Raises InputError."""
+    """The end that `to` names: serial line, UDP, or else ZeroMQ; `clock` (ns) stamps its time
+    replies. Raises InputError.
+    """
     line = serial_target(to)
     if line is None and not to.startswith("udp:"):
         return ZmqSender(to, bind=not connect, keys=keys)
@@ -52,7 +56,9 @@ def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, cl
 
 
 class TwoWay(Closing):
-    """An end that also listens: a thread answers time requests by the clock, keeps the newest status and answer."""
+    """An end that also listens: a thread answers time requests by the clock, keeps the newest
+    status and answer.
+    """
 
     status: Status | None = None
     answer: AnswerPacket | None = None
@@ -100,7 +106,9 @@ class SerialSender(TwoWay, SerialLink):
         self.send_bytes(framed(packet), PATIENCE_S)
 
     def close(self) -> None:
-        """Stop listening, and close the port once everything has been sent; after a signal at once."""
+        """Stop listening, and close the port once everything has been sent; after a signal at
+        once.
+        """
         self._stop_listening()
         if caught() is None:
             self.drain()
@@ -108,7 +116,9 @@ class SerialSender(TwoWay, SerialLink):
 
 
 class UdpSender(TwoWay):
-    """The sender's end of UDP: a connected socket. Raises InputError where the endpoint is wrong or its host unknown."""
+    """The sender's end of UDP: a connected socket. Raises InputError where the endpoint is wrong
+    or its host unknown.
+    """
 
     def __init__(self, to: str, clock: Clock = time.monotonic_ns) -> None:
         match = UDP.fullmatch(to)
@@ -153,11 +163,12 @@ SenderEnd = ZmqSender | SerialSender | UdpSender  # where a sender puts its pack
 class Sender(Closing):
     """The sending end of a road to hilstar; `hilstar serve` is the other.
 
-    `to` is `udp://HOST:PORT`, `serial:/dev/ttyX@BAUD`, or a ZeroMQ endpoint: `tcp://HOST:PORT` or `ipc:///PATH`, which this end
-    binds unless `connect`. The key files are those of `hilstar keys`: `secret_key`, with `allowed_clients` where this end binds
-    and `server_key` where it connects. `clock` gives the simulation's time in ns, of any zero. Over UDP and serial lines a
-    thread answers hilstar's time requests on it, and keeps the newest `status`. Raises InputError where the road cannot be
-    opened.
+    `to` is `udp://HOST:PORT`, `serial:/dev/ttyX@BAUD`, or a ZeroMQ endpoint: `tcp://HOST:PORT` or
+    `ipc:///PATH`, which this end binds unless `connect`. The key files are those of `hilstar keys`:
+    `secret_key`, with `allowed_clients` where this end binds and `server_key` where it connects.
+    `clock` gives the simulation's time in ns, of any zero. Over UDP and serial lines a thread
+    answers hilstar's time requests on it, and keeps the newest `status`. Raises InputError where
+    the road cannot be opened.
     """
 
     def __init__(
@@ -183,16 +194,22 @@ class Sender(Closing):
 
     @property
     def status(self) -> Status | None:
-        """The newest status of hilstar; None before the first, and over ZeroMQ, which has no way back."""
+        """The newest status of hilstar; None before the first, and over ZeroMQ, which has no way
+        back.
+        """
         return self._end.status
 
     @property
     def answer(self) -> AnswerPacket | None:
-        """The tracker's newest valid answer, `t_ns` on this end's clock; None as `status` is, and without `[answers]`."""
+        """The tracker's newest valid answer, `t_ns` on this end's clock; None as `status` is,
+        and without `[answers]`.
+        """
         return self._end.answer
 
     def wait(self, timeout_s: float = 30.0) -> bool:
-        """True once hilstar listens: a subscriber (ZeroMQ), an answer (UDP), or at once where the road cannot tell (serial)."""
+        """True once hilstar listens: a subscriber (ZeroMQ), an answer (UDP), or at once where
+        the road cannot tell (serial).
+        """
         return self._end.wait_for_listener(timeout_s)
 
     def send(
@@ -203,10 +220,12 @@ class Sender(Closing):
         t_ns: int | None = None,
         discontinuity: bool = False,
     ) -> None:
-        """Send one attitude: a unit quaternion (4,), scalar first, and its rate (3,), rad/s, camera components, if it is known.
+        """Send one attitude: a unit quaternion (4,), scalar first, and its rate (3,), rad/s, camera
+        components, if it is known.
 
-        `t_ns` is the instant of the attitude on the simulation's clock, by default now. `discontinuity` says that the attitude
-        jumped. Raises InputError for what hilstar would refuse. Only a full serial line is waited for, half a second at most.
+        `t_ns` is the instant of the attitude on the simulation's clock, by default now.
+        `discontinuity` says that the attitude jumped. Raises InputError for what hilstar would
+        refuse. Only a full serial line is waited for, half a second at most.
         """
         at_ns = self._clock() if t_ns is None else int(t_ns)
         q, rate = tuple(map(float, q_icrs_to_cam)), None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s))

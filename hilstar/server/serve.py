@@ -1,4 +1,6 @@
-"""A live run over a link: a free-running stream, or a simulation in lockstep, which waits for a frame of each attitude."""
+"""A live run over a link: a free-running stream, or a simulation in lockstep, which waits for a
+frame of each attitude.
+"""
 
 import itertools
 import math
@@ -41,7 +43,8 @@ POLL_MS = 50
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock, None without a sender.
+    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock,
+    None without a sender.
 
     `answers` are the tracker's, None where the bench file names none.
     """
@@ -57,10 +60,12 @@ Follower = Callable[[Running], None]  # called once, when a run begins
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink (a screen, a ledger), where events are reported, and who follows the run.
+    """Where frames go besides their sink (a screen, a ledger), where events are reported, and who
+    follows the run.
 
-    `pictures` are sent to a simulation that asks for its camera's pictures. `requests` are those of the operator's page.
-    `faults` are the scenario's and the stream's. `pulse` is started at each frame. `answers` are compared with the frames.
+    `pictures` are sent to a simulation that asks for its camera's pictures. `requests` are those of
+    the operator's page. `faults` are the scenario's and the stream's. `pulse` is started at each
+    frame. `answers` are compared with the frames.
     """
 
     screen: Screen | None = None
@@ -74,7 +79,9 @@ class Outlet:
     answers: LiveAnswers | None = None
 
     def loop(self, bench: Bench, sink: FrameSink, moving: bool | None = None) -> FrameLoop:
-        """The frame loop of a run, paced by the screen or else at the bench's own rate; its frames start the pulse."""
+        """The frame loop of a run, paced by the screen or else at the bench's own rate; its
+        frames start the pulse.
+        """
         faults = None if self.faults is None else self.faults.frames
         if self.screen is not None:
             pacer: Pacer = DisplayPacer(self.screen, self.notices, requests=self.requests)
@@ -88,7 +95,9 @@ class Outlet:
         return loop
 
     def record(self, bench: Bench, loop: FrameLoop, shown: Shown, light_ns: int) -> None:
-        """Record a frame, in the ledger if there is one, and for answers; `light_ns` is on the sender's clock."""
+        """Record a frame, in the ledger if there is one, and for answers; `light_ns` is on the
+        sender's clock.
+        """
         if self.answers is not None:
             self.answers.frame(shown, light_ns)
         if self.ledger.on:
@@ -190,7 +199,9 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
 
 
 def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_ns: int) -> None:
-    """Pass a valid answer of the tracker on to the sender, stamped on the sender's clock, once that is known."""
+    """Pass a valid answer of the tracker on to the sender, stamped on the sender's clock, once
+    that is known.
+    """
     offset_ms = receiver.clock_summary().offset_ms
     if answer.q_icrs_to_cam is None or not answer.valid or offset_ms is None:
         return
@@ -201,7 +212,8 @@ def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_
 
 
 class LockstepRun:
-    """The frames of a simulation in lockstep, up to its limit: each attitude that it asks for is drawn at once.
+    """The frames of a simulation in lockstep, up to its limit: each attitude that it asks for is
+    drawn at once.
 
     Its time is its own, and may run at any speed.
     """
@@ -214,7 +226,9 @@ class LockstepRun:
         self._max_rate_rad_s = math.radians(bench.config.attitude.max_rate_deg_s)
 
     def serve(self, link: LockstepLink) -> RunSummary:
-        """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
+        """Answer requests up to the limit, or until a signal; returns the summary. A refused
+        request leaves the last frame.
+        """
         check = self._bench.config.attitude.check_rates
         self._rates = RateCheck(check, self._loop.notices, used=False, read_as=_read_as(self._bench, link))
         loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
@@ -272,7 +286,8 @@ class LockstepRun:
 
 
 class StatusMaker:
-    """Makes the status that goes back to the sender: which frame its attitudes caused, and how the display is doing.
+    """Makes the status that goes back to the sender: which frame its attitudes caused, and how the
+    display is doing.
 
     Missed frames, refused packets and momentary events are reported once each.
     """

@@ -37,8 +37,8 @@ MAX_LATE_SHARE = 0.01  # of frames that may be missed or stale where --strict pa
 class RunVerdict(msgspec.Struct, frozen=True):
     """Whether a run showed the right sky in time, in one line.
 
-    `late_share` is that of frames missed or stale from the first attitude on, `wrong_sky_s` the seconds of a wrong sky.
-    `strict` says whether `--strict` passes.
+    `late_share` is that of frames missed or stale from the first attitude on, `wrong_sky_s` the
+    seconds of a wrong sky. `strict` says whether `--strict` passes.
     """
 
     ok: bool
@@ -90,7 +90,9 @@ class ClippedSummary(msgspec.Struct, frozen=True):
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The JSON object of `serve` and `replay`; what a kind of run does not have is left unset, and is not in its JSON."""
+    """The JSON object of `serve` and `replay`; what a kind of run does not have is left unset,
+    and is not in its JSON.
+    """
 
     frames: int
     duration_s: float
@@ -136,7 +138,9 @@ class SwapTally:
         self._last_ns: int | None = None
 
     def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
-        """Add one swap; `received_ns` is when the newest packet behind the frame arrived, None if there is none."""
+        """Add one swap; `received_ns` is when the newest packet behind the frame arrived, None
+        if there is none.
+        """
         if self._last_ns is not None and not missed_before:
             self._interval_ms.add((swap_ns - self._last_ns) / NS_PER_MS)
         self._last_ns = swap_ns
@@ -145,7 +149,9 @@ class SwapTally:
             self._packet_ms.add((swap_ns - received_ns) / NS_PER_MS)
 
     def summary(self) -> dict[str, Any]:
-        """Jitter of the interval between swaps (standard deviation), lateness and packet to swap; {} without a swap."""
+        """Jitter of the interval between swaps (standard deviation), lateness and packet to
+        swap; {} without a swap.
+        """
         if not self._late_ms.count:
             return {}
         return {

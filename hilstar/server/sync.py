@@ -1,7 +1,9 @@
-"""How a tracker's exposures beat with a screen's refresh, whether that costs more than the bench tolerates, and what avoids it.
+"""How a tracker's exposures beat with a screen's refresh, whether that costs more than the bench
+tolerates, and what avoids it.
 
-An exposure of n + f refreshes (f under 1) sees about n whole frames and a part of one at each end. Each frame shows a star at
-the middle of its own light. A frame seen only in part still counts at its own middle.
+An exposure of n + f refreshes (f under 1) sees about n whole frames and a part of one at each end.
+Each frame shows a star at the middle of its own light. A frame seen only in part still counts at
+its own middle.
 """
 
 import math
@@ -17,7 +19,8 @@ from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 from hilstar.server.bench.config import BenchConfig
 
 ARCSEC_PER_DEG = 3600.0
-# Closer to whole refreshes than this there is no beat: a screen's clock and a tracker's differ by more.
+# Closer to whole refreshes than this there is no beat: a screen's clock and a tracker's differ by
+# more.
 NO_BEAT = 1e-6
 PHASES = 1024
 EDGE = 1e-9  # refreshes: phases to either side of a jump
@@ -30,10 +33,12 @@ FEW_ARCSEC = 99.5  # from there on, two digits would be written with an exponent
 
 @dataclass(frozen=True, slots=True)
 class Exposures:
-    """A tracker before a screen: refresh rate, exposure, how often it exposes, and how long a row stays lit in a refresh.
+    """A tracker before a screen: refresh rate, exposure, how often it exposes, and how long a row
+    stays lit in a refresh.
 
-    `frame_hz` None: one exposure follows the other without a gap. `lit_s` None: the whole refresh; no longer than that counts.
-    `triggered` exposures begin with a frame. Raises InputError for a rate not above 0, and an exposure or light below 0.
+    `frame_hz` None: one exposure follows the other without a gap. `lit_s` None: the whole refresh;
+    no longer than that counts. `triggered` exposures begin with a frame. Raises InputError for a
+    rate not above 0, and an exposure or light below 0.
     """
 
     refresh_hz: float
@@ -70,11 +75,13 @@ class Exposures:
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """A beat: refreshes in an exposure, the period in which the errors repeat, and the largest errors.
+    """A beat: refreshes in an exposure, the period in which the errors repeat, and the largest
+    errors.
 
-    `period_s` is None where nothing beats, and where the tracker exposes at a whole part of the refresh rate: then its phase
-    stands, until the clocks drift. `worst_arcsec_per_deg_s` is that of a star's place in a turn of 1 deg/s, None for an
-    exposure of no length; `worst_mag` that of its light, infinite where an exposure may see none.
+    `period_s` is None where nothing beats, and where the tracker exposes at a whole part of the
+    refresh rate: then its phase stands, until the clocks drift. `worst_arcsec_per_deg_s` is that of
+    a star's place in a turn of 1 deg/s, None for an exposure of no length; `worst_mag` that of its
+    light, infinite where an exposure may see none.
     """
 
     refreshes_per_exposure: float
@@ -87,7 +94,8 @@ class Beat:
 class SeenBeat:
     """What exposures see, by the phase at which each begins, (n,).
 
-    `off_s`: the middle of the light seen after the middle of the exposure, NaN without any. `light`: relative to the mean.
+    `off_s`: the middle of the light seen after the middle of the exposure, NaN without any.
+    `light`: relative to the mean.
     """
 
     off_s: FloatArray
@@ -95,10 +103,12 @@ class SeenBeat:
 
 
 def seen_at(exposures: Exposures, phase: FloatArray) -> SeenBeat:
-    """What is seen by an exposure that begins `phase` (n,) refreshes after a row lights, any number.
+    """What is seen by an exposure that begins `phase` (n,) refreshes after a row lights, any
+    number.
 
-    The integrals of a row's light, and of its light times the middle of its frame, are closed forms of whole refreshes and a
-    rest; an exposure is the difference of two. A star that turns at a rate is off by that rate times `off_s`.
+    The integrals of a row's light, and of its light times the middle of its frame, are closed forms
+    of whole refreshes and a rest; an exposure is the difference of two. A star that turns at a rate
+    is off by that rate times `off_s`.
     """
     begin = np.asarray(phase, dtype=np.float64) % 1.0
     length, lit = exposures.refreshes, exposures.lit
@@ -120,16 +130,17 @@ def _integrals(time: FloatArray, lit: float) -> tuple[FloatArray, FloatArray]:
 def beat(exposures: Exposures) -> Beat:
     """The beat of a screen's refresh and a tracker's exposures.
 
-    While rows stay lit for the whole refresh a star is off by at most f (1 - f) / 2 of one refresh's path, divided by n + f,
-    and whole refreshes cure it. Where they flash it is off by up to half of the dark, however long the exposure is: no exposure
-    cures that.
+    While rows stay lit for the whole refresh a star is off by at most f (1 - f) / 2 of one
+    refresh's path, divided by n + f, and whole refreshes cure it. Where they flash it is off by up
+    to half of the dark, however long the exposure is: no exposure cures that.
     """
     length = exposures.refreshes
     if length <= 0:
         return Beat(length, None, None)
     if exposures.triggered:
         return Beat(length, None, 0.0)
-    # Phases all over a refresh, and to either side of those at which an exposure begins or ends with a row's light.
+    # Phases all over a refresh, and to either side of those at which an exposure begins or ends
+    # with a row's light.
     edges = np.array([0.0, exposures.lit, -length, exposures.lit - length])
     phases = np.concatenate([np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))])
     seen = seen_at(exposures, phases)
@@ -138,7 +149,8 @@ def beat(exposures: Exposures) -> Beat:
     mag = math.inf if dim <= 0 else 2.5 * max(math.log10(bright), -math.log10(dim))
     if abs(length - round(length)) < NO_BEAT and exposures.lit == 1.0:
         return Beat(length, None, 0.0)
-    # The refresh as the tracker's frames sample it: the difference from the nearest multiple of their rate.
+    # The refresh as the tracker's frames sample it: the difference from the nearest multiple of
+    # their rate.
     frame_hz = exposures.every_hz
     rest = exposures.refresh_hz / frame_hz
     rest -= round(rest)
@@ -148,7 +160,8 @@ def beat(exposures: Exposures) -> Beat:
 class BeatProposal(msgspec.Struct, frozen=True, kw_only=True):
     """The nearest settings without a beat, each to be changed alone; None where there is none.
 
-    `frame_hz`, for a panel that flashes, is the nearest rate of the tracker at which its phase stands.
+    `frame_hz`, for a panel that flashes, is the nearest rate of the tracker at which its phase
+    stands.
     """
 
     refresh_hz: float | None = None
@@ -157,9 +170,11 @@ class BeatProposal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BeatSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What a bench's beat costs, in JSON: the figures of `Beat`, and at the bench's own rate of turn.
+    """What a bench's beat costs, in JSON: the figures of `Beat`, and at the bench's own rate of
+    turn.
 
-    `matters` says whether that is over `[render] tolerance_px` or `tolerance_mag`; then there is a `proposal`.
+    `matters` says whether that is over `[render] tolerance_px` or `tolerance_mag`; then there is a
+    `proposal`.
     """
 
     refresh_hz: float
@@ -177,7 +192,9 @@ class BeatSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """What a beat may cost: in a turn at a rate, deg/s, of a star's place, arcsec, and of its light, mag."""
+    """What a beat may cost: in a turn at a rate, deg/s, of a star's place, arcsec, and of its
+    light, mag.
+    """
 
     turn_deg_s: float
     arcsec: float
@@ -190,7 +207,9 @@ class Tolerance:
 
 
 def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposures:
-    """The exposures of a bench, with its screen's nominal refresh rate or a measured one. Raises InputError."""
+    """The exposures of a bench, with its screen's nominal refresh rate or a measured one. Raises
+    InputError.
+    """
     monitor, tracker = config.monitor, config.tracker
     lit_s = None if monitor.hold_ms is None else monitor.hold_ms * NS_PER_MS / NS_PER_S
     hz = monitor.refresh_hz if refresh_hz is None else refresh_hz
@@ -200,7 +219,8 @@ def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposu
 def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequence[float] = ()) -> BeatSummary:
     """The beat of a bench, and what to write instead where it costs too much. Raises InputError.
 
-    `refresh_hz` is that of the display where it was measured, `modes_hz` are those that the display has.
+    `refresh_hz` is that of the display where it was measured, `modes_hz` are those that the display
+    has.
     """
     exposures, render = exposures_of(config, refresh_hz), config.render
     pixel_arcsec = config.monitor.pixel_pitch_um * MM_PER_UM / config.collimator.focal_length_mm * ARCSEC_PER_RAD
@@ -224,7 +244,8 @@ def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequ
 
 
 def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float] = ()) -> BeatProposal:
-    """The nearest refresh rate, exposure and rate of the tracker that keep the beat within a tolerance, each alone.
+    """The nearest refresh rate, exposure and rate of the tracker that keep the beat within a
+    tolerance, each alone.
 
     With `modes_hz` the refresh rate is the nearest of those.
     """
@@ -279,10 +300,12 @@ def beat_line(found: BeatSummary) -> str | None:
 
 
 class SyncSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The pulses of a run: how many were sent, how many due ones were skipped, and how often the line was lost.
+    """The pulses of a run: how many were sent, how many due ones were skipped, and how often the
+    line was lost.
 
-    `delay_ms` is the mean from a frame's time stamp to its pulse as this machine asks the line for it, `jitter_ms` the standard
-    deviation, `max_delay_ms` the largest; `line_ms` is the mean time that the line takes, which comes on top. None without any.
+    `delay_ms` is the mean from a frame's time stamp to its pulse as this machine asks the line for
+    it, `jitter_ms` the standard deviation, `max_delay_ms` the largest; `line_ms` is the mean time
+    that the line takes, which comes on top. None without any.
     """
 
     port: str

@@ -1,4 +1,6 @@
-"""What a run watches: whether an attitude is there, how long each stage of a frame takes, and whether the GPU is well."""
+"""What a run watches: whether an attitude is there, how long each stage of a frame takes, and
+whether the GPU is well.
+"""
 
 import threading
 from typing import Self
@@ -45,21 +47,26 @@ class AttitudeWatch:
 
 LOOK_S = 0.25
 STUCK_NS = NS_PER_S
-# A frame is reported as late after this many refresh periods and this many ms; shorter delays happen on any busy machine.
+# A frame is reported as late after this many refresh periods and this many ms; shorter delays
+# happen on any busy machine.
 LATE_PERIODS = 3.0
 LATE_NS = 50 * NS_PER_MS
 TOLD_EVERY_NS = NS_PER_S
 
 
 class FrameWatch:
-    """Takes the stages of each frame from the loop's thread; a second thread reports a stage that does not end."""
+    """Takes the stages of each frame from the loop's thread; a second thread reports a stage
+    that does not end.
+    """
 
     def __init__(self, period_ns: float, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._late_ns = max(LATE_PERIODS * period_ns, LATE_NS)
         self._clock, self._notices, self._number = clock, notices, 0
-        self._stages: list[tuple[str, int]] = []  # name and begin; one list, so that the other thread reads a whole one
+        # name and begin; one list, so that the other thread reads a whole one
+        self._stages: list[tuple[str, int]] = []
         self._told_ns = 0
-        self.alive_ns = 0  # when the loop last was between two stages, host time; 0 before its first frame
+        # when the loop last was between two stages, host time; 0 before its first frame
+        self.alive_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-watchdog", daemon=True)
 
@@ -115,14 +122,16 @@ class FrameWatch:
 
 GPU_LOST = "gpu-lost"
 GPU_LOOK_NS = NS_PER_S
-SLEPT_NS = 200 * NS_PER_MS  # two clocks read one after the other, with the process interrupted between them, differ by less
+# two clocks read one after the other, with the process interrupted between them, differ by less
+SLEPT_NS = 200 * NS_PER_MS
 
 
 class GpuWatch:
-    """Looks once a second, in the loop's thread and between its frames, whether the GPU is lost; then the run is stopped.
+    """Looks once a second, in the loop's thread and between its frames, whether the GPU is lost;
+    then the run is stopped.
 
-    After the machine has slept it also compares the tables that turn light into codes, and has the next frame drawn on black:
-    a driver may lose the GPU's memory without an error.
+    After the machine has slept it also compares the tables that turn light into codes, and has the
+    next frame drawn on black: a driver may lose the GPU's memory without an error.
     """
 
     def __init__(self, backend: Backend, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
@@ -134,7 +143,9 @@ class GpuWatch:
         self._next_ns = clock.now_ns() + GPU_LOOK_NS
 
     def look(self) -> None:
-        """Look, if a second has passed since the last time; microseconds, but after the machine has slept."""
+        """Look, if a second has passed since the last time; microseconds, but after the machine
+        has slept.
+        """
         now_ns = self._clock.now_ns()
         if now_ns < self._next_ns:
             return

@@ -1,9 +1,10 @@
 """The air over a place on the Earth: it bends light, dims it, glows, and makes stars twinkle.
 
 Refraction is that of `stars.AirAbove`. The air mass
-is Kasten and Young's (1989, Appl. Opt. 28, 4735). Extinction is that of each star's own spectrum, tabulated at AIR_MASSES and
-straight between them. The glow of the sky goes with the zenith distance by van Rhijn's layer and with extinction (Krisciunas
-and Schaefer 1991, PASP 103, 1033, eq. 2 and 3). Stars twinkle by Young's law (1967, AJ 72, 747).
+is Kasten and Young's (1989, Appl. Opt. 28, 4735). Extinction is that of each star's own spectrum,
+tabulated at AIR_MASSES and straight between them. The glow of the sky goes with the zenith distance
+by van Rhijn's layer and with extinction (Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and
+3). Stars twinkle by Young's law (1967, AJ 72, 747).
 """
 
 from collections.abc import Callable
@@ -33,9 +34,11 @@ def air_mass(altitude_rad: FloatArray) -> FloatArray:
 
 
 def scintillation(aperture_mm: float, masses: FloatArray, height_m: float, exposure_s: float) -> FloatArray:
-    """One sigma of a star's light relative to its mean, (n,) (Young 1967): 0.09 D^(-2/3) X^1.75 exp(-h / 8 km) / sqrt(2 t).
+    """One sigma of a star's light relative to its mean, (n,) (Young 1967): 0.09 D^(-2/3) X^1.75
+    exp(-h / 8 km) / sqrt(2 t).
 
-    D is in cm. The law is of exposures that are long against the time of a shadow's passage, some 10 ms; without one it is 1.
+    D is in cm. The law is of exposures that are long against the time of a shadow's passage, some
+    10 ms; without one it is 1.
     """
     if not exposure_s:
         return np.full_like(masses, MAX_TWINKLE)
@@ -62,7 +65,9 @@ def extinction_names() -> tuple[str, ...]:
 
 
 def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
-    """A tracker's optics behind so many air masses; the ends of a table of extinction hold beyond it."""
+    """A tracker's optics behind so many air masses; the ends of a table of extinction hold
+    beyond it.
+    """
     low, high = optics.range_nm
     knots = [c.wavelength_nm for c in (optics.transmission, extinction) if len(c.wavelength_nm)]
     nm = np.unique(np.concatenate([*knots, np.linspace(low, high, 161)]))
@@ -75,13 +80,17 @@ def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
 
 
 def dimmed_mag(rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve) -> FloatArray:
-    """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons through optics."""
+    """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons
+    through optics.
+    """
     every = np.stack([rates(through_air(optics, extinction, x)) for x in AIR_MASSES.tolist()])
     return np.asarray(-2.5 * np.log10(np.maximum(every, 1e-300) / np.maximum(every[0], 1e-300)))
 
 
 def glow_e_per_s_arcsec2(spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry) -> float:
-    """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as zodiacal light's."""
+    """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as
+    zodiacal light's.
+    """
     passband = load_curve("johnson-v", "johnson-v")
     nm, weight_m = integration_nodes(passband, spectrum)
     response = passband(nm) * weight_m * (nm if photometry.weighting == "photon" else 1.0)
@@ -92,7 +101,9 @@ def glow_e_per_s_arcsec2(spectrum: Curve, v_mag_arcsec2: float, optics: Optics, 
 
 
 def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Curve:
-    """A curve with the knots of another within a range, so that a product of both is integrated as it is."""
+    """A curve with the knots of another within a range, so that a product of both is integrated
+    as it is.
+    """
     nm = np.unique(np.concatenate([curve.wavelength_nm, other.wavelength_nm, range_nm]))
     nm = nm[(nm >= range_nm[0]) & (nm <= range_nm[1])]
     return Curve(nm, curve(nm))
@@ -100,10 +111,12 @@ def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Cur
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteAir:
-    """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims, glows and twinkles.
+    """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims,
+    glows and twinkles.
 
-    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last sunlight. `glow_e_per_s_sr`
-    (channels,) is that at the zenith, and `v_extinction_mag` that of V by air mass.
+    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last
+    sunlight. `glow_e_per_s_sr` (channels,) is that at the zenith, and `v_extinction_mag` that of V
+    by air mass.
     """
 
     up_at: Callable[[int], FloatArray]
@@ -130,7 +143,9 @@ class SiteAir:
         return replace(stars, air=air, electrons_per_s=stars.electrons_per_s * total, colours=each / total[:, None])
 
     def shares(self, row: IntArray, altitude_rad: FloatArray) -> FloatArray:
-        """What comes through (channels, n) of stars by row of the catalogue, -1 for sunlight, at apparent altitudes (n,)."""
+        """What comes through (channels, n) of stars by row of the catalogue, -1 for sunlight, at
+        apparent altitudes (n,).
+        """
         masses = air_mass(np.nan_to_num(altitude_rad))
         k = np.clip(np.searchsorted(AIR_MASSES, masses, side="right") - 1, 0, len(AIR_MASSES) - 2)
         part = (masses - AIR_MASSES[k]) / (AIR_MASSES[k + 1] - AIR_MASSES[k])
@@ -147,7 +162,9 @@ class SiteAir:
         return replace(stars, electrons_per_s=stars.electrons_per_s * factor)
 
     def glow_at(self, directions: FloatArray, utc_ns: int) -> FloatArray:
-        """The sky's glow (channels, n) in apparent directions (n, 3), electrons per second and steradian; none below ground."""
+        """The sky's glow (channels, n) in apparent directions (n, 3), electrons per second and
+        steradian; none below ground.
+        """
         sine = directions @ self.above(utc_ns).up
         masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - np.maximum(sine, 0.0) ** 2))
         relative = masses * flux_ratio(self.v_extinction_mag * (masses - 1)) * (sine > 0)

@@ -43,7 +43,8 @@ COLUMN_COUNT = 78
 MAX_CATALOGUE_BYTES = 100_000_000  # hip_main.dat has 53 MB
 REQUIRED = ("hip", "v_mag", "ra_deg", "dec_deg", "bv_mag")
 ZERO_WHERE_MISSING = ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
-# Field H52: stars whose light varies by themselves. C is constant; D and R are neighbours' light and revised colours.
+# Field H52: stars whose light varies by themselves. C is constant; D and R are neighbours' light
+# and revised colours.
 VARIABLE_TYPES = b"PUM"
 
 # A Tycho number TYC1-TYC2-TYC3 as one integer: TYC1 to 9537, TYC2 to 12121, TYC3 to 3.
@@ -58,14 +59,16 @@ STAR_NAMES = Path(__file__).resolve().parent / "data" / "star_names.csv"
 class Catalog:
     """Stars with a position, V and B-V; ICRS, each at its own epoch; every array has shape (n,).
 
-    `pm_ra_cosdec_mas_yr` carries the cos(dec), as Hipparcos publishes it. `vi_mag` and `parallax_mas` are NaN where the
-    catalogue gives none. `hip` is 0 for stars of another catalogue, which `designation` and `identifier` name instead.
-    `variable` is Hipparcos' type of a variable star (P periodic, U unsolved, M within 0.03 mag; blank for others), which varies
-    by `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its largest light, which a
-    user's table may have. `multiple` is its flag H59 of doubles (C resolved, G accelerated, O orbit, V variability-induced, X
-    unexplained scatter), with `separation_arcsec` where it resolved the pair:
-    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts all rows of the source, and
-    `notes` say what became of them.
+    `pm_ra_cosdec_mas_yr` carries the cos(dec), as Hipparcos publishes it. `vi_mag` and
+    `parallax_mas` are NaN where the catalogue gives none. `hip` is 0 for stars of another
+    catalogue, which `designation` and `identifier` name instead. `variable` is Hipparcos' type of a
+    variable star (P periodic, U unsolved, M within 0.03 mag; blank for others), which varies by
+    `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its
+    largest light, which a user's table may have. `multiple` is its flag H59 of doubles (C resolved,
+    G accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec`
+    where it resolved the pair:
+    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts
+    all rows of the source, and `notes` say what became of them.
     """
 
     hip: npt.NDArray[np.int32]
@@ -97,7 +100,9 @@ class Catalog:
         return replace(self, **{name: getattr(self, name)[rows] for name in column_names()})
 
     def at_phase(self, jd: float) -> "Catalog":
-        """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those that have a `maximum_jd`."""
+        """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those
+        that have a `maximum_jd`.
+        """
         known = np.flatnonzero(np.isfinite(self.maximum_jd))
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
         v_mag = self.v_mag.copy()
@@ -108,7 +113,8 @@ class Catalog:
 
     def brighter_than(self, faintest_v_mag: float) -> "Catalog":
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
-        kept = np.flatnonzero(self.v_mag <= faintest_v_mag)  # places: a mask is searched again for each column
+        # places: a mask is searched again for each column
+        kept = np.flatnonzero(self.v_mag <= faintest_v_mag)
         return self if len(kept) == len(self) else self.taken(kept)
 
     def name(self, row: int) -> str:
@@ -122,7 +128,9 @@ class Catalog:
         return f"{self.designation} {identifier}"
 
     def identifier_of(self, name: str) -> int | None:
-        """The identifier in a name that `name` gives to a star without a HIP number; None for any other text."""
+        """The identifier in a name that `name` gives to a star without a HIP number; None for
+        any other text.
+        """
         if not self.designation or not name.startswith(f"{self.designation} "):
             return None
         numbers = name.removeprefix(f"{self.designation} ").split("-")
@@ -139,9 +147,11 @@ def column_names() -> list[str]:
 
 
 def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArray[np.generic]]) -> Catalog:
-    """A catalogue of these `columns` (n,) alone, of which hip, v_mag, ra_deg and dec_deg have to be there.
+    """A catalogue of these `columns` (n,) alone, of which hip, v_mag, ra_deg and dec_deg have to be
+    there.
 
-    No motion, no parallax, no variability and no companion is known where the column is not given; the epoch is Hipparcos'.
+    No motion, no parallax, no variability and no companion is known where the column is not given;
+    the epoch is Hipparcos'.
     """
     n = len(columns["v_mag"])
     unknown, zero, blank = np.full(n, np.nan), np.zeros(n), np.zeros(n, dtype="S1")
@@ -158,7 +168,8 @@ def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArr
 
 
 def load_catalog(source: str | Path = "hipparcos", faintest_v_mag: float = math.inf) -> Catalog:
-    """Load the packaged catalogue ("hipparcos"), of which fainter stars may be left out, or a user's own `hip_main.dat`.
+    """Load the packaged catalogue ("hipparcos"), of which fainter stars may be left out, or a
+    user's own `hip_main.dat`.
 
     Raises InputError when the file is missing or is not a Hipparcos main catalogue.
     """
@@ -171,7 +182,9 @@ def load_catalog(source: str | Path = "hipparcos", faintest_v_mag: float = math.
 
 @lru_cache(maxsize=4)
 def _packaged(faintest_v_mag: float) -> Catalog:
-    """The packaged catalogue in read-only arrays, read once: a verdict, a campaign and a study open several benches."""
+    """The packaged catalogue in read-only arrays, read once: a verdict, a campaign and a study
+    open several benches.
+    """
     with np.load(PACKAGED_CATALOG) as packed:
         kept = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
         catalog = unpack({name: packed[name][kept] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
@@ -279,7 +292,9 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
 
 
 class StarName(NamedTuple):
-    """A star's designation ("α Ori", "51 Peg") and its proper name ("Betelgeuse"), each "" where it has none."""
+    """A star's designation ("α Ori", "51 Peg") and its proper name ("Betelgeuse"), each "" where
+    it has none.
+    """
 
     designation: str
     name: str
@@ -294,6 +309,8 @@ def star_names() -> dict[int, StarName]:
 
 
 def label_of(hip: int) -> str:
-    """A star's label on a chart: its designation, else its name, else its HIP number; "" without any."""
+    """A star's label on a chart: its designation, else its name, else its HIP number; "" without
+    any.
+    """
     designation, name = star_names().get(hip, ("", ""))
     return designation or name or (f"HIP {hip}" if hip else "")

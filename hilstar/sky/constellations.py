@@ -1,4 +1,6 @@
-"""The constellation in which a place of the sky lies, by the boundaries of the International Astronomical Union."""
+"""The constellation in which a place of the sky lies, by the boundaries of the International
+Astronomical Union.
+"""
 
 import csv
 from functools import cache
@@ -10,8 +12,8 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 
 ZONES = Path(__file__).resolve().parent / "data" / "constellations.csv"
-# ICRS components into those of the mean equator and equinox B1875, in which the boundaries were drawn (Delporte 1930):
-# Astropy 7, `FK5(equinox="B1875")`.
+# ICRS components into those of the mean equator and equinox B1875, in which the boundaries were
+# drawn (Delporte 1930): Astropy 7, `FK5(equinox="B1875")`.
 ICRS_TO_B1875 = np.array(
     [
         [0.9995359306781646, 0.027935194957718956, 0.01214694060282576],

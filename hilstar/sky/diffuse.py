@@ -1,7 +1,9 @@
-"""A map of light that stands on the sky: read from FITS, kept as tangent images whose unit is stars of V = 0 per steradian.
+"""A map of light that stands on the sky: read from FITS, kept as tangent images whose unit is stars
+of V = 0 per steradian.
 
-Each WCS image of a file becomes a tangent (gnomonic) image of its own resolution. One that is wider than MAX_HALF_DEG from its
-middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all are bilinear.
+Each WCS image of a file becomes a tangent (gnomonic) image of its own resolution. One that is wider
+than MAX_HALF_DEG from its middle, or a HEALPix map, becomes the six faces of a cube. Between pixels
+all are bilinear.
 """
 
 import math
@@ -34,10 +36,11 @@ Sampled = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TangentImage:
-    """A square image on a tangent plane, stars of V = 0 per steradian; `axes` (3, 3) are its x, y and normal, ICRS.
+    """A square image on a tangent plane, stars of V = 0 per steradian; `axes` (3, 3) are its x, y
+    and normal, ICRS.
 
-    The direction (u, v, 1) in its axes is at `px_per_tangent` (u, v) from the middle. Nothing of it lies beyond
-    `max_tangent`, which is 1 for a face of a cube.
+    The direction (u, v, 1) in its axes is at `px_per_tangent` (u, v) from the middle. Nothing of it
+    lies beyond `max_tangent`, which is 1 for a face of a cube.
     """
 
     image: Float32Array
@@ -54,7 +57,9 @@ class TangentImage:
         return x * scale + middle, y * scale + middle
 
     def seen_by(self, px_rad: float, sigma_px: float) -> "TangentImage":
-        """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large, and spread by a Gaussian."""
+        """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large,
+        and spread by a Gaussian.
+        """
         from scipy.ndimage import gaussian_filter
 
         whole = self._binned(int(px_rad * self.px_per_tangent))
@@ -82,7 +87,9 @@ def block_means(image: Any, count: int) -> Any:
 
 
 def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
-    """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its library."""
+    """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its
+    library.
+    """
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     try:
         with opened_fits(unpacked(raw, MAX_FILE_BYTES)) as units:
@@ -102,9 +109,11 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
 
 
 def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:
-    """Values in any unit of surface brightness as stars of V = 0 per steradian; what is negative or not finite is dark.
+    """Values in any unit of surface brightness as stars of V = 0 per steradian; what is negative or
+    not finite is dark.
 
-    Magnitudes are V. Other units are spectral densities at V_NM: of energy or photons, per wavelength or frequency.
+    Magnitudes are V. Other units are spectral densities at V_NM: of energy or photons, per
+    wavelength or frequency.
     """
     from astropy import units as u
 

@@ -1,13 +1,17 @@
-"""Electron rates of stars: DGS (thesis eq. 3.1) and AGS (eq. 3.2), with the corrections that the functions state.
+"""Electron rates of stars: DGS (thesis eq. 3.1) and AGS (eq. 3.2), with the corrections that the
+functions state.
 
 Both are `10^(-0.4 V)` times the rate at V = 0. For DGS that rate depends on the star's temperature
 alone, so it is tabulated once per bench; for AGS it is one number.
 
 Electron rates from real spectra by colour: the Pickles library (Pickles 1998, PASP 110, 863).
 
-Black bodies fail where molecules take over: B-V saturates near 1.5 and turns back, V-I does not. So the
-logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the hottest:
-fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out stars.
+Black bodies fail where molecules take over: B-V saturates near 1.5 and turns back, V-I does not. So
+the
+logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the
+hottest:
+fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out
+stars.
 """
 
 from collections.abc import Sequence
@@ -51,15 +55,19 @@ ZeroPoint = Literal["vega", "iau-bolometric"]
 Weighting = Literal["energy", "photon"]
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 
-# Natural cubic splines with knots at equal shares of the library. 7 to 14 knots were tried, without B-V and with
-# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within 1 % (median) and 3 % (95 %)
+# Natural cubic splines with knots at equal shares of the library. 7 to 14 knots were tried, without
+# B-V and with
+# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within 1 % (median)
+# and 3 % (95 %)
 # for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots nothing improves.
 VI_KNOT_COUNT = 12
-# Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past it, B-V
+# Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past
+# it, B-V
 # follows the metal lines in the blue and makes the rates of cool supergiants worse.
 MAX_BV_TERM_MAG = 0.3
-# For stars without V-I. Late M giants have the B-V of K giants and ten times their electrons. The fit excludes them: their
-# rates are wrong, and those of the K giants, fifty times as many to V = 7.5, are right.
+# For stars without V-I. Late M giants have the B-V of K giants and ten times their electrons. The
+# fit excludes them: their rates are wrong, and those of the K giants, fifty times as many to V =
+# 7.5, are right.
 BV_KNOT_COUNT = 5
 MAX_BV_FIT_VI_MAG = 2.0
 BLOCK_STARS = 2_000  # evaluated at once: their splines' terms stay within a processor's cache
@@ -67,7 +75,9 @@ BLOCK_STARS = 2_000  # evaluated at once: their splines' terms stay within a pro
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """The optics and sensor that turn starlight into electrons: aperture, quantum efficiency, transmission."""
+    """The optics and sensor that turn starlight into electrons: aperture, quantum efficiency,
+    transmission.
+    """
 
     aperture_mm: float
     quantum_efficiency: Curve
@@ -119,7 +129,8 @@ class Photometry:
 def v_band_mean_w_m2_m(temperature_k: float | FloatArray, weighting: Weighting) -> FloatArray:
     """<pi B(T)> through Johnson V, W/m2/m; shape of `temperature_k` (thesis eq. 3.11).
 
-    Bessell's V is an energy response; "photon" multiplies it by lambda once more, as the thesis does.
+    Bessell's V is an energy response; "photon" multiplies it by lambda once more, as the thesis
+    does.
     """
     passband = load_curve("johnson-v", "johnson-v")
     wavelength_nm, weight_m = integration_nodes(passband)
@@ -133,7 +144,8 @@ def v_band_mean_w_m2_m(temperature_k: float | FloatArray, weighting: Weighting) 
 def reference_mean_w_m2_m(photometry: Photometry) -> float:
     """<F_ref> of a V = 0 star through Johnson V, W/m2/m.
 
-    "vega" is the published band average itself, whatever the weighting. "iau-bolometric" is the thesis's:
+    "vega" is the published band average itself, whatever the weighting. "iau-bolometric" is the
+    thesis's:
     a 9602 K black body with the IAU's bolometric zero point (eq. 3.14, 3.15).
     """
     if photometry.zero_point == "vega":
@@ -143,7 +155,9 @@ def reference_mean_w_m2_m(photometry: Photometry) -> float:
 
 
 def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (n,), nm, and weights (n,): a spectrum in W/m2/m there, times the weights, sums to electrons/s/m2."""
+    """Wavelengths (n,), nm, and weights (n,): a spectrum in W/m2/m there, times the weights,
+    sums to electrons/s/m2.
+    """
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     electrons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
     return wavelength_nm, optics.quantum_efficiency(wavelength_nm) * optics.transmission(
@@ -152,7 +166,9 @@ def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
 
 
 def dgs_electrons_per_s(temperature_k: float | FloatArray, optics: Optics, photometry: Photometry) -> FloatArray:
-    """Electron rate of a V = 0 black body by direct integration (thesis eq. 3.1); shape of `temperature_k`."""
+    """Electron rate of a V = 0 black body by direct integration (thesis eq. 3.1); shape of
+    `temperature_k`.
+    """
     wavelength_nm, response = electron_response(optics)
     temperature_k = np.asarray(temperature_k, dtype=np.float64)
     exitance = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k[..., None])
@@ -161,9 +177,11 @@ def dgs_electrons_per_s(temperature_k: float | FloatArray, optics: Optics, photo
 
 
 def zodiacal_electrons_per_s_arcsec2(v_mag_arcsec2: float, optics: Optics, photometry: Photometry) -> float:
-    """Electron rate of zodiacal light per square arcsecond of sky: sunlight of that V surface brightness.
+    """Electron rate of zodiacal light per square arcsecond of sky: sunlight of that V surface
+    brightness.
 
-    Zodiacal light is a little redder than the Sun: the WFC3 handbook's spectrum gives 5 % more photons from 330 to 1100 nm.
+    Zodiacal light is a little redder than the Sun: the WFC3 handbook's spectrum gives 5 % more
+    photons from 330 to 1100 nm.
     """
     return float(flux_ratio(v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry))
 
@@ -171,7 +189,8 @@ def zodiacal_electrons_per_s_arcsec2(v_mag_arcsec2: float, optics: Optics, photo
 def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
     """Electron rate of any V = 0 star in the average model (thesis eq. 3.2, 3.16, 3.17).
 
-    Every curve is replaced by its mean over the tracker's range, every star by the 9602 K reference.
+    Every curve is replaced by its mean over the tracker's range, every star by the 9602 K
+    reference.
     """
     low_nm, high_nm = optics.range_nm
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
@@ -188,7 +207,8 @@ def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
 def star_temperatures_k(bv_mag: FloatArray, scale: str) -> FloatArray:
     """Temperatures (n,) by a scale of TEMPERATURE_SCALES, held within TABLE_RANGE_K.
 
-    Only `wang2021` reaches the lower end: it gives the carbon star with B-V = 5.46 a temperature of 296 K.
+    Only `wang2021` reaches the lower end: it gives the carbon star with B-V = 5.46 a temperature of
+    296 K.
     """
     low_k, high_k = TABLE_RANGE_K
     return np.clip(TEMPERATURE_SCALES[scale](bv_mag), low_k, high_k)
@@ -226,7 +246,8 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """Spectra over `wavelength_nm` (k,): relative F_lambda (m, k), and each star's type and colours, (m,).
+    """Spectra over `wavelength_nm` (k,): relative F_lambda (m, k), and each star's type and
+    colours, (m,).
 
     Flux is 1 in the mean through Johnson V. Colours are synthetic, Johnson B-V and Cousins V-I.
     """
@@ -240,7 +261,9 @@ class Library:
 
 @dataclass(frozen=True, slots=True)
 class Spline:
-    """A natural cubic spline by its coefficients over `natural_basis`; constant beyond its end knots."""
+    """A natural cubic spline by its coefficients over `natural_basis`; constant beyond its end
+    knots.
+    """
 
     knots_mag: FloatArray
     coefficients: FloatArray
@@ -254,7 +277,8 @@ class Spline:
 class PicklesTable:
     """Electrons per second of a V = 0 star against its colours, made once per bench.
 
-    ln(rate) = `over_vi`(V-I) + `per_bv` B-V, B-V held to `bv_range_mag`; `over_bv` alone where V-I is missing.
+    ln(rate) = `over_vi`(V-I) + `per_bv` B-V, B-V held to `bv_range_mag`; `over_bv` alone where V-I
+    is missing.
     """
 
     over_vi: Spline
@@ -263,7 +287,9 @@ class PicklesTable:
     over_bv: Spline
 
     def electrons_per_s(self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray) -> FloatArray:
-        """Electron rates of stars, shape (n,); B-V alone where V-I is NaN; a colour beyond the library counts as its end."""
+        """Electron rates of stars, shape (n,); B-V alone where V-I is NaN; a colour beyond the
+        library counts as its end.
+        """
         log_rate = np.empty(len(v_mag))
         for begin in range(0, len(v_mag), BLOCK_STARS):
             part = slice(begin, begin + BLOCK_STARS)
@@ -277,7 +303,9 @@ class PicklesTable:
 
 @cache
 def load_library() -> Library:
-    """The packaged library: 106 stars, 250 to 1600 nm every 0.5 nm (tools/make_pickles.py made it)."""
+    """The packaged library: 106 stars, 250 to 1600 nm every 0.5 nm (tools/make_pickles.py made
+    it).
+    """
     with np.load(PACKAGED_LIBRARY) as packed:
         return Library(
             wavelength_nm=packed["wavelength_nm"].astype(np.float64),
@@ -291,14 +319,16 @@ def load_library() -> Library:
 def tabulate_pickles(optics: Optics, photometry: Photometry) -> PicklesTable:
     """The rate table of a bench.
 
-    Raises InputError when the tracker detects light beyond the library's range, or none of some library star.
+    Raises InputError when the tracker detects light beyond the library's range, or none of some
+    library star.
     """
     library = load_library()
     return fit_table(library.bv_mag, library.vi_mag, library_electrons_per_s(library, optics, photometry))
 
 
 def library_electrons_per_s(library: Library, optics: Optics, photometry: Photometry) -> FloatArray:
-    """Electron rate of each library star at V = 0, shape (m,), by direct integration (thesis eq. 3.1).
+    """Electron rate of each library star at V = 0, shape (m,), by direct integration (thesis eq.
+    3.1).
 
     Raises InputError as `tabulate_pickles` does.
     """
@@ -317,7 +347,9 @@ def library_electrons_per_s(library: Library, optics: Optics, photometry: Photom
 
 
 def band_mean(library: Library, passband: Curve, weighting: Weighting = "energy") -> FloatArray:
-    """Mean relative F_lambda of each library star through a passband, shape (m,) (thesis eq. 3.11)."""
+    """Mean relative F_lambda of each library star through a passband, shape (m,) (thesis eq.
+    3.11).
+    """
     nodes_nm, weight_m = integration_nodes(passband, _knots(library))
     response = passband(nodes_nm) * weight_m
     if weighting == "photon":
@@ -339,7 +371,9 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
 
 
 def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
-    """Basis of the natural cubic splines, shape (n, knots) (Hastie et al. 2009, eq. 5.4), colours held to the knots' range."""
+    """Basis of the natural cubic splines, shape (n, knots) (Hastie et al. 2009, eq. 5.4),
+    colours held to the knots' range.
+    """
     x = np.clip(colour_mag, knots_mag[0], knots_mag[-1])[:, None]
     last = np.maximum(x - knots_mag[-1], 0) ** 3
     d = (np.maximum(x - knots_mag[:-1], 0) ** 3 - last) / (knots_mag[-1] - knots_mag[:-1])
@@ -359,7 +393,9 @@ def _knots(library: Library) -> Curve:
 
 
 def _onto_grid(grid_nm: FloatArray, nodes_nm: FloatArray, response: FloatArray) -> FloatArray:
-    """Weights on the samples that integrate the straight lines between them as `response` does at the nodes."""
+    """Weights on the samples that integrate the straight lines between them as `response` does
+    at the nodes.
+    """
     left = np.clip(np.searchsorted(grid_nm, nodes_nm, side="right") - 1, 0, len(grid_nm) - 2)
     share = (nodes_nm - grid_nm[left]) / (grid_nm[left + 1] - grid_nm[left])
     weights = np.bincount(left, response * (1 - share), len(grid_nm))

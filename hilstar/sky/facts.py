@@ -1,6 +1,7 @@
 """What a catalogue knows of its stars beside place, V and colours: errors, origins, spectral types.
 
-Hipparcos' facts are a file of their own, read when somebody first asks. Errors of place and motion are carried to an epoch.
+Hipparcos' facts are a file of their own, read when somebody first asks. Errors of place and motion
+are carried to an epoch.
 """
 
 from functools import cache
@@ -17,7 +18,8 @@ from hilstar.sky.stars import RAD_PER_MAS
 PACKAGED_FACTS = Path(__file__).resolve().parent / "data" / "hipparcos_facts.npz"
 
 MOTION = ("ra", "dec", "pm_ra", "pm_dec")  # the parameters whose errors are carried to an epoch
-# Columns of hip_main.dat (CDS I/239 ReadMe): name -> (column counted from 0, steps per unit, stored as).
+# Columns of hip_main.dat (CDS I/239 ReadMe): name -> (column counted from 0, steps per unit, stored
+# as).
 STEP_FACTS: dict[str, tuple[int, int, str]] = {
     "sigma_ra_mas": (14, 100, "i2"),
     "sigma_dec_mas": (15, 100, "i2"),
@@ -37,8 +39,8 @@ STEP_FACTS: dict[str, tuple[int, int, str]] = {
 }
 # Fields of one letter: where V, B-V, V-I and the spectral type are from.
 LETTER_FACTS = {"v_source": 7, "bv_source": 39, "vi_source": 42, "spectral_type_source": 77}
-# Scatter of V about Hp by colour, of single constant stars, measured over the catalogue: V from Hp (H), from the ground (G) for
-# B-V under 1 and above; V from Tycho's VT (T) as the ground's.
+# Scatter of V about Hp by colour, of single constant stars, measured over the catalogue: V from Hp
+# (H), from the ground (G) for B-V under 1 and above; V from Tycho's VT (T) as the ground's.
 # A user's table (U) gives the error of V itself.
 V_SCATTER_MAG = {b"H": (0.004, 0.004), b"G": (0.010, 0.025), b"T": (0.010, 0.025), b"U": (0.0, 0.0)}
 RED_BV_MAG = 1.0
@@ -47,7 +49,9 @@ STEP = 1e-30  # complex-step derivatives: exact to rounding
 
 @cache
 def _packaged() -> dict[str, npt.NDArray[Any]]:
-    """The facts in their units, by the rows of the packaged catalogue, and its `hip`; unknown figures NaN."""
+    """The facts in their units, by the rows of the packaged catalogue, and its `hip`; unknown
+    figures NaN.
+    """
     with np.load(PACKAGED_CATALOG) as catalog, np.load(PACKAGED_FACTS) as packed:
         facts: dict[str, npt.NDArray[Any]] = {"hip": catalog["hip"]}
         for name, (_, per_unit, _) in STEP_FACTS.items():
@@ -60,7 +64,9 @@ def _packaged() -> dict[str, npt.NDArray[Any]]:
 
 
 def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
-    """Hipparcos' facts of stars (n,) by their HIP numbers: NaN and empty text for those that it does not have."""
+    """Hipparcos' facts of stars (n,) by their HIP numbers: NaN and empty text for those that it
+    does not have.
+    """
     facts = _packaged()
     order = np.argsort(facts["hip"])
     place = np.minimum(np.searchsorted(facts["hip"], hip, sorter=order), len(order) - 1)
@@ -74,7 +80,9 @@ def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
 
 
 def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
-    """Hipparcos' facts of a catalogue's stars (n,), but the errors of what is Hipparcos' own alone, NaN for a table's stars."""
+    """Hipparcos' facts of a catalogue's stars (n,), but the errors of what is Hipparcos' own
+    alone, NaN for a table's stars.
+    """
     facts = facts_of(catalog.hip)
     own = (catalog.identifier == catalog.hip) & (catalog.epoch_jyear == HIPPARCOS_EPOCH_JYEAR)
     errors = [name for name in STEP_FACTS if name.startswith("sigma_")]
@@ -82,7 +90,8 @@ def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
 
 
 class PropagatedPlaces(NamedTuple):
-    """Places and proper motions at an epoch, (n,), and the covariance (n, 4, 4) of MOTION's parameters, mas and mas a year.
+    """Places and proper motions at an epoch, (n,), and the covariance (n, 4, 4) of MOTION's
+    parameters, mas and mas a year.
 
     Places are degrees, ICRS; right ascensions' errors and motions carry the cos(dec).
     """
@@ -95,9 +104,11 @@ class PropagatedPlaces(NamedTuple):
 
 
 def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear: float) -> PropagatedPlaces:
-    """The stars' places, motions and their errors at `epoch_jyear`; radial velocity zero (ESA SP-1200 vol. 1, 1.5.5).
+    """The stars' places, motions and their errors at `epoch_jyear`; radial velocity zero (ESA
+    SP-1200 vol. 1, 1.5.5).
 
-    The Jacobian is that of the straight line in space itself, by complex steps. NaN errors where none are known.
+    The Jacobian is that of the straight line in space itself, by complex steps. NaN errors where
+    none are known.
     """
     years = epoch_jyear - catalog.epoch_jyear
     start = np.stack(
@@ -125,7 +136,9 @@ def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear:
 
 
 def _moved(start: npt.NDArray[np.complex128], years: FloatArray) -> tuple[npt.NDArray[np.complex128], ...]:
-    """The unit vector (3, n) and the proper motions (n,) after `years`, of ra, dec and motions (4, n), radians."""
+    """The unit vector (3, n) and the proper motions (n,) after `years`, of ra, dec and motions
+    (4, n), radians.
+    """
     ra, dec, east, north = start
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
     u0 = np.stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))
@@ -150,7 +163,9 @@ def _covariance(facts: dict[str, npt.NDArray[Any]]) -> FloatArray:
 
 
 def sigma_v_mag(facts: dict[str, npt.NDArray[Any]], bv_mag: FloatArray) -> FloatArray:
-    """The error of V (n,), magnitudes: that of the measured Hp or VT and the scatter of V about it; NaN where unknown."""
+    """The error of V (n,), magnitudes: that of the measured Hp or VT and the scatter of V about
+    it; NaN where unknown.
+    """
     scatter = np.full(len(bv_mag), np.nan)
     for source, (blue, red) in V_SCATTER_MAG.items():
         chosen = facts["v_source"] == source

@@ -1,7 +1,8 @@
 """Electron rates by MK type and colour: what a star's type says of its spectrum beyond its colour.
 
-A giant and a dwarf of one V-I differ, and no colour that Hipparcos has tells an M8 giant from a reddened M6. The logarithm of a
-V = 0 star's rate is interpolated over subclass, luminosity class and V-I between the library's spectra, bare and behind dust.
+A giant and a dwarf of one V-I differ, and no colour that Hipparcos has tells an M8 giant from a
+reddened M6. The logarithm of a V = 0 star's rate is interpolated over subclass, luminosity class
+and V-I between the library's spectra, bare and behind dust.
 """
 
 import re
@@ -20,23 +21,30 @@ from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
 
 LETTERS = "OBAFGKM"
 TYPE = re.compile(rf"([{LETTERS}])(\d(?:\.\d)?)?(?:[/-]?([{LETTERS}]?)(\d(?:\.\d)?))?")
-CLASS = re.compile(r"(?<![IV])(Iab|Ia\+?|Ib|III|II|IV|I|V)(?![IV])")  # after the temperature subclass
+# after the temperature subclass
+CLASS = re.compile(r"(?<![IV])(Iab|Ia\+?|Ib|III|II|IV|I|V)(?![IV])")
 CLASSES = {"V": 5.0, "IV": 4.0, "III": 3.0, "II": 2.0}  # the others are supergiants: 1
-# Absolute V between dwarfs and giants by subclass (20 is A0), and of supergiants, for types without a class. Measured on the
-# catalogue's stars that have both: 99 % of K and M giants to V = 7.5 are told right, 95 % of G (tests/authority/test_mk.py).
+# Absolute V between dwarfs and giants by subclass (20 is A0), and of supergiants, for types without
+# a class. Measured on the catalogue's stars that have both: 99 % of K and M giants to V = 7.5 are
+# told right, 95 % of G (tests/authority/test_mk.py).
 GIANT_SUBCLASS = (10, 15, 20, 25, 30, 35, 40, 45, 50, 60)
 GIANT_MAG = (-3.1, -1.6, -0.75, 0.0, 0.9, 1.5, 2.2, 2.8, 3.5, 4.0)
 SUPERGIANT_MAG = -4.5
-MIN_PARALLAX_SIGMAS = 2.0  # a parallax counts as no smaller than this: a star is bright for its distance, or near
+# a parallax counts as no smaller than this: a star is bright for its distance, or near
+MIN_PARALLAX_SIGMAS = 2.0
 
-# Mean extinction of the Galaxy, A/E(B-V) at 1/micrometre: Fitzpatrick 1999 (PASP 111, 63), table 3, R = 3.1, a cubic spline.
+# Mean extinction of the Galaxy, A/E(B-V) at 1/micrometre: Fitzpatrick 1999 (PASP 111, 63), table 3,
+# R = 3.1, a cubic spline.
 DUST_PER_UM = (0.0, 0.377, 0.820, 1.667, 1.828, 2.141, 2.433, 3.704, 3.846)
 DUST_MAG = (0.0, 0.265, 0.829, 2.688, 3.055, 3.806, 4.315, 6.265, 6.591)
-DUST_EBV_MAG = 0.5  # the reddened copies have it; rates from 0 to 0.8 are interpolated between them and the bare spectra
+# the reddened copies have it; rates from 0 to 0.8 are interpolated between them and the bare
+# spectra
+DUST_EBV_MAG = 0.5
 
-# Lengths over which the rates' departures from the trend are alike, in subclasses and classes, and in V-I; what a type's
-# departure has for every V-I; the noise of a library star, in units of the departures of early types; how much more those of
-# late M stars are, rising over these subclasses. Fitted to held-out spectra on four sensors, and rounded.
+# Lengths over which the rates' departures from the trend are alike, in subclasses and classes, and
+# in V-I; what a type's departure has for every V-I; the noise of a library star, in units of the
+# departures of early types; how much more those of late M stars are, rising over these subclasses.
+# Fitted to held-out spectra on four sensors, and rounded.
 TYPE_LENGTHS = (10.0, 2.7)
 COLOUR_LENGTH_MAG = 1.2
 ANY_COLOUR = 0.3
@@ -48,15 +56,19 @@ BLOCK_STARS = 4000
 
 
 def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.str_]:
-    """The luminosity class in MK types (n,), such as "III" or "Ib": the first where two are given, "" where none is."""
+    """The luminosity class in MK types (n,), such as "III" or "Ib": the first where two are
+    given, "" where none is.
+    """
     found = (CLASS.search(text.decode()) for text in spectral_type.tolist())
     return np.array(["" if match is None else match[1] for match in found], dtype=np.str_)
 
 
 def read_types(spectral_type: npt.NDArray[np.bytes_]) -> FloatArray:
-    """Subclass (0 is O0, 60 is M0) and luminosity class (1 supergiant to 5 dwarf) in MK types (n,), shape (n, 2).
+    """Subclass (0 is O0, 60 is M0) and luminosity class (1 supergiant to 5 dwarf) in MK types (n,),
+    shape (n, 2).
 
-    The mean where two are given, NaN for what is not there. A letter without a number has the middle of its ten.
+    The mean where two are given, NaN for what is not there. A letter without a number has the
+    middle of its ten.
     """
     texts, which = np.unique(spectral_type, return_inverse=True)
     return np.array([_read(text.decode()) for text in texts.tolist()]).reshape(-1, 2)[which]
@@ -75,9 +87,11 @@ def _read(text: str) -> tuple[float, float]:
 
 
 def star_types(catalog: Catalog) -> FloatArray:
-    """Subclass and luminosity class of a catalogue's stars, (n, 2), NaN where their type is none of O to M.
+    """Subclass and luminosity class of a catalogue's stars, (n, 2), NaN where their type is none of
+    O to M.
 
-    By absolute magnitude, without extinction, where the type has no class; NaN too without a parallax.
+    By absolute magnitude, without extinction, where the type has no class; NaN too without a
+    parallax.
     """
     facts = facts_of(catalog.hip)
     kind = read_types(facts["spectral_type"])
@@ -92,7 +106,9 @@ def star_types(catalog: Catalog) -> FloatArray:
 
 @cache
 def bare_and_dusty() -> electrons.Library:
-    """The library (m stars), and after it the same stars behind dust of DUST_EBV_MAG, whose B-V is still that without dust."""
+    """The library (m stars), and after it the same stars behind dust of DUST_EBV_MAG, whose B-V
+    is still that without dust.
+    """
     from scipy.interpolate import CubicSpline  # which a bench without types need not load
 
     bare = electrons.load_library()
@@ -117,8 +133,9 @@ def bare_and_dusty() -> electrons.Library:
 class TypeTable:
     """Electrons per second of a V = 0 star against its type and V-I, made once per bench.
 
-    ln(rate) is a polynomial `trend` of V-I, and `weight` (k,) times the covariances with the `spectra` (k, 3): subclass, class
-    and V-I (universal kriging). Without type or V-I it is that of `by_colour`.
+    ln(rate) is a polynomial `trend` of V-I, and `weight` (k,) times the covariances with the
+    `spectra` (k, 3): subclass, class and V-I (universal kriging). Without type or V-I it is that of
+    `by_colour`.
     """
 
     by_colour: electrons.PicklesTable
@@ -148,7 +165,9 @@ class TypeTable:
 
 
 def _alike_types(kind: FloatArray, other: FloatArray) -> FloatArray:
-    """The part of the covariance of ln(rate) that types have, between (n, 2 or more) and (k, 2 or more), shape (n, k)."""
+    """The part of the covariance of ln(rate) that types have, between (n, 2 or more) and (k, 2
+    or more), shape (n, k).
+    """
     late = [1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)) for part in (kind, other)]
     apart = [(kind[:, column, None] - other[:, column]) / length for column, length in enumerate(TYPE_LENGTHS)]
     return np.asarray(late[0][:, None] * late[1] * np.exp(-(apart[0] ** 2 + apart[1] ** 2) / 2))
@@ -164,13 +183,17 @@ def _trend(vi_mag: FloatArray) -> FloatArray:
 
 
 def fit_types(rate: FloatArray) -> TypeTable:
-    """Fit the table to the rates of the spectra of `bare_and_dusty`, or to anything else of them above zero, shape (m,)."""
+    """Fit the table to the rates of the spectra of `bare_and_dusty`, or to anything else of them
+    above zero, shape (m,).
+    """
     library = bare_and_dusty()
     return fit_spectra(read_types(np.array(library.spectral_type, dtype=np.bytes_)), library, rate)
 
 
 def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) -> TypeTable:
-    """Fit the table to the rates (m,) of a library's spectra, the first half bare, of `kind` (m, 2)."""
+    """Fit the table to the rates (m,) of a library's spectra, the first half bare, of `kind` (m,
+    2).
+    """
     bare = slice(len(rate) // 2)
     covariance = _alike_types(kind, kind) * _alike_colours(library.vi_mag, library.vi_mag)
     covariance[np.diag_indices(len(rate))] += NOISE**2
@@ -189,7 +212,8 @@ def tabulate_types(optics: electrons.Optics, photometry: electrons.Photometry) -
 
 
 def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
-    """The share of a star's electrons that is light from a wavelength on, by spectral class: the mean of the library's stars.
+    """The share of a star's electrons that is light from a wavelength on, by spectral class: the
+    mean of the library's stars.
 
     Light beyond the library's 250 to 1600 nm counts for nothing.
     """

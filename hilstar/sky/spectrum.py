@@ -18,7 +18,8 @@ STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 
 DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
-MIN_CONSTANT = 1e-6  # smallest constant curve: no sensor or lens is below, and products stay within float64
+# smallest constant curve: no sensor or lens is below, and products stay within float64
+MIN_CONSTANT = 1e-6
 MAX_CURVE_ROWS = 10_000
 CURVE_COLUMNS = ("wavelength_nm", "value")
 CURVE_ADVICE = "write wavelength_nm,value"
@@ -64,7 +65,8 @@ QUANTUM_EFFICIENCIES = ("ccd47-20", "kai-4021")
 TRANSMISSIONS = ("n-bk7-10mm",)
 BUILT_IN_CURVES = (*QUANTUM_EFFICIENCIES, *TRANSMISSIONS, "johnson-v")
 
-# Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this wide.
+# Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this
+# wide.
 # A Planck curve at 1000 K over 25 nm, times two straight lines, is then integrated to 1e-13.
 GAUSS_ORDER = 8
 MAX_INTERVAL_NM = 25.0
@@ -114,9 +116,11 @@ def constant_curve(value: float) -> Curve:
 
 
 def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in: tuple[str, ...] = BUILT_IN_CURVES) -> Curve:
-    """A curve from a built-in name, a CSV path (wavelength_nm,value; relative to `folder`) or a number.
+    """A curve from a built-in name, a CSV path (wavelength_nm,value; relative to `folder`) or a
+    number.
 
-    `what` names the curve in the InputError that bad input raises, `built_in` are the names of its kind.
+    `what` names the curve in the InputError that bad input raises, `built_in` are the names of its
+    kind.
     """
     if isinstance(source, int | float):
         if not MIN_CONSTANT <= source <= 1.0:
@@ -281,7 +285,8 @@ TEMPERATURE_SCALES: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths [nm] and weights [m] that integrate a product of the curves and a smooth spectrum.
+    """Wavelengths [nm] and weights [m] that integrate a product of the curves and a smooth
+    spectrum.
 
     Gauss-Legendre between every two neighbouring knots of all curves, over the range they share.
     """
@@ -292,7 +297,8 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     if len(knots) < 2:
         raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
     pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
-    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)  # number within its interval, from 0
+    # number within its interval, from 0
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     edges = np.append(np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces), knots[-1])
     half = np.diff(edges)[:, None] / 2
     wavelength_nm = (edges[:-1, None] + half * (1 + NODES)).ravel()

@@ -1,13 +1,17 @@
-"""From a table's columns to a catalogue: one unit for each figure, V and colours, and which rows are no star.
+"""From a table's columns to a catalogue: one unit for each figure, V and colours, and which rows
+are no star.
 
-A table's stars added to Hipparcos: in their overlap Hipparcos' star stands, and no other in its place.
+A table's stars added to Hipparcos: in their overlap Hipparcos' star stands, and no other in its
+place.
 
-Catalogues made of tables, kept in the user's cache directory: whole or not at all, and made anew where they are damaged.
+Catalogues made of tables, kept in the user's cache directory: whole or not at all, and made anew
+where they are damaged.
 
-A file is found by what it was made of. Nothing depends on it: without a cache directory, on a full disk or beside another
-process that writes the same file, a table is read again.
+A file is found by what it was made of. Nothing depends on it: without a cache directory, on a full
+disk or beside another process that writes the same file, a table is read again.
 
-The catalogue of a bench: the packaged one, a `hip_main.dat`, or a user's table, alone or added to Hipparcos.
+The catalogue of a bench: the packaged one, a `hip_main.dat`, or a user's table, alone or added to
+Hipparcos.
 """
 
 import contextlib
@@ -50,13 +54,13 @@ MIN_MEDIAN_MAS_YR, MOTION_STARS = 1.0, 3
 MAX_AMPLITUDE_MAG = 10.0  # half of the range: chi Cygni has 5
 MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
 UNIT_ADVICE = "give the column its unit"
-# Two catalogues' places of one star at a common epoch differ by far less, but for orbits. Hipparcos' photometry has the light
-# from both components of an unresolved pair.
+# Two catalogues' places of one star at a common epoch differ by far less, but for orbits.
+# Hipparcos' photometry has the light from both components of an unresolved pair.
 SAME_ARCSEC = 2.0
 # A star that is left alone there is looked for this far, where the magnitude has to agree as well.
 FAR_ARCSEC, FAR_MAG = 10.0, 0.5
-# A pair's orbit may have taken it so far past the separation that Hipparcos gives; no component is brighter than the sum by
-# more than this.
+# A pair's orbit may have taken it so far past the separation that Hipparcos gives; no component is
+# brighter than the sum by more than this.
 PAIR_ARCSEC, PAIR_MAG = 2.0, 1.0
 ODD_MAG = 1.0
 OVERLAP_LIMIT_MAG = 0.03  # limit for the median
@@ -90,7 +94,8 @@ class Assembled:
 
 
 def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
-    """The stars of a table, whose epoch matters where they move or are to be `compared` with stars that do.
+    """The stars of a table, whose epoch matters where they move or are to be `compared` with stars
+    that do.
 
     Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
     """
@@ -199,7 +204,9 @@ class _Columns:
         return ""
 
     def motions_doubt(self, motions: dict[str, FloatArray]) -> str:
-        """Why proper motions without a unit are too small to be mas a year; "" where they are not."""
+        """Why proper motions without a unit are too small to be mas a year; "" where they are
+        not.
+        """
         given = [self.layout.role[role] for role in motions if role in self.layout.role]
         if not given or any(map(self.has_unit, given)):
             return ""
@@ -218,7 +225,9 @@ class _Columns:
         return np.where(np.isfinite(values), values, blank)
 
     def places(self) -> tuple[FloatArray, FloatArray]:
-        """Right ascension, 0 to 360, and declination, degrees; NaN where no pair of columns has both."""
+        """Right ascension, 0 to 360, and declination, degrees; NaN where no pair of columns has
+        both.
+        """
         ra_deg, dec_deg = (np.full(self.table.row_count, np.nan) for _ in range(2))
         for ra, dec in self.layout.places:
             blank = ~(np.isfinite(ra_deg) & np.isfinite(dec_deg))
@@ -247,7 +256,9 @@ class _Columns:
         return TableMagnitudes(v, bv, vi, ", ".join(words))
 
     def variables(self) -> dict[str, npt.NDArray[Any]]:
-        """Type, range, period and a time of largest light, where a row has all of its three figures; nothing without them."""
+        """Type, range, period and a time of largest light, where a row has all of its three
+        figures; nothing without them.
+        """
         roles = ("maximum_jd", "period_d", "amplitude_mag")
         if not all(role in self.layout.role for role in roles):
             return {}
@@ -261,7 +272,9 @@ class _Columns:
         }
 
     def identifiers(self) -> tuple[str, npt.NDArray[np.int64]]:
-        """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the row, from 1."""
+        """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the
+        row, from 1.
+        """
         role, columns = self.layout.role, self.table.columns
         if "gaia" in role:
             epoch = self.role("epoch_jyear", GAIA_DR3_JYEAR)
@@ -283,7 +296,9 @@ class _Columns:
         return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
 
     def epoch(self, stated_jyear: float | None, dated: bool, designation: str) -> tuple[FloatArray, str]:
-        """The epoch of each place, Julian years, and where it comes from. Raises InputError where it has to be stated."""
+        """The epoch of each place, Julian years, and where it comes from. Raises InputError
+        where it has to be stated.
+        """
         known = EPOCH_OF_PLACES.get(self.pair[0].lower())
         if known is None and designation == "Gaia DR3":
             known = GAIA_DR3_JYEAR
@@ -352,7 +367,9 @@ def _repeats(identifier: npt.NDArray[np.int64]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """Hipparcos with a table's further stars, one line about the overlap, and what is suspect about it (None: nothing)."""
+    """Hipparcos with a table's further stars, one line about the overlap, and what is suspect
+    about it (None: nothing).
+    """
 
     catalog: Catalog
     line: str
@@ -362,7 +379,8 @@ class Joined:
 def join(hipparcos: Catalog, table: Catalog) -> Joined:
     """Add the table's stars that Hipparcos does not have.
 
-    Stars are compared at the median epoch of the table's places. Hipparcos' own row stays for each star of both, with
+    Stars are compared at the median epoch of the table's places. Hipparcos' own row stays for each
+    star of both, with
     its place, magnitude and number; so do pairs that it has as one star of the sum.
     """
     epoch_jyear = float(np.median(table.epoch_jyear))
@@ -377,7 +395,9 @@ def join(hipparcos: Catalog, table: Catalog) -> Joined:
 
 
 def _nearest_owner(hipparcos: Catalog, table: Catalog, epoch_jyear: float) -> tuple[IntArray, FloatArray]:
-    """For each star of the table (n,) Hipparcos' nearest star and its distance, arcsec; infinite beyond any pair's reach."""
+    """For each star of the table (n,) Hipparcos' nearest star and its distance, arcsec; infinite
+    beyond any pair's reach.
+    """
     from scipy.spatial import cKDTree
 
     reach = max(FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC)
@@ -404,7 +424,9 @@ class _Differences:
 
 
 def _differences(hipparcos: Catalog, table: Catalog, owner: IntArray, held: npt.NDArray[np.bool_]) -> _Differences:
-    """Differences between the table's V and B-V and Hipparcos', from single stars in both that do not vary."""
+    """Differences between the table's V and B-V and Hipparcos', from single stars in both that
+    do not vary.
+    """
     shares = np.bincount(owner[held], minlength=len(hipparcos))
     plain = (shares == 1) & (hipparcos.variable == b"") & (hipparcos.multiple == b"")
     star = np.flatnonzero(held)[plain[owner[held]]]
@@ -443,7 +465,9 @@ class Kept:
 
 
 def file_sha256(path: Path, advice: str) -> str:
-    """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it. Raises InputError."""
+    """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it.
+    Raises InputError.
+    """
     with open_regular(path, advice, table_reader.MAX_TABLE_BYTES) as file:
         status = os.fstat(file.fileno())
     return _sha256(path, (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns), advice)
@@ -460,7 +484,9 @@ def _sha256(path: Path, state: tuple[int, ...], advice: str) -> str:
 
 
 def store_path(made_of: Sequence[str]) -> Path | None:
-    """The cache's file for what was made of these words (a file's hash, settings); None where there is no cache directory."""
+    """The cache's file for what was made of these words (a file's hash, settings); None where
+    there is no cache directory.
+    """
     named = os.environ.get("XDG_CACHE_HOME", "")
     try:
         root = Path(named) if named.startswith("/") else Path.home() / ".cache"
@@ -506,7 +532,9 @@ def _is_sound(catalog: Catalog) -> bool:
 
 
 def keep(path: Path, made: Kept) -> None:
-    """Put a catalogue into the cache, and drop the oldest others; nothing happens where that cannot be."""
+    """Put a catalogue into the cache, and drop the oldest others; nothing happens where that
+    cannot be.
+    """
     about = {"designation": made.catalog.designation, "rows_read": made.catalog.rows_read}
     about |= {"notes": made.catalog.notes, "doubts": made.doubts}
     columns = {name: getattr(made.catalog, name) for name in column_names()}
@@ -521,7 +549,8 @@ def keep(path: Path, made: Kept) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TableChoice:
-    """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where the file states it.
+    """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where
+    the file states it.
 
     Of Hipparcos stars fainter than `faintest_v_mag` may be left out.
     """
@@ -535,8 +564,8 @@ class TableChoice:
 def choose_catalog(choice: TableChoice) -> Catalog:
     """The stars of a choice, with notes on what became of a table's rows.
 
-    A table is read once; then what was made of it comes from the user's cache directory. Rows that are no star, and an overlap
-    that does not fit, are said in the log each time. Raises InputError.
+    A table is read once; then what was made of it comes from the user's cache directory. Rows that
+    are no star, and an overlap that does not fit, are said in the log each time. Raises InputError.
     """
     packaged = str(choice.source) == "hipparcos"
     if packaged or _is_hip_main(Path(choice.source)):
@@ -575,12 +604,15 @@ def _made(path: Path, choice: TableChoice) -> Kept:
 
 
 def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
-    """The same stars, neighbours together: a bench that sorts them by cell then reads each array from its start to its end."""
+    """The same stars, neighbours together: a bench that sorts them by cell then reads each array
+    from its start to its end.
+    """
     return replace(catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes)
 
 
 def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Hipparcos' `facts` (n,) of the `stars` of a choice, and in their place what its table says of its own stars.
+    """Hipparcos' `facts` (n,) of the `stars` of a choice, and in their place what its table says of
+    its own stars.
 
     Reads the table once more, for the columns that no bench needs. Raises InputError.
     """

@@ -22,11 +22,13 @@ log = logging.getLogger(__name__)
 MAX_SHIFT = 1.1  # largest aberration in units of v/c, for speeds up to 0.1 c
 
 BODY_CELL_RAD = 1e-6  # radius of a cell with one body: rounding
-# Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11 us
+# Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11
+# us
 # and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
 # results/tradeoff.csv, culling: 1 to 6 degrees take the same time, a scan twenty times as long.
 CELL_DEG = 4.0
-# Within a cell stars are sorted by PARTS^2 parts of it: neighbours on the image follow each other, which
+# Within a cell stars are sorted by PARTS^2 parts of it: neighbours on the image follow each other,
+# which
 # saves a twelfth of drawing them.
 PARTS = 4
 # arccos near 1 is accurate to 1e-8 rad only; a cell is enlarged by this.
@@ -39,10 +41,12 @@ RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
 
 @dataclass(frozen=True, slots=True)
 class AirAbove:
-    """The air over a place at a moment: the zenith `up` (3,), ICRS, and the constants of refraction, rad.
+    """The air over a place at a moment: the zenith `up` (3,), ICRS, and the constants of
+    refraction, rad.
 
-    Refraction is ERFA's: A tan z + B tan^3 z, z the observed zenith distance, with constants for pressure, temperature and
-    humidity (refco), one for all colours; below 3 degrees of altitude it stays what it is there. `told` are warnings given.
+    Refraction is ERFA's: A tan z + B tan^3 z, z the observed zenith distance, with constants for
+    pressure, temperature and humidity (refco), one for all colours; below 3 degrees of altitude it
+    stays what it is there. `told` are warnings given.
     """
 
     up: FloatArray
@@ -71,7 +75,9 @@ class AirAbove:
         return MOST_BENT_RAD if self.lowest_rad(axis, radius_rad) < LOW_RAD else LESS_BENT_RAD
 
     def risen(self, which: IntArray, vectors: FloatArray, lowest_rad: float) -> IntArray:
-        """Those of directions (n, 3) above the horizon, which a field that reaches down to `lowest_rad` may cut."""
+        """Those of directions (n, 3) above the horizon, which a field that reaches down to
+        `lowest_rad` may cut.
+        """
         if lowest_rad > MOST_BENT_RAD:
             return which
         up = self.altitude_rad(vectors[which]) > 0
@@ -98,19 +104,23 @@ COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row", 
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape (n,).
+    """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape
+    (n,).
 
-    Vectors are kept component by component (Fortran's order): they are gathered and turned several times faster.
+    Vectors are kept component by component (Fortran's order): they are gathered and turned several
+    times faster.
 
-    `row` is each star's place in `catalog`, which has what no frame needs; -1 for what is in no catalogue. With a
-    `velocity_km_s` (3,), ICRS, they are seen by an observer who moves so against the one who sees `vectors`: `near` and
-    `directions` then say what that observer sees. The last stars may be `bodies`, by name: whoever moves them rewrites their
-    part of the arrays. Those that `near` does not find (satellites) come first.
+    `row` is each star's place in `catalog`, which has what no frame needs; -1 for what is in no
+    catalogue. With a `velocity_km_s` (3,), ICRS, they are seen by an observer who moves so against
+    the one who sees `vectors`: `near` and `directions` then say what that observer sees. The last
+    stars may be `bodies`, by name: whoever moves them rewrites their part of the arrays. Those that
+    `near` does not find (satellites) come first.
 
-    `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker has, which sum to 1; None where
-    it has one channel. `primaries` (n, 3) are the light that each of a monitor's primaries gives of it, as shares of
-    `electrons_per_s`; None where they are not driven apart. `colours_by_bv` and `primaries_by_bv` (k, columns) are the same of
-    light of BV_MAG (k,). Through `air` directions are bent, and `near` finds none below the horizon.
+    `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker
+    has, which sum to 1; None where it has one channel. `primaries` (n, 3) are the light that each
+    of a monitor's primaries gives of it, as shares of `electrons_per_s`; None where they are not
+    driven apart. `colours_by_bv` and `primaries_by_bv` (k, columns) are the same of light of BV_MAG
+    (k,). Through `air` directions are bent, and `near` finds none below the horizon.
     """
 
     hip: npt.NDArray[np.int32]
@@ -139,9 +149,11 @@ class Stars:
         return self.electrons_per_s[: len(self) - len(self.bodies)]
 
     def near(self, axis: FloatArray, radius_rad: float, edges: FloatArray | None = None, reach_rad: float = 0.0) -> IntArray:
-        """Every star seen within `radius_rad` and `reach_rad` of the unit vector `axis` (ICRS), and some more; rising.
+        """Every star seen within `radius_rad` and `reach_rad` of the unit vector `axis` (ICRS), and
+        some more; rising.
 
-        With `edges` (k, 3), unit vectors (ICRS), those within `reach_rad` of the inner side of each one's plane.
+        With `edges` (k, 3), unit vectors (ICRS), those within `reach_rad` of the inner side of each
+        one's plane.
         """
         if self.velocity_km_s is not None:
             reach_rad += MAX_SHIFT * float(np.linalg.norm(self.velocity_km_s)) / LIGHT_KM_S
@@ -162,7 +174,9 @@ class Stars:
         return self if velocity_km_s is None else replace(self, velocity_km_s=velocity_km_s)
 
     def names(self, which: IntArray) -> list[str]:
-        """The names of bodies and of stars without a HIP number among stars (n,), empty text for the others."""
+        """The names of bodies and of stars without a HIP number among stars (n,), empty text for
+        the others.
+        """
         first, named = len(self) - len(self.bodies), (self.hip[which] == 0).tolist()
         return [self._name(i, first) if has_name else "" for i, has_name in zip(which.tolist(), named, strict=True)]
 
@@ -177,7 +191,8 @@ class Stars:
 
 
 def split_by_rate(stars: Stars, faintest_e_per_s: float, drive: FloatArray | float = 1.0) -> tuple[Stars, Stars]:
-    """The stars of at least `faintest_e_per_s` electrons per second times `drive`, and the fainter ones, each in own cells.
+    """The stars of at least `faintest_e_per_s` electrons per second times `drive`, and the fainter
+    ones, each in own cells.
 
     The first are `stars` itself where no star is fainter.
     """
@@ -213,7 +228,9 @@ def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray,
 
 
 class Flux(NamedTuple):
-    """Electrons per second of all channels (n,), and each channel's share of them (n, channels), None for one channel."""
+    """Electrons per second of all channels (n,), and each channel's share of them (n, channels),
+    None for one channel.
+    """
 
     electrons_per_s: FloatArray
     colours: FloatArray | None
@@ -230,10 +247,11 @@ def total_and_colours(electrons_per_s: FloatArray) -> Flux:
 def with_bodies(
     stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found: bool = True, colours: FloatArray | None = None
 ) -> Stars:
-    """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have no place or light yet.
+    """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have
+    no place or light yet.
 
-    Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them to an image. Their `colours`
-    (k, channels) or (channels,) are wanted where stars have theirs.
+    Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them
+    to an image. Their `colours` (k, channels) or (channels,) are wanted where stars have theirs.
     """
     count, order = len(bodies), len(stars) + np.arange(len(bodies))
     cells = order[: count if found else 0]
@@ -280,13 +298,16 @@ class CellGrid:
     sin_radius: FloatArray
 
     def near(self, axis: FloatArray, radius_rad: float, edges: FloatArray | None = None, reach_rad: float = 0.0) -> IntArray:
-        """Positions in `order`, rising, of every star within `radius_rad` and `reach_rad` of the unit vector `axis`, and more.
+        """Positions in `order`, rising, of every star within `radius_rad` and `reach_rad` of the
+        unit vector `axis`, and more.
 
-        With `edges` (k, 3), unit normals of planes through the centre, the stars within `reach_rad` of the inner side of each.
+        With `edges` (k, 3), unit normals of planes through the centre, the stars within `reach_rad`
+        of the inner side of each.
         """
         if not len(self.start):
             return np.empty(0, dtype=np.intp)
-        widest_rad = math.acos(self.cos_radius.min())  # one bound for all cells, then each hit cell's own
+        # one bound for all cells, then each hit cell's own
+        widest_rad = math.acos(self.cos_radius.min())
         farthest_rad = min(radius_rad + reach_rad + widest_rad, math.pi)
         hit = (self.centre @ axis >= math.cos(farthest_rad)).nonzero()[0]
         centre = self.centre.take(hit, axis=0).T
@@ -297,7 +318,8 @@ class CellGrid:
             cosine, sine = math.cos(reach_rad), math.sin(reach_rad)
             deepest = cosine * sin_radius + sine * cos_radius
             if widest_rad + reach_rad >= math.pi / 2:
-                deepest[cosine * cos_radius <= sine * sin_radius] = 1.0  # a cell wider than a plane bounds
+                # a cell wider than a plane bounds
+                deepest[cosine * cos_radius <= sine * sin_radius] = 1.0
             within &= (edges @ centre + deepest).min(axis=0) >= 0
         return self._stars(hit[within])
 
@@ -307,13 +329,16 @@ class CellGrid:
             return np.empty(0, dtype=np.intp)
         start = self.start.take(cells)
         end = start + self.count.take(cells)
-        gaps = (start[1:] != end[:-1]).nonzero()[0]  # neighbours in a band follow each other: few ranges
+        # neighbours in a band follow each other: few ranges
+        gaps = (start[1:] != end[:-1]).nonzero()[0]
         firsts, lasts = [int(start[0]), *start[gaps + 1].tolist()], [*end[gaps].tolist(), int(end[-1])]
         return np.concatenate([np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)])
 
 
 def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
-    """Group unit vectors (n, 3) into bands of declination, cut into cells of about `cell_deg` squared."""
+    """Group unit vectors (n, 3) into bands of declination, cut into cells of about `cell_deg`
+    squared.
+    """
     bands = max(1, round(180.0 / cell_deg))
     down = np.arccos(np.clip(vectors[:, 2], -1, 1)) / np.pi * bands
     band = np.minimum(down.astype(np.intp), bands - 1)
@@ -325,7 +350,8 @@ def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
     part = ((down - band) * PARTS).astype(np.uint8) * np.uint8(PARTS + 1) + ((along - sector) * PARTS).astype(np.uint8)
     order = np.argsort(part, kind="stable")
     order = order[np.argsort(cell.astype(np.min_scalar_type(per_band.sum()))[order], kind="stable")]
-    # Not `np.unique`, here and wherever a bench opens: its first call imports `numpy.ma`, which takes 10 ms.
+    # Not `np.unique`, here and wherever a bench opens: its first call imports `numpy.ma`, which
+    # takes 10 ms.
     start = np.flatnonzero(np.diff(cell[order], prepend=-1))
     count = np.diff(start, append=len(order))
     if not len(start):
@@ -341,8 +367,10 @@ def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
 def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     """ICRS unit vectors of the catalogue's stars at `epoch_jyear`, shape (n, 3).
 
-    Each star moves in a straight line in space at right angles to its direction at its catalogue's epoch (parallax
-    and radial velocity zero): u = unit(u0 + t (mu_alpha* p + mu_delta q)), ESA SP-1200 vol. 1 eq. 1.2.17.
+    Each star moves in a straight line in space at right angles to its direction at its catalogue's
+    epoch (parallax
+    and radial velocity zero): u = unit(u0 + t (mu_alpha* p + mu_delta q)), ESA SP-1200 vol. 1 eq.
+    1.2.17.
     Nothing divides by cos(dec), so the poles are ordinary points.
     """
     ra, dec = np.radians(catalog.ra_deg), np.radians(catalog.dec_deg)
@@ -350,7 +378,8 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     years = epoch_jyear - catalog.epoch_jyear
     east = catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS * years
     north = catalog.pm_dec_mas_yr * RAD_PER_MAS * years
-    # One component after the other: millions of stars cost half the time and memory of (n, 3) intermediates.
+    # One component after the other: millions of stars cost half the time and memory of (n, 3)
+    # intermediates.
     u = np.empty((len(ra), 3))
     u[:, 0] = cos_dec * cos_ra + east * -sin_ra + north * (-sin_dec * cos_ra)
     u[:, 1] = cos_dec * sin_ra + east * cos_ra + north * (-sin_dec * sin_ra)
@@ -362,7 +391,8 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
 def aberrate(vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float] | FloatArray) -> FloatArray:
     """Directions (n, 3) as a moving observer sees them; the velocity is ICRS, barycentric, in km/s.
 
-    The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps the
+    The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps
+    the
     speed under that of light.
     """
     beta = np.asarray(observer_velocity_km_s, dtype=np.float64) / LIGHT_KM_S

@@ -1,4 +1,6 @@
-"""Synthetic magnitudes: a star's spectrum through UBVRI, Gaia's G and all wavelengths, and a tracker's own zero points."""
+"""Synthetic magnitudes: a star's spectrum through UBVRI, Gaia's G and all wavelengths, and a
+tracker's own zero points.
+"""
 
 from collections.abc import Callable
 from typing import Literal
@@ -21,7 +23,8 @@ from hilstar.sky.spectrum import (
     torres2010_k,
 )
 
-# F_lambda of magnitude 0, W/m2/m: Bessell, Castelli and Plez 1998, A&A 333, 231, table A2 (thesis table 2.5).
+# F_lambda of magnitude 0, W/m2/m: Bessell, Castelli and Plez 1998, A&A 333, 231, table A2 (thesis
+# table 2.5).
 ZERO_W_M2_M = {"u": 4.175e-2, "b": 6.32e-2, "v": electrons.VEGA_V0_W_M2_M, "r": 2.177e-2, "i": 1.126e-2}
 BANDS = ("u", "b", "r", "i", "g")
 VEGA_V_MAG = 0.03  # the V and the instrument magnitude of Vega (thesis 2.4.3)
@@ -47,7 +50,9 @@ def curve_mean(spectrum: Curve, passband: Curve, weighting: str = "energy") -> f
 
 
 def colours(spectrum: Spectrum, temperature: str, photometry: electrons.Photometry) -> dict[str, Colour]:
-    """The colours of BANDS and of "bolometric" (eq. 2.6, 2.7) against V, of the spectra that a bench gives its stars."""
+    """The colours of BANDS and of "bolometric" (eq. 2.6, 2.7) against V, of the spectra that a
+    bench gives its stars.
+    """
     johnson_v, light = read_curve_csv(DATA_DIR / "johnson-v.csv"), vega()
     found: dict[str, Colour] = {}
     for band in BANDS:
@@ -106,7 +111,8 @@ def _bolometric(spectrum: Spectrum, temperature: str, photometry: electrons.Phot
 def library_exitance_m(library: electrons.Library) -> FloatArray:
     """A library's spectra over all wavelengths, in their mean through V times m (n,).
 
-    Beyond a spectrum's ends stands a black body of its B-V (Torres 2010), fitted to its last END_NM.
+    Beyond a spectrum's ends stands a black body of its B-V (Torres 2010), fitted to its last
+    END_NM.
     """
     nm, flux = library.wavelength_nm, library.flux
     total = np.trapezoid(flux, nm, axis=1) * 1e-9

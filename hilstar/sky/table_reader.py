@@ -1,8 +1,10 @@
 """From a catalogue's own passbands to Johnson V, B-V and Cousins V-I, by published relations.
 
-Which column of a table is which: the names of Gaia, Tycho-2, Hipparcos and this project, and what their units say.
+Which column of a table is which: the names of Gaia, Tycho-2, Hipparcos and this project, and what
+their units say.
 
-Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the columns that are used.
+Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the columns that are
+used.
 """
 
 import io
@@ -28,22 +30,23 @@ from hilstar.basics.text_tables import TextTable, open_table
 from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.sky.catalog import load_catalog
 
-# BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
-# appendix C, with the sign of the erratum (2006, AJ 131, 2360). For -0.25 < BT - VT < 2; beyond, the offsets of the ends.
+# BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and
+# Liebert 2002, AJ 124, 1670, appendix C, with the sign of the erratum (2006, AJ 131, 2360). For
+# -0.25 < BT - VT < 2; beyond, the offsets of the ends.
 TYCHO_RANGE_MAG, TYCHO_RED_MAG = (-0.25, 2.0), 0.5
 V_FROM_VT = (9.7e-4, -0.1334, 0.05486, -0.01998)
 BV_BLUE, BV_RED = (-0.006, -0.1069, 0.1459), (0.0, -0.007813, -0.1489, 0.03384)
 
-# BP - RP to G - V and to G - I: Riello et al. 2021, A&A 649, A3, table C.2 (Gaia DR3 documentation, table 5.9), scatter 0.030
-# and 0.038 mag, for -0.5 < BP - RP < 4.5; beyond, the values of the ends.
+# BP - RP to G - V and to G - I: Riello et al. 2021, A&A 649, A3, table C.2 (Gaia DR3 documentation,
+# table 5.9), scatter 0.030 and 0.038 mag, for -0.5 < BP - RP < 4.5; beyond, the values of the ends.
 GAIA_RANGE_MAG = (-0.5, 4.5)
 G_LESS_V = (-0.02704, 0.01424, -0.2156, 0.01426)
 G_LESS_I = (0.01753, 0.76, -0.0991)
 
 # V - I to B - V: the median of Hipparcos' stars in bins of this width and at least so many.
 BIN_MAG, MIN_STARS = 0.05, 20
-# Names in lower case, the first that a table has is taken. A later pair of places fills the rows of an earlier one that are
-# blank: Tycho-2 has no mean place for one star in 20.
+# Names in lower case, the first that a table has is taken. A later pair of places fills the rows of
+# an earlier one that are blank: Tycho-2 has no mean place for one star in 20.
 PLACES = (
     ("ra", "dec"),
     ("ramdeg", "demdeg"),
@@ -81,7 +84,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     "tyc3": ("tyc3",),
     "hip": ("hip",),
 }
-# What `hilstar catalogue` alone asks for: the errors of Gaia, Tycho-2, Hipparcos and this project, and the MK type.
+# What `hilstar catalogue` alone asks for: the errors of Gaia, Tycho-2, Hipparcos and this project,
+# and the MK type.
 SPECTRAL_TYPE = "spectral_type"
 ERROR_NAMES: dict[str, tuple[str, ...]] = {
     "sigma_ra_mas": ("ra_error", "e_ra_icrs", "e_raicrs", "e_radeg", "e_raj2000", "e_ramdeg", "sigma_ra_mas"),
@@ -142,7 +146,9 @@ def from_gaia(g_mag: FloatArray, bp_rp_mag: FloatArray) -> tuple[FloatArray, Flo
 
 
 def bv_from_vi(vi_mag: FloatArray) -> FloatArray:
-    """The B-V, shape (n,), that Hipparcos' stars of that V-I have in the median; the colours of its ends beyond them."""
+    """The B-V, shape (n,), that Hipparcos' stars of that V-I have in the median; the colours of
+    its ends beyond them.
+    """
     return np.asarray(np.interp(vi_mag, *_bv_along_vi()))
 
 
@@ -163,7 +169,9 @@ Converted = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """One way from a table's magnitudes to V, B-V and V-I, (n,) each, V-I NaN where it is not known."""
+    """One way from a table's magnitudes to V, B-V and V-I, (n,) each, V-I NaN where it is not
+    known.
+    """
 
     roles: tuple[str, ...]
     words: str
@@ -204,7 +212,9 @@ ROUTES = (
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The table's column for each role, the pairs that give places, and the sets of roles that give V and a colour."""
+    """The table's column for each role, the pairs that give places, and the sets of roles that
+    give V and a colour.
+    """
 
     role: Mapping[str, str]
     places: tuple[tuple[str, str], ...]
@@ -276,7 +286,9 @@ def unit_by_name(name: str) -> str | None:
 
 
 def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
-    """By what a column's figures are multiplied to have the role's unit; 1 where the table says none. Raises InputError."""
+    """By what a column's figures are multiplied to have the role's unit; 1 where the table says
+    none. Raises InputError.
+    """
     from astropy import units as u
 
     wanted = UNIT_OF.get(role)
@@ -311,7 +323,9 @@ Whole = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 
 
 def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawTable:
-    """Read the columns of a table of stars that have `roles`. Raises InputError for another file, or one that is too large."""
+    """Read the columns of a table of stars that have `roles`. Raises InputError for another
+    file, or one that is too large.
+    """
     with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(4096)
     kind = kind_of(head[:HEAD_BYTES])
@@ -512,7 +526,9 @@ def _even_block(table: TextTable, number: int, lines: list[str]) -> str:
 
 
 def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], mask: Any) -> Any:
-    """A column as float64, int64 where it identifies the star, or bytes of the MK type. Raises InputError for other text."""
+    """A column as float64, int64 where it identifies the star, or bytes of the MK type. Raises
+    InputError for other text.
+    """
     if name == layout.role.get(SPECTRAL_TYPE):
         texts = np.array([str(text).strip().encode("ascii", "replace") for text in values.tolist()], dtype=np.bytes_)
         return texts if mask is None else np.where(mask, b"", texts)

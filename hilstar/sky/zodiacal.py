@@ -1,9 +1,11 @@
-"""Zodiacal light by direction from the Sun (Leinert et al. 1998, A&AS 127, 1): table 17's brightness, table 19's spectrum.
+"""Zodiacal light by direction from the Sun (Leinert et al. 1998, A&AS 127, 1): table 17's
+brightness, table 19's spectrum.
 
-Table 17 is for 500 nm, seen from the Earth's orbit, and symmetric in longitude and latitude. Between its directions the
-logarithm is bilinear. With every second direction left out it finds them within 4.0 % (rms) and 9 % (95 %), so that between
-all of them it is off by about a quarter of that; the light itself changes by some 10 % over the year, which no table has.
-The spectrum is sunlight times the ratio of table 19 to it, straight in logarithms between the tabled wavelengths. It is that
+Table 17 is for 500 nm, seen from the Earth's orbit, and symmetric in longitude and latitude.
+Between its directions the logarithm is bilinear. With every second direction left out it finds them
+within 4.0 % (rms) and 9 % (95 %), so that between all of them it is off by about a quarter of that;
+the light itself changes by some 10 % over the year, which no table has. The spectrum is sunlight
+times the ratio of table 19 to it, straight in logarithms between the tabled wavelengths. It is that
 of 90 degrees from the Sun, and redder nearer to it by the paper's equation 22.
 """
 
@@ -20,7 +22,8 @@ from hilstar.sky.spectrum import DATA_DIR, blackbody_exitance_w_m2_m, read_curve
 BRIGHTNESS, SPECTRUM = (DATA_DIR / f"leinert1998_table{number}.csv" for number in (17, 19))
 TABLE_NM = 500.0
 W_M2_SR_M = 1e-8 * 1e6  # table 17's unit, 1e-8 W m-2 sr-1 um-1
-# Equation 22: 1 + slope log10(wavelength / 500 nm) over sunlight at 30 and 90 degrees from the Sun: below 500 nm, and above.
+# Equation 22: 1 + slope log10(wavelength / 500 nm) over sunlight at 30 and 90 degrees from the Sun:
+# below 500 nm, and above.
 NEAR_DEG, FAR_DEG = 30.0, 90.0
 NEAR_SLOPES, FAR_SLOPES = (1.2, 0.8), (0.9, 0.6)
 J2000_JD = 2_451_545.0
@@ -28,7 +31,9 @@ ROUNDING = 1e-9
 
 
 class Sunward(NamedTuple):
-    """Directions about the Sun, degrees (n,): ecliptic longitude from it, and ecliptic latitude, neither with a sign."""
+    """Directions about the Sun, degrees (n,): ecliptic longitude from it, and ecliptic latitude,
+    neither with a sign.
+    """
 
     dlon_deg: FloatArray
     lat_deg: FloatArray
@@ -40,18 +45,23 @@ class Sunward(NamedTuple):
 
 
 def sunward(vectors_icrs: FloatArray, tdb_jd: float) -> Sunward:
-    """Where unit vectors (n, 3), ICRS, are from the Sun as the Earth sees it, by the ecliptic of J2000."""
+    """Where unit vectors (n, 3), ICRS, are from the Sun as the Earth sees it, by the ecliptic of
+    J2000.
+    """
     import erfa
 
     to_ecliptic = erfa.ecm06(J2000_JD, 0.0)
-    sun = -to_ecliptic @ erfa.ufunc.epv00(tdb_jd, 0.0)[0]["p"]  # arcsec in 1900 to 2100; it does not warn of other years
+    # arcsec in 1900 to 2100; it does not warn of other years
+    sun = -to_ecliptic @ erfa.ufunc.epv00(tdb_jd, 0.0)[0]["p"]
     x, y, z = to_ecliptic @ vectors_icrs.T
     dlon = np.abs(np.arctan2(y * sun[0] - x * sun[1], x * sun[0] + y * sun[1]))
     return Sunward(np.degrees(dlon), np.degrees(np.arcsin(np.clip(np.abs(z), 0.0, 1.0))))
 
 
 class TabledLight(NamedTuple):
-    """Radiance at 500 nm (n,), 1e-8 W m-2 sr-1 um-1, and whether it is tabled; where not, it is the nearest tabled."""
+    """Radiance at 500 nm (n,), 1e-8 W m-2 sr-1 um-1, and whether it is tabled; where not, it is
+    the nearest tabled.
+    """
 
     radiance: FloatArray
     tabled: BoolArray
@@ -75,7 +85,9 @@ def tabled_light(seen: Sunward) -> TabledLight:
 
 @cache
 def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Longitudes, latitudes, the logarithm with blanks filled from the nearest direction, and 1 where there was a blank."""
+    """Longitudes, latitudes, the logarithm with blanks filled from the nearest direction, and 1
+    where there was a blank.
+    """
     lines = BRIGHTNESS.read_text().splitlines()
     lat_deg = np.array([float(name.split("_")[1]) for name in lines[1].split(",")[1:]])
     rows = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines[2:]])
@@ -88,7 +100,9 @@ def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 
 def relative_spectrum(wavelength_nm: FloatArray, slopes: tuple[float, float] = FAR_SLOPES) -> FloatArray:
-    """Zodiacal light over its value at 500 nm, per wavelength: table 19's, or with the other `slopes` of equation 22."""
+    """Zodiacal light over its value at 500 nm, per wavelength: table 19's, or with the other
+    `slopes` of equation 22.
+    """
     table = read_curve_csv(SPECTRUM)
     nodes = table.wavelength_nm
     over_sun = np.log(table.value / blackbody_exitance_w_m2_m(nodes, np.array(SUN_TEMPERATURE_K)))
@@ -102,7 +116,9 @@ def relative_spectrum(wavelength_nm: FloatArray, slopes: tuple[float, float] = F
 
 @dataclass(frozen=True, slots=True)
 class ZodiacalLight:
-    """Zodiacal light through a tracker's optics: electrons/s/sr for a unit of table 17, 30 and 90 degrees from the Sun."""
+    """Zodiacal light through a tracker's optics: electrons/s/sr for a unit of table 17, 30 and
+    90 degrees from the Sun.
+    """
 
     near_e_per_s_sr: float
     far_e_per_s_sr: float
@@ -118,6 +134,8 @@ class ZodiacalLight:
         return cls(near, far)
 
     def electrons_per_s_sr(self, seen: Sunward, light: TabledLight) -> FloatArray:
-        """Electron rates per steradian of sky (n,); the colour is linear in the elongation between 30 and 90 degrees."""
+        """Electron rates per steradian of sky (n,); the colour is linear in the elongation
+        between 30 and 90 degrees.
+        """
         far = np.clip((seen.elongation_deg - NEAR_DEG) / (FAR_DEG - NEAR_DEG), 0.0, 1.0)
         return light.radiance * (self.near_e_per_s_sr + far * (self.far_e_per_s_sr - self.near_e_per_s_sr))

@@ -1,1 +1,3 @@
-"""The virtual star tracker: from expected electrons to code values, and from code values to star positions."""
+"""The virtual star tracker: from expected electrons to code values, and from code values to star
+positions.
+"""

@@ -1,9 +1,11 @@
-"""Where centroiders of several kinds find a star: in squares of pixels around it, one star to a square.
+"""Where centroiders of several kinds find a star: in squares of pixels around it, one star to a
+square.
 
-`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is as wide, a pixel at least
-(SExtractor's XWIN_IMAGE); `wide`: under one half as wide again. `fit`: least squares of a Gaussian integrated over pixels.
-`psf`: least squares of any PSF that it is told. `box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a
-fiftieth of the brightest. What a display does to a star's light, each sees differently.
+`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is
+as wide, a pixel at least (SExtractor's XWIN_IMAGE); `wide`: under one half as wide again. `fit`:
+least squares of a Gaussian integrated over pixels. `psf`: least squares of any PSF that it is told.
+`box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the
+brightest. What a display does to a star's light, each sees differently.
 """
 
 from collections.abc import Callable
@@ -21,7 +23,8 @@ WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
 FIT_STEPS, WINDOW_STEPS = 8, 20
 FIRST_STEPS = 3  # steps with a window before a fit
-# A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both come to rest by this.
+# A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both
+# come to rest by this.
 PACE = 1.5
 SETTLED_PX = 1e-6
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
@@ -45,11 +48,12 @@ def star_places(
     pixels: Pixels | None = None,
     box_share: float = BOX_SHARE,
 ) -> Places:
-    """Each star's x and y (n,), px from the middle of its square (n, side, side), side odd; 0 for a square without light.
+    """Each star's x and y (n,), px from the middle of its square (n, side, side), side odd; 0 for a
+    square without light.
 
-    `sigma_px` (x, y) is the star's. A box is about one of `pixels`, at least two from the edge, by default the brightest: two
-    images of a star between two pixels are to be compared in one box. The others begin there. Of a box those pixels count
-    that have over `box_share` of its brightest.
+    `sigma_px` (x, y) is the star's. A box is about one of `pixels`, at least two from the edge, by
+    default the brightest: two images of a star between two pixels are to be compared in one box.
+    The others begin there. Of a box those pixels count that have over `box_share` of its brightest.
     """
     lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
     x, y = np.zeros(len(stamps)), np.zeros(len(stamps))
@@ -65,7 +69,8 @@ def star_places(
 
 
 def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
-    """Each star's x and y (n,), px from the middle of its square (n, side, side), by least squares of a PSF from `first` on.
+    """Each star's x and y (n,), px from the middle of its square (n, side, side), by least squares
+    of a PSF from `first` on.
 
     The place is that of the PSF's middle, the chief ray: with coma the star's light lies beside it.
     """
@@ -80,7 +85,8 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
         normal, seen = parts @ parts.transpose(0, 2, 1), (parts @ stamps.reshape(len(stamps), -1, 1))
         normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
         found = np.linalg.solve(normal, seen)[..., 0]  # flux, and flux times each step
-        flux = np.where(found[:, 0] > MIN_LIGHT, found[:, 0], np.inf)  # where there is no light, no step
+        # where there is no light, no step
+        flux = np.where(found[:, 0] > MIN_LIGHT, found[:, 0], np.inf)
         dx, dy = (np.clip(found[:, k] / flux, -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
         x, y = (np.clip(place, -half, half) for place in (x + dx, y + dy))
         if not len(dx) or max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
@@ -125,7 +131,9 @@ def _window(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, wide: float = 1
 
 
 def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
-    """Sums of each square under products of `rows` (n, j, side) and `columns` (n, side, k): (n, j, k)."""
+    """Sums of each square under products of `rows` (n, j, side) and `columns` (n, side, k): (n,
+    j, k).
+    """
     return np.asarray(rows @ (stamps @ columns))
 
 
@@ -146,8 +154,8 @@ def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
 def _fit_step(seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray) -> FloatArray:
     """What least squares adds to flux, x and y, (n, 3).
 
-    `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows, `seen` (n, 2, 2) the square's
-    sums under their products.
+    `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows,
+    `seen` (n, 2, 2) the square's sums under their products.
     """
     (xx, xd, dd), (yy, yd, ee) = (
         [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))] for part in (across, down)

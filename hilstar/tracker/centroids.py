@@ -1,13 +1,18 @@
-"""Stars found in an image, and their places: a threshold, connected blobs, a windowed centre of gravity.
+"""Stars found in an image, and their places: a threshold, connected blobs, a windowed centre of
+gravity.
 
-The Gaussian window is that of SExtractor's XWIN_IMAGE: the place x where the sum over pixels of w(i - x) (i - x) I_i is
-zero, w a Gaussian of `window_sigma_px`. The plain window is the centre of gravity of a square of pixels.
+The Gaussian window is that of SExtractor's XWIN_IMAGE: the place x where the sum over pixels of
+w(i - x) (i - x) I_i is zero, w a Gaussian of `window_sigma_px`. The plain window is the centre of
+gravity of a square of pixels.
 
-Both sample the image at pixels, so both have an S-curve: a bias that repeats with the place within the pixel. For a
-Gaussian star of s px, integrated over pixels, the plain window's is -exp(-2 pi^2 s^2) sin(2 pi x) / pi: 0.0135 px at
-s = 0.4, 0.0023 at 0.5, under 1e-5 from 0.75 on. The Gaussian window's is larger, and larger yet for a narrow window:
-0.017 px at s = 0.55 and a window of 1 px. Where the star's sigma is known (`psf_sigma_px`) the S-curve is removed.
-tests/authority/test_centroids.py measures all of this, with the noise.
+Both sample the image at pixels, so both have an S-curve: a bias that repeats with the place within
+the pixel. For a
+Gaussian star of s px, integrated over pixels, the plain window's is -exp(-2 pi^2 s^2) sin(2 pi x) /
+pi: 0.0135 px at
+s = 0.4, 0.0023 at 0.5, under 1e-5 from 0.75 on. The Gaussian window's is larger, and larger yet for
+a narrow window:
+0.017 px at s = 0.55 and a window of 1 px. Where the star's sigma is known (`psf_sigma_px`) the
+S-curve is removed. tests/authority/test_centroids.py measures all of this, with the noise.
 """
 
 import functools
@@ -28,19 +33,25 @@ BoolArray = npt.NDArray[np.bool_]
 
 CLIP_SIGMAS = 3.0
 BLOCK_PX, NOISIER_PERCENT = 32, 90
-CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
+# the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
+CLIPPED_SIGMA = 0.986578
 MIN_STEP_PX = 1e-7
 WITH_DIAGONALS = np.ones((3, 3), dtype=np.bool_)
-# Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10 times the
+# Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10
+# times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
 COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
-S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to 1e-5 px
+# where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to
+# 1e-5 px
+S_CURVE_PHASES = 201
 
 
 @dataclass(frozen=True, slots=True)
 class LocalBackground:
-    """The background under the stars, in the image's unit: its level, and the sigma of a pixel's noise."""
+    """The background under the stars, in the image's unit: its level, and the sigma of a pixel's
+    noise.
+    """
 
     level: float
     noise: float
@@ -48,10 +59,12 @@ class LocalBackground:
 
 @dataclass(frozen=True, slots=True)
 class CentroidSettings:
-    """How stars are found: pixels above `threshold_sigma`, in blobs of `minimum_pixels`, then a window around each.
+    """How stars are found: pixels above `threshold_sigma`, in blobs of `minimum_pixels`, then a
+    window around each.
 
-    `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2 radius + 1 pixels wide.
-    `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian star from the places.
+    `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2
+    radius + 1 pixels wide. `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian
+    star from the places.
     Raises InputError for a value out of range.
     """
 
@@ -84,10 +97,13 @@ class CentroidSettings:
 
 @dataclass(frozen=True, slots=True)
 class Centroids:
-    """Stars, arrays of shape (n,), brightest first; (0, 0) is the centre of the top-left pixel, x right, y down.
+    """Stars, arrays of shape (n,), brightest first; (0, 0) is the centre of the top-left pixel, x
+    right, y down.
 
-    `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background and in the image's
-    unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases the place inwards.
+    `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background
+    and in the image's
+    unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases
+    the place inwards.
     """
 
     x_px: FloatArray
@@ -103,7 +119,9 @@ class Centroids:
 
 @dataclass(frozen=True, slots=True)
 class _Blobs:
-    """What the threshold found: arrays (n,), places by the centre of gravity of what is above the background."""
+    """What the threshold found: arrays (n,), places by the centre of gravity of what is above
+    the background.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -112,12 +130,15 @@ class _Blobs:
 
 
 def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> LocalBackground:
-    """The background of a whole image: median and MAD, then mean and sigma of the pixels within 3 sigma of the median.
+    """The background of a whole image: median and MAD, then mean and sigma of the pixels within 3
+    sigma of the median.
 
-    The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One level for the image:
-    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole numbers, else 0), and the noise
-    at least rounding's, step / sqrt 12. That of a noiseless float image is 0, and then every pixel over the level belongs to
-    a star: give a `LocalBackground` for such an image.
+    The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One
+    level for the image:
+    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole
+    numbers, else 0), and the noise at least rounding's, step / sqrt 12. That of a noiseless float
+    image is 0, and then every pixel over the level belongs to a star: give a `LocalBackground` for
+    such an image.
     """
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
@@ -125,7 +146,8 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     values, counts = _counted(image) if image.dtype in COUNTED_TYPES else (image.astype(np.float64).ravel(), None)
     median = _median(values, counts)
     sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
-    # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
+    # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its
+    # counterpart on the other.
     kept = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
     shares = None if counts is None else counts[kept]
     level = float(np.average(values[kept], weights=shares))
@@ -134,9 +156,12 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
 
 
 def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
-    """The values in an image of DN, in order, and how many pixels have each: ten times faster than pixel by pixel."""
+    """The values in an image of DN, in order, and how many pixels have each: ten times faster
+    than pixel by pixel.
+    """
     flat, counts = image.ravel(), np.zeros(int(image.max()) + 1, dtype=np.intp)
-    for begin in range(0, len(flat), COUNTED_AT_ONCE):  # whose whole numbers of 64 bits stay in a core's cache
+    # whose whole numbers of 64 bits stay in a core's cache
+    for begin in range(0, len(flat), COUNTED_AT_ONCE):
         counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
     values = np.flatnonzero(counts)
     return values.astype(np.float64), counts[values]
@@ -153,9 +178,11 @@ def _median(values: FloatArray, counts: IntArray | None) -> float:
 
 
 def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground:
-    """The level of an image (h, w) in steps of `step`, such as DN, and the noise of its noisier parts, at least rounding's.
+    """The level of an image (h, w) in steps of `step`, such as DN, and the noise of its noisier
+    parts, at least rounding's.
 
-    A screen's black glows over a part of the detector; beyond it many an ADC clips at 0, and has no noise at all.
+    A screen's black glows over a part of the detector; beyond it many an ADC clips at 0, and has no
+    noise at all.
     """
     rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
     height, width = image.shape[0] // rows, image.shape[1] // columns
@@ -165,7 +192,8 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     values: npt.NDArray[Any] = blocks.reshape(rows * columns, -1).astype(np.float32)
     values -= _row_medians(values)
     off = np.abs(values)
-    # The median deviation of whole steps is a whole one: half a step more, so that nothing of the noise is cut off.
+    # The median deviation of whole steps is a whole one: half a step more, so that nothing of the
+    # noise is cut off.
     kept = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
     noise = np.sqrt((values**2 * kept).sum(axis=1, dtype=np.float64) / kept.sum(axis=1)) / CLIPPED_SIGMA
     level = _median(*_counted(image)) if whole else float(np.median(image))
@@ -173,7 +201,9 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
 
 
 def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The median of each row of values (n, k), (n, 1) of their type: whole rows are sorted in a tenth of `np.median`'s time."""
+    """The median of each row of values (n, k), (n, 1) of their type: whole rows are sorted in a
+    tenth of `np.median`'s time.
+    """
     middle = np.sort(values, axis=1)[:, (values.shape[1] - 1) // 2 : values.shape[1] // 2 + 1]
     return np.asarray(middle.mean(axis=1, keepdims=True))
 
@@ -181,9 +211,11 @@ def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def find_stars(
     image: npt.NDArray[Any], settings: CentroidSettings | None = None, background: LocalBackground | None = None
 ) -> Centroids:
-    """The stars of an image (height, width) of DN or electrons. Raises InputError for NaN, infinity or another shape.
+    """The stars of an image (height, width) of DN or electrons. Raises InputError for NaN, infinity
+    or another shape.
 
-    Without `background` it is estimated from the image. Stars whose blobs touch are one; a neighbour inside the window
+    Without `background` it is estimated from the image. Stars whose blobs touch are one; a
+    neighbour inside the window
     pulls the centre towards itself.
     """
     settings = settings or CentroidSettings()
@@ -215,7 +247,9 @@ def _check(image: npt.NDArray[Any]) -> None:
 
 
 def _find_blobs(image: npt.NDArray[Any], level: float, threshold: float, minimum_pixels: int) -> _Blobs:
-    """Connected pixels more than the threshold above the level, diagonals included, in the order of the rows that meet them."""
+    """Connected pixels more than the threshold above the level, diagonals included, in the order
+    of the rows that meet them.
+    """
     cut = level + threshold
     if image.dtype.kind in "iu":  # whole numbers are compared as such
         cut = math.floor(cut)
@@ -241,7 +275,8 @@ def _find_blobs(image: npt.NDArray[Any], level: float, threshold: float, minimum
 def squares(
     image: npt.NDArray[Any], level: float, x_px: FloatArray | IntArray, y_px: FloatArray | IntArray, radius_px: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Squares of an image around n places: values over the level (n, k, k), and the pixels' offsets dx (n, 1, k), dy (n, k, 1).
+    """Squares of an image around n places: values over the level (n, k, k), and the pixels' offsets
+    dx (n, 1, k), dy (n, k, 1).
 
     Beyond the image values are 0.
     """
@@ -265,8 +300,8 @@ def _gaussian_centres(
 ) -> tuple[FloatArray, FloatArray]:
     """Places (n,), px, where the Gaussian-weighted first moment is zero, by Newton's steps.
 
-    The slope of the weighted moment is <d^2>/s^2 - 1 of its flux. A centre that leaves its window, or whose window holds no
-    light, goes back to the blob's own centre of gravity.
+    The slope of the weighted moment is <d^2>/s^2 - 1 of its flux. A centre that leaves its window,
+    or whose window holds no light, goes back to the blob's own centre of gravity.
     """
     place = np.stack([blobs.x_px, blobs.y_px])
     start = place.copy()
@@ -295,7 +330,8 @@ def _gaussian_centres(
 def _plain_centres(
     image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Places (n,), px: the centre of gravity of the square around the last place, until no square moves.
+    """Places (n,), px: the centre of gravity of the square around the last place, until no square
+    moves.
 
     A square without light, or whose centre of gravity lies outside it, leaves the blob's own.
     """
@@ -317,7 +353,9 @@ def _plain_centres(
 
 @dataclass(frozen=True, slots=True)
 class SCurve:
-    """The bias, px, of a star's measured place within its pixel along one axis: arrays (S_CURVE_PHASES,), one period."""
+    """The bias, px, of a star's measured place within its pixel along one axis: arrays
+    (S_CURVE_PHASES,), one period.
+    """
 
     measured_px: FloatArray
     bias_px: FloatArray
@@ -325,10 +363,13 @@ class SCurve:
 
 @functools.lru_cache(maxsize=16)
 def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
-    """The S-curves along x and y of a noiseless Gaussian star of `psf_sigma_px`, by the centroider itself.
+    """The S-curves along x and y of a noiseless Gaussian star of `psf_sigma_px`, by the centroider
+    itself.
 
-    Window and star are products of an x and a y part, so the curve of one axis does not depend on the other's place.
-    Raises InputError where two places within a pixel are measured as one: the window is too narrow for that star.
+    Window and star are products of an x and a y part, so the curve of one axis does not depend on
+    the other's place.
+    Raises InputError where two places within a pixel are measured as one: the window is too narrow
+    for that star.
     """
     if settings.psf_sigma_px is None:
         raise InputError("centroids: an S-curve needs psf_sigma_px; write the star's sigma along x and y")

@@ -1,4 +1,5 @@
-"""The detector's noise (thesis section 4.3, tables 4.1 and 4.2, corrected): expected electrons in, DN out.
+"""The detector's noise (thesis section 4.3, tables 4.1 and 4.2, corrected): expected electrons in,
+DN out.
 
 Cosmic rays and false stars are new in every frame.
 
@@ -8,12 +9,16 @@ The physical order, which is the order of `Detector.expose`:
     -> column pattern -> read noise -> ADC
 
 Laws:
-1. What belongs to the device (PRNU, DSNU, hot and dead pixels, columns) comes from `device_seed`, each from its own
-   stream, so that one map does not change when another is switched on. What belongs to the frame comes from the
+1. What belongs to the device (PRNU, DSNU, hot and dead pixels, columns) comes from `device_seed`,
+   each from its own
+   stream, so that one map does not change when another is switched on. What belongs to the frame
+   comes from the
    generator that is passed in. Same seeds and same numpy: same image, bit for bit.
-2. Photon and dark shot noise are one Poisson draw: the sum of two independent Poisson counts is Poisson of the
+2. Photon and dark shot noise are one Poisson draw: the sum of two independent Poisson counts is
+   Poisson of the
    summed mean, exactly, and one draw costs half of two.
-3. Quantisation noise is what rounding does. The thesis's added Gaussian (table 4.1) is off unless asked for.
+3. Quantisation noise is what rounding does. The thesis's added Gaussian (table 4.1) is off unless
+   asked for.
 """
 
 import math
@@ -30,7 +35,8 @@ from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_
 DEFAULT_PITCH_UM = 13.0
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
-# A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a pair. The mean
+# A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
+# pair. The mean
 # alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
@@ -48,9 +54,11 @@ def cosmic_rays_e(
     rng: np.random.Generator,
     pixel_pitch_um: float = DEFAULT_PITCH_UM,
 ) -> FloatArray:
-    """Electrons of one frame's cosmic rays, shape `shape`: straight tracks through RAY_DEPTH_UM of silicon.
+    """Electrons of one frame's cosmic rays, shape `shape`: straight tracks through RAY_DEPTH_UM of
+    silicon.
 
-    The rate is that of hits on the sensor's face. Rays come isotropically, so a face sees cos^2 of the angle to its
+    The rate is that of hits on the sensor's face. Rays come isotropically, so a face sees cos^2 of
+    the angle to its
     normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS are expected.
     """
     height, width = shape
@@ -62,7 +70,8 @@ def cosmic_rays_e(
     cosine = np.sqrt(1.0 - rng.random(hits))
     azimuth_rad = rng.uniform(0.0, 2 * np.pi, hits)
     start_px = rng.random((hits, 2)) * (width, height)
-    # A grazing ray is longer than the sensor: only what the sensor can see of it is stepped through.
+    # A grazing ray is longer than the sensor: only what the sensor can see of it is stepped
+    # through.
     length_px = RAY_DEPTH_UM / pixel_pitch_um * np.sqrt(1 - cosine**2) / cosine
     charge_e = RAY_E_PER_UM * RAY_DEPTH_UM / cosine
     seen_px = np.minimum(length_px, width + height)
@@ -81,7 +90,9 @@ def cosmic_rays_e(
 def false_stars_e(
     settings: DetectorSettings, shape: tuple[int, int], exposure_s: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Expected electrons, shape `shape`, of `false_stars` equal point sources at random places, new in every frame."""
+    """Expected electrons, shape `shape`, of `false_stars` equal point sources at random places,
+    new in every frame.
+    """
     from scipy.special import ndtr
 
     height, width = shape
@@ -106,7 +117,9 @@ class Detector:
     def __init__(
         self, settings: DetectorSettings, resolution_px: tuple[int, int], pixel_pitch_um: float = DEFAULT_PITCH_UM
     ) -> None:
-        """`resolution_px` is (width, height). Raises InputError where it is not positive, or the pitch is not a sensor's."""
+        """`resolution_px` is (width, height). Raises InputError where it is not positive, or the
+        pitch is not a sensor's.
+        """
         check_value("pixel_pitch_um", pixel_pitch_um, PixelPitch)
         width, height = resolution_px
         if width < 1 or height < 1:
@@ -133,9 +146,11 @@ class Detector:
         ).astype(kind)
 
     def expose(self, mean_e: npt.ArrayLike, exposure_s: float, rng: np.random.Generator) -> CodeArray:
-        """One frame, DN, of `mean_e` (height, width): the electrons that the light makes on average in the exposure.
+        """One frame, DN, of `mean_e` (height, width): the electrons that the light makes on average
+        in the exposure.
 
-        Raises InputError for a wrong shape, and for electrons or an exposure that are negative, not finite or beyond
+        Raises InputError for a wrong shape, and for electrons or an exposure that are negative, not
+        finite or beyond
         MAX_E.
         """
         settings = self.settings
@@ -188,7 +203,9 @@ class Detector:
         return self._read_out(kept_e, rng.standard_normal(self.shape, dtype=np.float32) if settings.electronics_e else None)
 
     def _read_out(self, charge_e: ChargeArray, normal: Float32Array | None, part: slice = slice(None)) -> CodeArray:
-        """DN of the charge in the wells, the rows `part`, with the noise of the electronics; `charge_e` is changed."""
+        """DN of the charge in the wells, the rows `part`, with the noise of the electronics;
+        `charge_e` is changed.
+        """
         if self.settings.column_noise_e:
             charge_e += self.column_e
         if self.settings.dsnu_e:
@@ -198,9 +215,11 @@ class Detector:
         return self._convert(charge_e)
 
     def expose_noiseless(self, mean_e: npt.ArrayLike, exposure_s: float) -> CodeArray:
-        """The DN of the mean signal, light and mean dark, through full well and ADC; refuses what `expose` refuses.
+        """The DN of the mean signal, light and mean dark, through full well and ADC; refuses what
+        `expose` refuses.
 
-        No fixed pattern, no strays. The mean of noisy frames differs where a well or the ADC clips the noise.
+        No fixed pattern, no strays. The mean of noisy frames differs where a well or the ADC clips
+        the noise.
         """
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)
@@ -210,14 +229,17 @@ class Detector:
         return self._convert(self._fill_wells(expected_e))
 
     def collected_e(self, mean_e: npt.ArrayLike, exposure_s: float) -> FloatArray:
-        """The same electrons with the smear of a frame transfer. Refuses what `expose` refuses of shape and exposure."""
+        """The same electrons with the smear of a frame transfer. Refuses what `expose` refuses
+        of shape and exposure.
+        """
         light_e = np.asarray(mean_e)
         if light_e.dtype.kind not in "fiu" or light_e.shape != self.shape:
             raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
         if not 0 <= exposure_s <= MAX_E:
             raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
         shift_s = self.settings.row_shift_us * 1e-6
-        if shift_s and exposure_s:  # clearing and readout together shift each charge through the light of all rows once
+        # clearing and readout together shift each charge through the light of all rows once
+        if shift_s and exposure_s:
             light_e = light_e + light_e.sum(axis=0, dtype=np.float64) * (shift_s / exposure_s)
         return light_e
 
@@ -238,7 +260,9 @@ class Detector:
         return bloom(collected_e, full_e) if self.settings.blooming else np.minimum(collected_e, full_e)
 
     def _convert(self, charge_e: ChargeArray) -> CodeArray:
-        """The ADC: electrons to the nearest code (a half goes to the even one), clipped to the bits; same shape."""
+        """The ADC: electrons to the nearest code (a half goes to the even one), clipped to the
+        bits; same shape.
+        """
         codes = charge_e
         codes /= self.settings.gain_e_per_dn
         codes += self.settings.offset_dn
@@ -255,9 +279,11 @@ def _dark_map_e_per_s(
     hot: np.random.Generator,
     column: np.random.Generator,
 ) -> FloatArray:
-    """Dark rates at the sensor's temperature: the pixels' and the columns', never negative, plus the hot pixels' extra.
+    """Dark rates at the sensor's temperature: the pixels' and the columns', never negative, plus
+    the hot pixels' extra.
 
-    Where DSNU is not small beside dark, the normal law's cut at 0 lifts the mean: 1e-4 of it for table 4.2 (203 and 60 e-/s).
+    Where DSNU is not small beside dark, the normal law's cut at 0 lifts the mean: 1e-4 of it for
+    table 4.2 (203 and 60 e-/s).
     """
     mean, sigma = settings.dark_e_per_s, settings.dsnu_e_per_s
     rate_e_per_s = np.full(shape, mean)
@@ -279,7 +305,8 @@ def _dark_map_e_per_s(
 
 
 def bloom(charge_e: ChargeArray, full_well_e: float) -> ChargeArray:
-    """`charge_e` with what exceeds the full well spilt along its columns, half up and half down; same shape.
+    """`charge_e` with what exceeds the full well spilt along its columns, half up and half down;
+    same shape.
 
     Only the charge that leaves a column at its ends is lost.
     """

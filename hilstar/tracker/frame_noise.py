@@ -1,13 +1,17 @@
-"""The random part of a frame, from random words by arithmetic alone: normal pairs, and Poisson counts by inversion.
+"""The random part of a frame, from random words by arithmetic alone: normal pairs, and Poisson
+counts by inversion.
 
-A frame is drawn in blocks of rows, each from a stream of its own: the frame's key and the block's number seed it. So one
-seed gives one frame on any number of threads. A pixel takes one word of 64 bits. It becomes two independent normal numbers
-(Box and Muller 1958): the first makes the electrons, the second the read noise.
+A frame is drawn in blocks of rows, each from a stream of its own: the frame's key and the block's
+number seed it. So one seed gives one frame on any number of threads. A pixel takes one word of 64
+bits. It becomes two independent normal numbers (Box and Muller 1958): the first makes the
+electrons, the second the read noise.
 
-Electrons are the smallest count whose cumulative probability reaches that of the normal number. Below EXACT_BELOW_E
-that is exact (to float32's rounding of the number): a table or an expansion gives the count, and where either leaves a doubt,
-scipy's distribution decides. From there on the expansion alone decides (Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and
-Fisher's kind, with the 1/3 of a discrete law): its errors are in `tests/unit/tracker/test_frame_noise.py`.
+Electrons are the smallest count whose cumulative probability reaches that of the normal number.
+Below EXACT_BELOW_E
+that is exact (to float32's rounding of the number): a table or an expansion gives the count, and
+where either leaves a doubt, scipy's distribution decides. From there on the expansion alone decides
+(Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and Fisher's kind, with the 1/3 of a discrete law):
+its errors are in `tests/unit/tracker/test_frame_noise.py`.
 """
 
 import os
@@ -33,16 +37,20 @@ UNSURE = 64  # a table's flag: this count or the next one
 ONE_STEP_SIGMAS = 3.0  # within it, a doubt is between two counts
 # Above this mean, the number of a step is straight between rows to 1.7e-3 sigmas.
 STRAIGHT_ABOVE_E, STEP_NUMBER_ERROR = 0.1, 2e-3
-# The expansion's error, e-, is at most ERROR_PER_BEND2 times the square of its last term ("bend"), plus
-# ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus FINER_ERROR_E / mean^1.5.
+# The expansion's error, e-, is at most ERROR_PER_BEND2 times the square of its last term ("bend"),
+# plus
+# ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus
+# FINER_ERROR_E / mean^1.5.
 ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
 
 
 def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Float32Array, Float32Array]:
-    """Two independent standard normal numbers for each random word: two arrays of its shape, up to 6.77 sigmas.
+    """Two independent standard normal numbers for each random word: two arrays of its shape, up to
+    6.77 sigmas.
 
-    Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the second angles.
+    Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the
+    second angles.
     `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
     """
     parts = words.shape[0] if words.ndim == 3 else 1
@@ -149,7 +157,9 @@ def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float)
 
 
 def _decide(counts: Float32Array, mean_e: Float32Array, normal: Float32Array, doubts: npt.NDArray[np.intp]) -> None:
-    """Raise the counts of the pixels `doubts`, lower bounds so far, to where the cumulative probability is reached."""
+    """Raise the counts of the pixels `doubts`, lower bounds so far, to where the cumulative
+    probability is reached.
+    """
     from scipy.special import ndtr, pdtr
 
     numbers = normal.ravel()[doubts]
@@ -167,8 +177,10 @@ def _decide(counts: Float32Array, mean_e: Float32Array, normal: Float32Array, do
 class CountTable(NamedTuple):
     """Counts by mean and normal number.
 
-    `cells` (rows * COLUMNS,) holds the smallest count of a cell, with UNSURE where there are more; `step_number`
-    ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at the means between rows.
+    `cells` (rows * COLUMNS,) holds the smallest count of a cell, with UNSURE where there are more;
+    `step_number`
+    ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at the means
+    between rows.
     """
 
     cells: npt.NDArray[np.uint8]
@@ -195,10 +207,11 @@ def _count_table() -> CountTable:
 
 
 def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]) -> None:
-    """Call `draw` for the rows of each block of an image (height, width) with random words, on every core.
+    """Call `draw` for the rows of each block of an image (height, width) with random words, on
+    every core.
 
-    Words are (parts, rows, width): two parts, or at the image's end what is left of each. One seed gives each block the same
-    words on any number of threads. `OMP_NUM_THREADS` bounds them.
+    Words are (parts, rows, width): two parts, or at the image's end what is left of each. One seed
+    gives each block the same words on any number of threads. `OMP_NUM_THREADS` bounds them.
     """
     height, width = shape
     rows = max(1, PART_PX // width)

@@ -1,4 +1,6 @@
-"""From found stars to an attitude: which star is which, by where they are expected or lost in space, and Wahba's problem."""
+"""From found stars to an attitude: which star is which, by where they are expected or lost in
+space, and Wahba's problem.
+"""
 
 import tempfile
 from collections.abc import Callable
@@ -15,7 +17,8 @@ from hilstar.basics.rotation import from_matrix, normalise, to_matrix
 MIN_STARS = 4  # identified, for an answer: three confirm a fourth
 MIN_SHARE = 0.5  # part of the stars found that have to be the catalogue's
 RADII_PX = (12.0, 3.0, 1.5)  # how far a found star may be from where it is expected, at each step
-CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02  # a centroid's variance: 0.4 px^2 an electron, and the display's own share
+# a centroid's variance: 0.4 px^2 an electron, and the display's own share
+CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02
 REFITS, REJECTED = 4, 4.0  # stars farther off than so many times the median are left out
 FIELD_ERROR = 0.02  # share of the field of view that the database leaves open
 GAIA_RECORD = np.dtype(
@@ -24,7 +27,8 @@ GAIA_RECORD = np.dtype(
 
 
 def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray:
-    """The rotation (4,), unit quaternion, that best turns directions `known` (n, 3) into `seen` (n, 3); weights (n,).
+    """The rotation (4,), unit quaternion, that best turns directions `known` (n, 3) into `seen` (n,
+    3); weights (n,).
 
     Wahba's problem by SVD (Markley 1988).
     """
@@ -34,7 +38,9 @@ def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray
 
 @dataclass(frozen=True, slots=True)
 class FoundStars:
-    """Stars found in an image, brightest first: places (n,), px, signal (n,), e-, and directions (n, 3), cam, unit."""
+    """Stars found in an image, brightest first: places (n,), px, signal (n,), e-, and directions
+    (n, 3), cam, unit.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -47,7 +53,9 @@ class FoundStars:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """An attitude q_icrs_to_cam and what it rests on: pairs (k,) of found stars and catalogue stars, and their rms, arcsec."""
+    """An attitude q_icrs_to_cam and what it rests on: pairs (k,) of found stars and catalogue
+    stars, and their rms, arcsec.
+    """
 
     q_icrs_to_cam: FloatArray
     found: IntArray
@@ -55,13 +63,16 @@ class Identified:
     rms_rad: float
 
 
-# Catalogue stars near an attitude: their numbers (m,), brightest first, and directions (m, 3), ICRS.
+# Catalogue stars near an attitude: their numbers (m,), brightest first, and directions (m, 3),
+# ICRS.
 StarsNear = Callable[[FloatArray], tuple[IntArray, FloatArray]]
 Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # pixels of directions (m, 3), cam
 
 
 def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, place: Place) -> Identified | None:
-    """The attitude near an expected one, by stars where they are expected; None where too few are there."""
+    """The attitude near an expected one, by stars where they are expected; None where too few
+    are there.
+    """
     if len(found) < MIN_STARS:
         return None
     seen_px = KDTree(np.stack([found.x_px, found.y_px], axis=1))
@@ -77,7 +88,8 @@ def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, p
         near = inside[np.isfinite(distance)]
         pairs, first = np.unique(nearest[np.isfinite(distance)], return_index=True)
         known = near[first]
-        if step == 0 and len(pairs) >= MIN_STARS:  # they all moved alike: those that did not are others
+        # they all moved alike: those that did not are others
+        if step == 0 and len(pairs) >= MIN_STARS:
             moved = np.stack([found.x_px[pairs], found.y_px[pairs]], axis=1) - expected[known]
             alike = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < RADII_PX[1]
             pairs, known = pairs[alike], known[alike]
@@ -96,10 +108,11 @@ def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, p
 
 
 class LostInSpace:
-    """Attitudes from stars alone, by `tetra3rs` (the extra hilstar[solve]) and a database of the given catalogue.
+    """Attitudes from stars alone, by `tetra3rs` (the extra hilstar[solve]) and a database of the
+    given catalogue.
 
-    `directions` (n, 3), ICRS unit vectors, and magnitudes (n,) are the stars that the tracker can see; the database is made of
-    them in a second. Raises InputError where the extra is missing.
+    `directions` (n, 3), ICRS unit vectors, and magnitudes (n,) are the stars that the tracker can
+    see; the database is made of them in a second. Raises InputError where the extra is missing.
     """
 
     def __init__(self, directions: FloatArray, v_mag: FloatArray, focal_length_px: float, size_px: tuple[int, int]) -> None:
@@ -130,7 +143,9 @@ class LostInSpace:
             )
 
     def solve(self, slopes: FloatArray, flux_e: FloatArray) -> FloatArray | None:
-        """q_icrs_to_cam of stars at slopes (n, 2) from the boresight (x / z and y / z in cam), brightest first; or None."""
+        """q_icrs_to_cam of stars at slopes (n, 2) from the boresight (x / z and y / z in cam),
+        brightest first; or None.
+        """
         places = np.column_stack([slopes * self._camera.focal_length_px, flux_e])
         solved = self._database.solve_from_centroids(places, camera_model=self._camera)
         return normalise(np.asarray(solved.quaternion)) if isinstance(solved, self._result) else None

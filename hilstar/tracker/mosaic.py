@@ -1,4 +1,6 @@
-"""A Bayer mosaic: light by channel to the pixels that see it, and the luminance in which a tracker's software finds stars."""
+"""A Bayer mosaic: light by channel to the pixels that see it, and the luminance in which a
+tracker's software finds stars.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,13 +12,15 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.tracker.settings import DetectorSettings
 
 CHANNELS = "rgb"
-# The pixel's weight in its own superpixels' mean, along an axis. Their light is spread by half a pixel squared more.
+# The pixel's weight in its own superpixels' mean, along an axis. Their light is spread by half a
+# pixel squared more.
 SUPERPIXEL = np.array([0.25, 0.5, 0.25])
 SUPERPIXEL_VARIANCE_PX2 = 0.5
 
 
 def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArray:
-    """What a sensor's pixels (height, width) have of images by channel: each its own colour's; the one image of a mono sensor.
+    """What a sensor's pixels (height, width) have of images by channel: each its own colour's; the
+    one image of a mono sensor.
 
     Images may share their memory, where they come one after the other.
     """
@@ -33,14 +37,18 @@ def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArr
 
 
 def of_colour(bayer: str, channel: str) -> list[tuple[slice, slice]]:
-    """The pixels of a channel in an image of a pattern, whose first row is the top: green has two of four."""
+    """The pixels of a channel in an image of a pattern, whose first row is the top: green has
+    two of four.
+    """
     return [np.s_[place // 2 :: 2, place % 2 :: 2] for place, colour in enumerate(bayer) if colour == channel]
 
 
 def luminance(image: npt.NDArray[Any]) -> FloatArray:
-    """The mean of the four superpixels of 2 x 2 that each pixel belongs to: of red, green and blue 1, 2 and 1 parts everywhere.
+    """The mean of the four superpixels of 2 x 2 that each pixel belongs to: of red, green and blue
+    1, 2 and 1 parts everywhere.
 
-    It has the mosaic's pixels, all of its light, and no pattern where the light has none; beyond its edges it is mirrored.
+    It has the mosaic's pixels, all of its light, and no pattern where the light has none; beyond
+    its edges it is mirrored.
     """
     from scipy.ndimage import correlate1d
 
@@ -49,7 +57,9 @@ def luminance(image: npt.NDArray[Any]) -> FloatArray:
 
 
 def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDArray[Any]:
-    """The image of an exposure in which a tracker's software finds stars: its DN, or the luminance of its superpixels."""
+    """The image of an exposure in which a tracker's software finds stars: its DN, or the
+    luminance of its superpixels.
+    """
     return luminance(dn) if detector.takes_superpixels else dn
 
 

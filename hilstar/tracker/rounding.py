@@ -19,7 +19,8 @@ from scipy.special import ndtr
 
 from hilstar.basics.arrays import FloatArray
 
-VARIANCE_DN2 = 1 / 12  # of the reading of a level that noise spreads over the steps, beside that noise
+# of the reading of a level that noise spreads over the steps, beside that noise
+VARIANCE_DN2 = 1 / 12
 STEP_PHASES = 16  # places of a dark level between two steps
 PLACES_DN = np.arange(STEP_PHASES)[:, None] / STEP_PHASES
 HARMONICS = np.arange(1, 9)  # of the sawtooth that rounding is: eight hold 93 % of its variance

@@ -1,4 +1,6 @@
-"""A detector's settings in plain numbers, which are also the keys of a bench file's [tracker.detector]."""
+"""A detector's settings in plain numbers, which are also the keys of a bench file's
+[tracker.detector].
+"""
 
 import math
 from dataclasses import dataclass
@@ -15,13 +17,15 @@ from hilstar.basics.errors import InputError
 BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018
 ELECTRON_C = 1.602176634e-19
 TABLE_4_2_TEMPERATURE_K = 293.0
-# e2v's dark signal relative to 293 K, a T^3 exp(-b / T), from 230 to 300 K: a in 1/K^3 and b in K. Seen in public code, not
-# on a data sheet: the first (AIMO) in the response model of Solar-C's EUVST, the second (NIMO) there, in a simulator that
-# quotes the CCD230-42's sheet, and in a background analysis of New Horizons' LORRI. They give 0.997 and 1.001 at 293 K.
+# e2v's dark signal relative to 293 K, a T^3 exp(-b / T), from 230 to 300 K: a in 1/K^3 and b in K.
+# Seen in public code, not on a data sheet: the first (AIMO) in the response model of Solar-C's
+# EUVST, the second (NIMO) there, in a simulator that quotes the CCD230-42's sheet, and in a
+# background analysis of New Horizons' LORRI. They give 0.997 and 1.001 at 293 K.
 E2V_DARK = {"ccd47-20": (1.14e6, 9080.0), "e2v-nimo": (122.0, 6400.0)}
 DATASHEET_RANGE_K = (230.0, 300.0)
 
-# More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their rounding is 0.004
+# More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their
+# rounding is 0.004
 # at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
 MAX_E = 1e12
 
@@ -36,8 +40,8 @@ PixelPitch = Annotated[float, Meta(ge=0.1, le=1000)]
 class PixelNoise:
     """Variances of a pixel's signal by source, e-^2, each of the shape of the light or a number.
 
-    Shot is the light's, dark the dark current's own shot noise. PRNU and DSNU, which holds CMOS columns too, are fixed in a
-    device: variances over its pixels.
+    Shot is the light's, dark the dark current's own shot noise. PRNU and DSNU, which holds CMOS
+    columns too, are fixed in a device: variances over its pixels.
     """
 
     shot_e2: FloatArray
@@ -62,46 +66,60 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     full_well_e: Charge = 70_000.0  #: Charge above this is lost, or spills with `blooming`.
     bits: Annotated[int, Meta(ge=1, le=16)] = 12  #: Bits of a DN.
     offset_dn: Amount = 0.0  #: Added by the ADC.
-    #: Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0). It needs `[tracker]
-    #: quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its colour ([colour](colour.md)). Default: no mosaic:
-    #: mono
+    #: Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0).
+    #: It needs `[tracker] quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its
+    #: colour ([colour](colour.md)). Default: no mosaic: mono
     bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = None
-    #: With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars. `"superpixel"`: the mean of the four
-    #: squares of 2 x 2 that a pixel belongs to. `"mosaic"`: the raw pixels. Places are those of the whole mosaic either way.
+    #: With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars.
+    #: `"superpixel"`: the mean of the four squares of 2 x 2 that a pixel belongs to. `"mosaic"`:
+    #: the raw pixels. Places are those of the whole mosaic either way.
     solver_image: Literal["superpixel", "mosaic"] = "superpixel"
     #: Share of a pixel that takes light: `quantum_efficiency` is that of its open part.
     fill_factor: Annotated[float, Meta(ge=1e-3, le=1)] = 1.0
     read_noise_e: Amount = 0.0  #: Sigma of the read noise, at `read_noise_reference_hz`.
-    readout_hz: Amount = 0.0  #: Pixels that an output reads in a second; 0: `read_noise_e` holds as it is.
+    #: Pixels that an output reads in a second; 0: `read_noise_e` holds as it is.
+    readout_hz: Amount = 0.0
     read_noise_reference_hz: Charge = 1e6  #: Readout frequency of `read_noise_e`.
-    #: Where 1/f noise equals white noise: read noise goes as the root of readout frequency plus this.
+    #: Where 1/f noise equals white noise: read noise goes as the root of readout frequency plus
+    #: this.
     read_noise_corner_hz: Amount = 0.0
-    #: Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is straight. Default: none
+    #: Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is
+    #: straight. Default: none
     read_noise_table: Annotated[tuple[tuple[Charge, Amount], ...], Meta(extra={"form": "[[hz, e], ...]"})] = ()
-    #: `"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one before. `"frame-transfer"`: no
-    #: shutter while rows are shifted under the mask, so light smears along the columns ([real glass](optics.md#the-shutter)).
+    #: `"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one
+    #: before. `"frame-transfer"`: no shutter while rows are shifted under the mask, so light smears
+    #: along the columns ([real glass](optics.md#the-shutter)).
     shutter: Literal["global", "rolling", "frame-transfer"] = "global"
-    row_time_us: Amount = 0.0  #: With `rolling`: from the beginning of a row's exposure to the next row's.
+    #: With `rolling`: from the beginning of a row's exposure to the next row's.
+    row_time_us: Amount = 0.0
     #: With `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.
     row_direction: Literal["down", "up"] = "down"
-    row_shift_us: Amount = 0.0  #: With `frame-transfer`: the time in which charge is shifted by one row.
-    sense_capacitance_ff: Amount = 0.0  #: Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling.
+    #: With `frame-transfer`: the time in which charge is shifted by one row.
+    row_shift_us: Amount = 0.0
+    #: Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling.
+    sense_capacitance_ff: Amount = 0.0
     dark_e_per_s: Amount = 0.0  #: Dark current of a pixel at the reference temperature.
     dsnu_e_per_s: Amount = 0.0  #: Sigma of the dark current over the device (DSNU).
-    dsnu_e: Amount = 0.0  #: Sigma of a fixed offset of each pixel, whatever the exposure (EMVA 1288's DSNU).
-    #: Law of pixels' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`, `"log-normal"`.
+    #: Sigma of a fixed offset of each pixel, whatever the exposure (EMVA 1288's DSNU).
+    dsnu_e: Amount = 0.0
+    #: Law of pixels' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`,
+    #: `"log-normal"`.
     dark_distribution: Literal["normal", "gamma", "log-normal"] = "normal"
-    #: Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution` is fitted to them, and gives
-    #: `dark_e_per_s` and `dsnu_e_per_s`. Default: none
+    #: Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution`
+    #: is fitted to them, and gives `dark_e_per_s` and `dsnu_e_per_s`. Default: none
     dark_quantiles: Annotated[tuple[tuple[Share, Amount], ...], Meta(extra={"form": "[[share, e/s], ...]"})] = ()
     prnu: Share = 0.0  #: Relative sigma of the gain map (PRNU), which is fixed for a device.
-    #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is the frame's.
+    #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is
+    #: the frame's.
     device_seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    fixed_pattern: Literal["ccd", "cmos"] = "ccd"  #: `"cmos"` allows `column_noise_e`; a `"ccd"` has one amplifier.
+    #: `"cmos"` allows `column_noise_e`; a `"ccd"` has one amplifier.
+    fixed_pattern: Literal["ccd", "cmos"] = "ccd"
     temperature_k: Temperature = TABLE_4_2_TEMPERATURE_K  #: Temperature of the sensor.
-    dark_reference_temperature_k: Temperature = TABLE_4_2_TEMPERATURE_K  #: Temperature at which the dark currents above hold.
-    #: Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`. `"diffusion-depletion"`: T^3 exp(-E/kT) and
-    #: T^1.5 exp(-E/2kT). `"ccd47-20"` (AIMO) and `"e2v-nimo"`: e2v's laws, 230 to 300 K.
+    #: Temperature at which the dark currents above hold.
+    dark_reference_temperature_k: Temperature = TABLE_4_2_TEMPERATURE_K
+    #: Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`.
+    #: `"diffusion-depletion"`: T^3 exp(-E/kT) and T^1.5 exp(-E/2kT). `"ccd47-20"` (AIMO) and
+    #: `"e2v-nimo"`: e2v's laws, 230 to 300 K.
     dark_law: Literal["arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"] = "arrhenius"
     #: Share of depletion in the dark current at the reference temperature; the rest is diffusion.
     dark_depletion_share: Share = 1.0
@@ -117,16 +135,21 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     hot_pixel_activation_ev: Annotated[float, Meta(ge=0, le=2)] = 0.0
     dead_pixel_fraction: Share = 0.0  #: Share of the pixels that give no electrons.
     column_noise_e: Amount = 0.0  #: Sigma of a fixed offset of each column, for `cmos`.
-    column_dark_e_per_s: Amount = 0.0  #: Sigma of a dark current that a column's pixels share, for `cmos`.
-    cosmic_rays_per_cm2_s: Amount = 0.0  #: Hits by isotropic minimum-ionising particles; each leaves a straight track.
-    false_stars: Annotated[int, Meta(ge=0, le=100_000)] = 0  #: False stars, at new places in every frame.
+    #: Sigma of a dark current that a column's pixels share, for `cmos`.
+    column_dark_e_per_s: Amount = 0.0
+    #: Hits by isotropic minimum-ionising particles; each leaves a straight track.
+    cosmic_rays_per_cm2_s: Amount = 0.0
+    #: False stars, at new places in every frame.
+    false_stars: Annotated[int, Meta(ge=0, le=100_000)] = 0
     false_star_e_per_s: Amount = 10_000.0  #: Rate of a false star.
-    false_star_sigma_px: Annotated[float, Meta(ge=0.05, le=20)] = 0.55  #: Gaussian sigma of a false star.
+    #: Gaussian sigma of a false star.
+    false_star_sigma_px: Annotated[float, Meta(ge=0.05, le=20)] = 0.55
     blooming: bool = False  #: Charge above the full well spills along the column.
-    #: How a frame's noise is drawn from its seed. `2`: in blocks, on every core, the same on any number of them; `1`: as up to
-    #: version 0.2, slower.
+    #: How a frame's noise is drawn from its seed. `2`: in blocks, on every core, the same on any
+    #: number of them; `1`: as up to version 0.2, slower.
     noise_version: Literal[1, 2] = 2
-    quantisation_noise: bool = False  #: Adds the Gaussian quantisation noise of the thesis to what rounding does.
+    #: Adds the Gaussian quantisation noise of the thesis to what rounding does.
+    quantisation_noise: bool = False
 
     def __post_init__(self) -> None:
         """Refuse (InputError) a value that no sensor has."""
@@ -165,7 +188,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def dark_factor(self) -> float:
-        """What the temperature does to dark rates: 1 at the reference temperature (thesis eq. 4.12)."""
+        """What the temperature does to dark rates: 1 at the reference temperature (thesis eq.
+        4.12).
+        """
         cold_k, warm_k = self.dark_reference_temperature_k, self.temperature_k
         if self.dark_law == "arrhenius":
             return _arrhenius(self.dark_activation_ev, cold_k, warm_k)
@@ -184,7 +209,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def read_noise_now_e(self) -> float:
-        """Sigma of the read noise at `readout_hz`: white noise of the band, and 1/f noise, which has as much in each octave."""
+        """Sigma of the read noise at `readout_hz`: white noise of the band, and 1/f noise, which
+        has as much in each octave.
+        """
         if not self.readout_hz:
             return self.read_noise_e
         if self.read_noise_table:
@@ -199,9 +226,11 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return math.sqrt(BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C)
 
     def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
-        """The noise of pixels that light gives `light_e` electrons on average, background among them (thesis table 4.1).
+        """The noise of pixels that light gives `light_e` electrons on average, background among
+        them (thesis table 4.1).
 
-        Of pixels that are neither hot nor dead nor hit by a cosmic ray, below full well and above code 0.
+        Of pixels that are neither hot nor dead nor hit by a cosmic ray, below full well and above
+        code 0.
         """
         light = np.asarray(light_e, dtype=np.float64)
         seconds = self.dark_factor * exposure_s
@@ -219,12 +248,16 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def electronics_e(self) -> float:
-        """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's for `quantisation_noise`."""
+        """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's
+        for `quantisation_noise`.
+        """
         return math.hypot(self.read_noise_now_e, self.reset_noise_e, self.adc_noise_e if self.quantisation_noise else 0.0)
 
     @property
     def adc_noise_e(self) -> float:
-        """The thesis's quantisation noise, full well / (2^bits sqrt 12) (table 4.1); rounding makes gain / sqrt 12."""
+        """The thesis's quantisation noise, full well / (2^bits sqrt 12) (table 4.1); rounding
+        makes gain / sqrt 12.
+        """
         return self.full_well_e / float(2**self.bits * math.sqrt(12))
 
 
@@ -239,7 +272,8 @@ def _check_shutter(detector: DetectorSettings) -> None:
 
 
 def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
-    """Mean and sigma of the law of `dark_distribution` through quantiles (n, 2): shares and e-/s. Raises InputError.
+    """Mean and sigma of the law of `dark_distribution` through quantiles (n, 2): shares and e-/s.
+    Raises InputError.
 
     Least squares of the quantiles; of their logarithms, except for the normal law.
     """
@@ -276,7 +310,9 @@ def e2v_dark(law: str, temperature_k: float) -> float:
 
 
 def silicon_gap_ev(temperature_k: float) -> float:
-    """Silicon's band gap, eV (Thurmond, J. Electrochem. Soc. 122 (1975) 1133; Sze, Physics of Semiconductor Devices)."""
+    """Silicon's band gap, eV (Thurmond, J. Electrochem. Soc. 122 (1975) 1133; Sze, Physics of
+    Semiconductor Devices).
+    """
     return 1.17 - 4.73e-4 * temperature_k**2 / (temperature_k + 636.0)
 
 
@@ -285,7 +321,9 @@ def _arrhenius(activation_ev: float, cold_k: float, warm_k: float) -> float:
 
 
 def check_value(name: str, value: Any, kind: Any) -> None:
-    """Refuse (InputError) a value outside the limits or the choices of its annotated type, `kind`."""
+    """Refuse (InputError) a value outside the limits or the choices of its annotated type,
+    `kind`.
+    """
     plain, *notes = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     if get_origin(plain) is Literal:
         if value not in get_args(plain):

@@ -1,8 +1,9 @@
-"""What a tracker finds wrong with a display's stars: each centroider, in the tracker's own pixels after its own blur.
+"""What a tracker finds wrong with a display's stars: each centroider, in the tracker's own pixels
+after its own blur.
 
-A lit monitor pixel is a square of light. The tracker's optics blur it (a Gaussian), and its pixels, of any width, collect it.
-Stars stand in the tiles of a square image (`monitor.phases`); each row and column of tiles meets the tracker's pixels at a
-phase of its own.
+A lit monitor pixel is a square of light. The tracker's optics blur it (a Gaussian), and its pixels,
+of any width, collect it. Stars stand in the tiles of a square image (`monitor.phases`); each row
+and column of tiles meets the tracker's pixels at a phase of its own.
 """
 
 import math
@@ -14,7 +15,8 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import magnitude
 from hilstar.tracker.centroiders import BOX_SHARE, FAMILY, Centroider, Pixels, Sigma, brightest, star_places
 
-SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
+# a pixel's width twice: a star is sampled by squares, and shown by squares
+SQUARES_VARIANCE = 1 / 6
 REACH_SIGMAS = 5.0
 BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centre
 # Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
@@ -26,7 +28,8 @@ MIN_BLUR_PX = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class StarErrors:
-    """Of n stars: flux errors, mag, positive too faint, and how far off each centroider finds them, px along x and y (2, n).
+    """Of n stars: flux errors, mag, positive too faint, and how far off each centroider finds them,
+    px along x and y (2, n).
 
     Infinite where a star shows nothing.
     """
@@ -58,11 +61,13 @@ class StarErrors:
 
 
 class Judge:
-    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where they should be.
+    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where
+    they should be.
 
-    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels, and
-    `box_share` the threshold of its boxes.
+    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a
+    column of tiles at an
+    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in
+    monitor pixels, and `box_share` the threshold of its boxes.
     """
 
     def __init__(
@@ -92,7 +97,9 @@ class Judge:
         self._places: dict[Centroider, FloatArray] = {}
 
     def errors(self, shown: FloatArray, share: float | FloatArray = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
-        """The errors of an image of the same stars, whose light should be `share` of those wanted: all's, or each one's."""
+        """The errors of an image of the same stars, whose light should be `share` of those
+        wanted: all's, or each one's.
+        """
         light = self._light_of(shown)
         off_px = {}
         for kind in kinds:
@@ -133,7 +140,8 @@ class Judge:
         """The tracker's pixels about each star, (n, side, side)."""
         (columns, rows), count, tile = self._views[pixel_px], self._count, self._tile
         side = rows.shape[1]
-        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(0, 2, 1)  # (column, y, side)
+        # (column, y, side)
+        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(0, 2, 1)
         lines = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
         return np.asarray((rows @ lines).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
 
@@ -147,9 +155,11 @@ def stamp_errors(
     *,
     box_share: float = BOX_SHARE,
 ) -> dict[Centroider, FloatArray]:
-    """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n, side, side): px (2, n).
+    """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n,
+    side, side): px (2, n).
 
-    Stars may be paths; sigmas, blur, pixels and threshold as for a `Judge`. Infinite where nothing is shown.
+    Stars may be paths; sigmas, blur, pixels and threshold as for a `Judge`. Infinite where nothing
+    is shown.
     """
     count, side = wanted.shape[:2]
     at, light = np.arange(side), wanted.sum(axis=(1, 2))
@@ -177,16 +187,18 @@ def stamp_errors(
 
 
 def _collected(star_px: FloatArray, side: int, pixel_px: float, blur_px: float, half: int) -> FloatArray:
-    """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor pixels, along one axis.
+    """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor
+    pixels, along one axis.
 
-    (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the tracker's pixels at a phase of
-    its own.
+    (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the
+    tracker's pixels at a phase of its own.
     """
     phase = (np.arange(len(star_px)) * GOLDEN) % 1.0 - 0.5
     middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
     edges = np.arange(side + 1) - 0.5
     to_left, to_right = (middles[:, :, None] + way * pixel_px / 2 - edges for way in (-1, 1))
-    # Cumulative light of a blurred point up to a place, and the integral of that over a monitor pixel.
+    # Cumulative light of a blurred point up to a place, and the integral of that over a monitor
+    # pixel.
     within = [_ramp(to, blur_px) for to in (to_left, to_right)]
     return -np.diff(within[1] - within[0], axis=-1)
 

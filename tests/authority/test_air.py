@@ -1,4 +1,6 @@
-"""The air over `[site]` against Astropy's refraction, own quadrature, and Young's law of scintillation."""
+"""The air over `[site]` against Astropy's refraction, own quadrature, and Young's law of
+scintillation.
+"""
 
 from __future__ import annotations
 
@@ -54,12 +56,15 @@ temperature_c = 5
 humidity = 0.3
 {site}
 """
-# Astropy's refraction is ERFA's too. It is given no distances, so parallaxes of up to 20 mas are left.
+# Astropy's refraction is ERFA's too. It is given no distances, so parallaxes of up to 20 mas are
+# left.
 REFRACTION_LIMIT_ARCSEC, FAR_MAS = 0.03, 20.0
-# hilstar's rates are a fit over V-I, whose errors at two air masses nearly cancel: over the Pickles library 0.005 to 0.01 mag
-# rms for air masses of 1 to 2.5, 0.014 at 6; the reddened and the hottest stars up to 0.07.
+# hilstar's rates are a fit over V-I, whose errors at two air masses nearly cancel: over the Pickles
+# library 0.005 to 0.01 mag rms for air masses of 1 to 2.5, 0.014 at 6; the reddened and the hottest
+# stars up to 0.07.
 EXTINCTION_LIMITS_MAG = {1.2: (0.008, 0.04), 2.4: (0.012, 0.06), 6.0: (0.018, 0.09)}
-# A black body's rate is tabulated to 1e-11: left are the straight lines between air masses; measured 0.003.
+# A black body's rate is tabulated to 1e-11: left are the straight lines between air masses;
+# measured 0.003.
 BLACK_BODY_LIMIT_MAG = 0.005
 GLOW_LIMIT = 1e-4
 
@@ -216,11 +221,13 @@ def test_stars_twinkle_by_youngs_law(tmp_path):
     masses = 1 / math.sin(math.radians(40))
     sigma = 0.09 * 1.84 ** (-2 / 3) * masses**1.75 * math.exp(-1200 / 8000) / math.sqrt(2 * 0.2)
     freedom = 59 * light.shape[1]
-    # The field is 6 degrees high: X^1.75 changes by a tenth over it. 4 sigmas of the scatter's own error beside that.
+    # The field is 6 degrees high: X^1.75 changes by a tenth over it. 4 sigmas of the scatter's own
+    # error beside that.
     assert light.std(ddof=1, axis=0).mean() == pytest.approx(sigma, rel=0.1 + 4 / math.sqrt(2 * freedom))
     correlation = np.corrcoef(light.T)[np.triu_indices(light.shape[1], 1)]
     assert abs(correlation.mean()) < 4 / math.sqrt(60 * len(correlation))  # each by itself
-    assert scintillation(18.4, np.array([1.0, 2.0]), 0.0, exposure_s=0.0).tolist() == [1.0, 1.0]  # and no warning
+    # and no warning
+    assert scintillation(18.4, np.array([1.0, 2.0]), 0.0, exposure_s=0.0).tolist() == [1.0, 1.0]
 
 
 def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
@@ -239,8 +246,10 @@ def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
     high, level, low = found
     assert len(low.truth) == 0
     assert low.mean_e.max() == 0
-    assert (np.array([t["y_px"] for t in level.truth]) < 192).all()  # the lower half of the image is the ground
-    assert level.mean_e[:, 256][:150].min() > 2 * high.mean_e.min()  # van Rhijn's: the sky is brighter at the horizon
+    # the lower half of the image is the ground
+    assert (np.array([t["y_px"] for t in level.truth]) < 192).all()
+    # van Rhijn's: the sky is brighter at the horizon
+    assert level.mean_e[:, 256][:150].min() > 2 * high.mean_e.min()
     assert sum("below the horizon" in record.message for record in caplog.records) == 1
 
 

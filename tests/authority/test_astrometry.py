@@ -20,8 +20,8 @@ MAS = np.pi / (180 * 3600 * 1000)
 ARCSEC = 1000 * MAS
 # The issue's limit; measured: 0.002 mas for the worst star over 34.75 years.
 LIMIT_MAS = 1.0
-# Two boosts one after the other are one boost and a rotation by half of beta x beta': 1.4e-9 rad for the Earth and an orbit
-# about it. Of 1041 px to a radian that is 1.4e-6 px.
+# Two boosts one after the other are one boost and a rotation by half of beta x beta': 1.4e-9 rad
+# for the Earth and an orbit about it. Of 1041 px to a radian that is 1.4e-6 px.
 ORBIT_LIMIT_PX = 2e-6
 FAR_FROM_THE_SUN_AU = 1e6  # ERFA bends light by the Sun's potential too
 
@@ -45,7 +45,8 @@ def moved_by_astropy(catalog: Catalog, epoch_jyear: float) -> np.ndarray:
     return np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
 
 
-@pytest.mark.filterwarnings("ignore::erfa.ErfaWarning")  # pmsafe's word for a zero parallax, which is meant
+# pmsafe's word for a zero parallax, which is meant
+@pytest.mark.filterwarnings("ignore::erfa.ErfaWarning")
 @pytest.mark.parametrize("epoch_jyear", [1950.0, 2000.0, 2026.0])
 def test_every_star_is_where_astropy_puts_it(epoch_jyear):
     catalog = load_catalog()
@@ -75,7 +76,8 @@ def test_aberration_at_right_angles_is_20_5_arcsec_at_the_earth_s_speed():
     star = np.array([[1.0, 0.0, 0.0]])
     seen = aberrate(star, (0.0, 29.8, 0.0))
     angle_arcsec = separation_rad(star, seen)[0] / ARCSEC
-    assert angle_arcsec == pytest.approx(np.arcsin(29.8 / LIGHT_KM_S) / ARCSEC, rel=1e-9)  # sin = beta, exactly
+    # sin = beta, exactly
+    assert angle_arcsec == pytest.approx(np.arcsin(29.8 / LIGHT_KM_S) / ARCSEC, rel=1e-9)
     assert angle_arcsec == pytest.approx(20.5, abs=0.01)
     assert seen[0, 1] > 0  # towards the motion
 
@@ -97,7 +99,9 @@ def test_aberration_is_the_exact_formula_at_any_speed(rng):
 
 
 def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the_earth(bench_with, rng):
-    """The Earth's velocity in the bench file, the spacecraft's with each frame; another frame's is not left behind."""
+    """The Earth's velocity in the bench file, the spacecraft's with each frame; another frame's
+    is not left behind.
+    """
     earth_km_s, orbit_km_s = np.array([-18.3, 21.4, 9.3]), np.array([3.0, -6.5, 2.5])
     bench = bench_with(f"[sky]\nobserver_velocity_km_s = {earth_km_s.tolist()}\n")
     still = bench_with("")
@@ -143,7 +147,8 @@ def test_pixels_are_those_of_astropy_s_tangent_projection(bench_with, rng):
         wcs = WCS({"NAXIS": 2} | world_coordinates(bench.camera, q))
         x, y = wcs.all_world2pix(np.degrees(star_ra), np.degrees(star_dec), 0)
         assert len(sprites) > 50
-        # Degrees in float64 know a direction to 5e-14 deg; arcsin near the pole to 1e-8 rad, 1e-5 px here.
+        # Degrees in float64 know a direction to 5e-14 deg; arcsin near the pole to 1e-8 rad, 1e-5
+        # px here.
         assert np.hypot(x - sprites.x_px, y - sprites.y_px).max() < 2e-5
         normal = (bench.camera.cam_to_image @ to_matrix(q))[2]
         assert wcs.wcs.crval[1] == pytest.approx(np.degrees(np.arcsin(normal[2])), abs=1e-6)

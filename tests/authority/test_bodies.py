@@ -93,8 +93,9 @@ def test_astropys_route_through_erfa_agrees(rng):
             assert apart_arcsec(ours[k], unit(theirs)) < ASTROPY_LIMIT_ARCSEC, name
 
 
-# Right ascension and declination of date, degrees, from 67.787260 W, 22.959748 S, 5186 m, on 2020-04-06 each hour from 0:00:
-# JPL Horizons, as Astropy's own tests quote it (test_solar_system.py), whose equinox is 51.02 mas off in right ascension.
+# Right ascension and declination of date, degrees, from 67.787260 W, 22.959748 S, 5186 m, on
+# 2020-04-06 each hour from 0:00: JPL Horizons, as Astropy's own tests quote it
+# (test_solar_system.py), whose equinox is 51.02 mas off in right ascension.
 SITE_DEG_M = (-67.787260, -22.959748, 5186.0)
 HORIZONS_EQUINOX_ARCSEC = 0.05102376467
 MOON_RA_DEG = (
@@ -134,7 +135,9 @@ def test_the_moon_over_a_turning_earth_is_where_horizons_has_it():
 
 
 def test_bodies_of_1980_are_where_horizons_has_them():
-    """Apparent, of date, from the Earth's centre, 1980-03-25 0:00 UTC: JPL Horizons by Astropy's tests."""
+    """Apparent, of date, from the Earth's centre, 1980-03-25 0:00 UTC: JPL Horizons by Astropy's
+    tests.
+    """
     horizons = {
         "Sun": "00h16m31.00s +01d47m16.9s",
         "Moon": "07h32m02.62s +18d34m05.0s",
@@ -155,7 +158,8 @@ def test_stars_near_and_far_are_seen_where_astropy_has_them(rng):
     for utc in random_utcs_ns(rng, 5):
         vectors = unit(rng.normal(size=(200, 3)))
         sun = seen_at(utc)[0]
-        vectors = vectors[vectors @ sun < np.cos(np.radians(1.0))]  # nearer, Astropy's Earth (ERFA's epv00) bends otherwise
+        # nearer, Astropy's Earth (ERFA's epv00) bends otherwise
+        vectors = vectors[vectors @ sun < np.cos(np.radians(1.0))]
         frame = GCRS(obstime=Time(utc / 1e9, format="unix", scale="utc"))
         ra, dec = erfa.c2s(vectors)
         parallax_mas = rng.uniform(1.0, 800.0, size=len(vectors))

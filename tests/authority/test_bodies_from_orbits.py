@@ -1,4 +1,6 @@
-"""Places and magnitudes of bodies for observers anywhere about the Earth, on 200 dates, against Skyfield."""
+"""Places and magnitudes of bodies for observers anywhere about the Earth, on 200 dates, against
+Skyfield.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,13 @@ from tests.support.stars import stars_at
 
 ARCSEC = np.pi / (180 * 3600)
 PLACE_ARCSEC = 0.1  # the issue's
-# Measured: 0.2, 1.6, 9 and 0.6 mas. Skyfield bends light by the Earth too, and turns elements by the sidereal time of 1982,
-# whose equinox drifts by 0.25 arcsec a century: 24 m of a geostationary orbit in 2046.
+# Measured: 0.2, 1.6, 9 and 0.6 mas. Skyfield bends light by the Earth too, and turns elements by
+# the sidereal time of 1982, whose equinox drifts by 0.25 arcsec a century: 24 m of a geostationary
+# orbit in 2046.
 MEASURED_ARCSEC = {"geocentre": 0.001, "low": 0.003, "geostationary": 0.015, "Molniya": 0.002}
-# The issue's. Skyfield takes the barycentre for the Sun, which is up to 0.01 au from it: a crescent of Mercury is then 0.2 mag
-# off. With the Sun in its place all are within 0.022, its term for spacecraft at Uranus.
+# The issue's. Skyfield takes the barycentre for the Sun, which is up to 0.01 au from it: a crescent
+# of Mercury is then 0.2 mag off. With the Sun in its place all are within 0.022, its term for
+# spacecraft at Uranus.
 MAGNITUDE_MAG = 0.05
 MOON_MAG = 1e-3  # light's 1.3 s, and the Sun's 8 min, of a phase
 DATES = 50  # of each of the four observers
@@ -105,6 +109,8 @@ def observer_of(kind: str, utc_ns: int, scale, rng) -> tuple[Orbit | None, Earth
 
 
 def clear_of_earth(directions: np.ndarray, to_earth_km: np.ndarray) -> np.ndarray:
-    """Those (n,) that are not behind the Earth, whose mass bends light by 9 mas where it would go through."""
+    """Those (n,) that are not behind the Earth, whose mass bends light by 9 mas where it would
+    go through.
+    """
     distance_km = np.linalg.norm(to_earth_km)
     return directions @ to_earth_km / distance_km < np.cos(np.arcsin(6378.0 / distance_km))

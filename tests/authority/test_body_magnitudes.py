@@ -1,4 +1,6 @@
-"""Magnitudes and colours of bodies against the papers' own figures, Skyfield and the ROLO model of the Moon."""
+"""Magnitudes and colours of bodies against the papers' own figures, Skyfield and the ROLO model
+of the Moon.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,18 @@ SKYFIELD_MAG = 1e-6  # the same formulas; its pole of Saturn has eight decimals.
 # Beyond 3.1 and 1.9 degrees of phase it adds a term for spacecraft, 0.021 and 0.015 mag at once.
 SKYFIELD_FAR_MAG = 0.025
 ROLO_MAG = 0.08
-# The table was drawn through observations that differ by as much (waxing and waning Moon: 0.1 mag); no law reaches 160 degrees.
+# The table was drawn through observations that differ by as much (waxing and waning Moon: 0.1 mag);
+# no law reaches 160 degrees.
 ALLEN_MAG, ALLEN_THIN_MAG = 0.11, 0.26
-# The paper's two photometric systems, measured apart: their rates differ by this at most (measured: 0.051, Uranus)
+# The paper's two photometric systems, measured apart: their rates differ by this at most (measured:
+# 0.051, Uranus)
 SYSTEMS_MAG = 0.06
 
 
 def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vectors from the Sun and from the observer to a body with these distances and this phase, km."""
+    """Vectors from the Sun and from the observer to a body with these distances and this phase,
+    km.
+    """
     phase = np.radians(phase_deg)
     return np.array([sun_au, 0, 0]) * KM_PER_AU, distance_au * KM_PER_AU * np.array([np.cos(phase), np.sin(phase), 0])
 
@@ -48,7 +54,9 @@ def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase
 
 
 def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
-    """Its formulas by the true distances from the Sun, which its own call takes at the barycentre."""
+    """Its formulas by the true distances from the Sun, which its own call takes at the
+    barycentre.
+    """
     functions = {name: getattr(magnitudelib, f"_{name.lower()}_magnitude") for name in PLANETS}
     poles = {"Saturn": magnitudelib._SATURN_POLE, "Uranus": magnitudelib._URANUS_POLE}
     for utc in random_utcs_ns(rng, 200):
@@ -64,13 +72,16 @@ def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
             else:
                 theirs = functions[name](*sizes, jyear) if name == "Neptune" else functions[name](*sizes)
             if np.isnan(theirs):
-                continue  # Neptune before 2000, at phases over 1.9 degrees, which Skyfield leaves open
+                # Neptune before 2000, at phases over 1.9 degrees, which Skyfield leaves open
+                continue
             limit = SKYFIELD_FAR_MAG if name in {"Uranus", "Neptune"} else SKYFIELD_MAG
             assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=limit), name
 
 
 def rolo_albedo(phase_deg: float) -> float:
-    """Disk-equivalent reflectance at 549.1 nm without libration (Kieffer and Stone 2005, eq. 10, table 4)."""
+    """Disk-equivalent reflectance at 549.1 nm without libration (Kieffer and Stone 2005, eq. 10,
+    table 4).
+    """
     g = np.radians(phase_deg)
     log_a = -2.10782 - 1.66736 * g + 0.41697 * g**2 - 0.22026 * g**3
     return float(np.exp(log_a + 0.36814 * np.exp(-phase_deg / 4.06054) - 0.09815 * np.exp(-phase_deg / 12.8802)))
@@ -83,7 +94,8 @@ def test_the_moon_is_as_bright_as_in_the_rolo_model(phase_deg, limit_mag):
     assert moon_v_mag(1.0, 384_400.0, phase_deg) == pytest.approx(rolo, abs=limit_mag)
 
 
-# Allen 1973, Astrophysical Quantities, 3rd edition, p. 143: phase in degrees, magnitudes below the full Moon.
+# Allen 1973, Astrophysical Quantities, 3rd edition, p. 143: phase in degrees, magnitudes below the
+# full Moon.
 ALLEN = {
     **{0: 0.0, 5: 0.08, 10: 0.23, 20: 0.51, 30: 0.79, 40: 1.06, 50: 1.35, 60: 1.62, 70: 1.91, 80: 2.24, 90: 2.63, 100: 3.04},
     **{110: 3.48, 120: 3.93, 130: 4.44, 140: 5.07, 150: 5.9, 160: 7.5},
@@ -106,7 +118,9 @@ def test_the_earth_is_as_bright_as_in_skyfield():
 
 
 def test_colours_are_those_of_the_paper():
-    """B-V of its table 3, within what rounding of table 7's albedos leaves (0.001 of 0.06 for Mars: 0.02 mag)."""
+    """B-V of its table 3, within what rounding of table 7's albedos leaves (0.001 of 0.06 for
+    Mars: 0.02 mag).
+    """
     published = {"Mercury": 0.97, "Venus": 0.70, "Mars": 1.36, "Jupiter": 0.86, "Saturn": 1.07, "Uranus": 0.50, "Neptune": 0.39}
     assert bodies_bv_mag(tuple(published)) == pytest.approx(list(published.values()), abs=0.02)
     assert bodies_bv_mag(("Moon",))[0] == pytest.approx(0.92, abs=0.03)  # Allen 1973

@@ -1,4 +1,6 @@
-"""Errors of place and motion carried to an epoch, against finite differences of ERFA's starpm; a bench's zero points."""
+"""Errors of place and motion carried to an epoch, against finite differences of ERFA's starpm; a
+bench's zero points.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,14 @@ from hilstar.sky.synthetic import ab_electrons_per_s, colours, vega_electrons_pe
 EPOCHS_JYEAR = (1950.0, 2000.0, 2026.0)
 STARS = 300
 MAS = np.pi / (180 * 3600 * 1000)
-# starpm also delays light (v/c of the transverse speed: under 1e-3 for the fastest); differences of 1 arcsec round to 1e-6.
+# starpm also delays light (v/c of the transverse speed: under 1e-3 for the fastest); differences of
+# 1 arcsec round to 1e-6.
 SIGMA_LIMIT = 1e-3
 STEPS = (1000 * MAS, 1000 * MAS, 10 * MAS, 10 * MAS)
 # CALSPEC's Vega behind a CCD47-20, at V = 0: tests/authority/test_pickles.py.
 CALSPEC_VEGA_E_PER_S, BINNED_LIMIT = 2.5016e7, 3e-4
-# Sun: IAU 2015 zero point and nominal luminosity, V = -26.76 (Torres 2010). G2V of the library is within 0.05 mag of its BC.
+# Sun: IAU 2015 zero point and nominal luminosity, V = -26.76 (Torres 2010). G2V of the library is
+# within 0.05 mag of its BC.
 SUN_BC_MAG, BC_LIMIT_MAG = -0.072, 0.05
 
 
@@ -68,7 +72,9 @@ def test_errors_are_those_of_erfa(epoch_jyear):
 
 
 def test_errors_of_1991_are_the_catalogue_s():
-    """HIP 1's row of CDS I/239: 1.32, 0.74, 1.36 and 0.81, correlation 0.32; a star that it does not have has none."""
+    """HIP 1's row of CDS I/239: 1.32, 0.74, 1.36 and 0.81, correlation 0.32; a star that it does
+    not have has none.
+    """
     catalog = load_catalog()
     one = catalog.taken(np.flatnonzero(catalog.hip == 1))
     covariance = motion_at(one, facts_of(one.hip), 1991.25).covariance[0]

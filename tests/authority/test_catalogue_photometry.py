@@ -1,4 +1,6 @@
-"""V and colours from other passbands: Tycho's against the ground's, Gaia's against spectra through its passbands."""
+"""V and colours from other passbands: Tycho's against the ground's, Gaia's against spectra
+through its passbands.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,14 @@ from hilstar.sky.electrons import load_library
 from hilstar.sky.table_reader import bv_from_vi, from_gaia, from_tycho
 
 HERE = Path(__file__).parent
-# Mamajek et al. 2002 state 0.006 mag in V and 0.009 in B-V; ground and Tycho scatter by 0.015 and 0.02
-# mag a star, the median of 20 by 0.25 of that. In V they leave 0.015 at the red end, where the linear relation of the
-# catalogue itself has 0.05 in B-V at BT - VT = 0.5.
+# Mamajek et al. 2002 state 0.006 mag in V and 0.009 in B-V; ground and Tycho scatter by 0.015 and
+# 0.02
+# mag a star, the median of 20 by 0.25 of that. In V they leave 0.015 at the red end, where the
+# linear relation of the catalogue itself has 0.05 in B-V at BT - VT = 0.5.
 TYCHO_MEDIAN_MAG, TYCHO_BIN_MAG, TYCHO_STAR_MAG = 0.009, 0.02, 0.06
-# Riello et al. 2021: scatter 0.030 mag in V, 0.038 in I. The library's stars are V = 0 at 3.631e-9, Vega's system at 0.03 mag
-# from it by its V; the coolest giants, beyond BP - RP = 2.5, are beyond the relations' scatter.
+# Riello et al. 2021: scatter 0.030 mag in V, 0.038 in I. The library's stars are V = 0 at 3.631e-9,
+# Vega's system at 0.03 mag from it by its V; the coolest giants, beyond BP - RP = 2.5, are beyond
+# the relations' scatter.
 GAIA_ZERO_MAG, GAIA_MEDIAN_MAG, GAIA_STAR_MAG, GAIA_VI_MAG, COOL_MAG = 0.03, 0.02, 0.06, 0.12, 2.5
 
 

@@ -1,6 +1,8 @@
-"""The centroider against truth: its S-curves against theory, its scatter against the propagated noise of the pixels.
+"""The centroider against truth: its S-curves against theory, its scatter against the propagated
+noise of the pixels.
 
-`python -m tests.authority.test_centroids` prints bias and scatter over star size and signal to noise.
+`python -m tests.authority.test_centroids` prints bias and scatter over star size and signal to
+noise.
 """
 
 from __future__ import annotations
@@ -27,14 +29,18 @@ STARS = 900  # in a measured field: 1800 coordinates
 
 # Errors are looked at to 5 of their own sigmas.
 SIGMAS = 5.0
-# Newton stops at 1e-7 px. At a phase of half a pixel the window's outermost pixels, 4 window sigmas out, come and go: a
+# Newton stops at 1e-7 px. At a phase of half a pixel the window's outermost pixels, 4 window sigmas
+# out, come and go: a
 # star of 3 px has 12 px * 0.133 e-/px * exp(-16) there, over a slope of 1/2: 4e-7 px.
 NUMERICAL_PX = 6e-7
-# The S-curve is taken out by a straight line between 201 phases: h^2 / 8 times its second derivative (2 pi)^2 0.05 px is
-# 6e-6 px at 0.4 px and a 1 px window; its second harmonic, smaller but four times as curved, as much again.
+# The S-curve is taken out by a straight line between 201 phases: h^2 / 8 times its second
+# derivative (2 pi)^2 0.05 px is 6e-6 px at 0.4 px and a 1 px window; its second harmonic, smaller
+# but four times as curved, as much again.
 CORRECTED_PX = 2e-5
-# The prediction is of first order, and taken at the true place: where the S-curve is 0.05 px (0.4 px, SNR 100) the
-# weights at the measured place differ, and 8 seeds lie 3 % lower on average, 0.4 px at SNR 30 as much higher. The
+# The prediction is of first order, and taken at the true place: where the S-curve is 0.05 px (0.4
+# px, SNR 100) the
+# weights at the measured place differ, and 8 seeds lie 3 % lower on average, 0.4 px at SNR 30 as
+# much higher. The
 # estimate's error, 1 / sqrt(2 * 1800) = 1.7 %, counts 4 times.
 SCATTER_TOLERANCE = 0.03 + 4 * 0.017
 FIRST_ORDER_SNR = (30.0, 100.0)
@@ -72,14 +78,18 @@ def star_field(sigma_px: float, flux_e: float, rng: np.random.Generator, tile_px
 
 
 def flux_for(snr: float, sigma_px: float) -> float:
-    """Electrons of a star whose matched-filter signal to noise is `snr`: noise-equivalent area 4 pi (sigma^2 + 1/12)."""
+    """Electrons of a star whose matched-filter signal to noise is `snr`: noise-equivalent area 4
+    pi (sigma^2 + 1/12).
+    """
     area_px = 4 * math.pi * (sigma_px**2 + 1 / 12)
     return (snr**2 + math.sqrt(snr**4 + 4 * snr**2 * area_px * READ_NOISE_E**2)) / 2
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What a field of stars gave: errors of the found ones, (n,) in px, with their true place within the pixel."""
+    """What a field of stars gave: errors of the found ones, (n,) in px, with their true place
+    within the pixel.
+    """
 
     error_px: FloatArray
     phase_px: FloatArray
@@ -110,7 +120,9 @@ def measure(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) 
 
 
 def predicted_scatter_px(sigma_px: float, snr: float, settings: CentroidSettings) -> float:
-    """The scatter of the zero of sum w d I: sqrt(sum (w d)^2 V) / |sum I d(w d)/dx|, V = I + read noise^2, over phases."""
+    """The scatter of the zero of sum w d I: sqrt(sum (w d)^2 V) / |sum I d(w d)/dx|, V = I +
+    read noise^2, over phases.
+    """
     radius, flux_e = settings.radius_px, flux_for(snr, sigma_px)
     d = np.arange(2 * radius + 1) - radius
     variances = []
@@ -140,7 +152,8 @@ def window_for(sigma_px: float) -> CentroidSettings:
 
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)
 def test_the_plain_windows_s_curve_is_that_of_theory(sigma_px):
-    # Alexander and Ng 1991, "Elimination of systematic error in subpixel accuracy centroid estimation": the first
+    # Alexander and Ng 1991, "Elimination of systematic error in subpixel accuracy centroid
+    # estimation": the first
     # harmonic of the sampled first moment; the second is exp(-8 pi^2 sigma^2) / (2 pi).
     settings = CentroidSettings(window="plain", window_radius_px=math.ceil(6 * sigma_px) + 1)
     theory = -np.exp(-2 * np.pi**2 * sigma_px**2) / np.pi * np.sin(2 * np.pi * PHASES_PX)
@@ -174,7 +187,8 @@ def test_the_s_curve_of_the_benchs_star_is_what_the_module_says():
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)
 def test_a_known_star_size_takes_the_s_curve_out(sigma_px, window):
     settings = replace(window_for(sigma_px), psf_sigma_px=(sigma_px, sigma_px), window=window)
-    if window == "plain":  # a narrower square cuts the star's wings, and jumps by what it cuts at half a pixel
+    # a narrower square cuts the star's wings, and jumps by what it cuts at half a pixel
+    if window == "plain":
         settings = replace(settings, window_radius_px=math.ceil(6 * sigma_px) + 1)
     assert np.abs(bias_px(sigma_px, settings)).max() < CORRECTED_PX
 
@@ -227,7 +241,8 @@ def test_stars_come_brightest_first_with_their_flux_peak_and_pixels():
     places = ((15.2, 15.4), (45.1, 15.3), (30.2, 44.9))
     image = sum(flux * star(*place, 0.8) for flux, place in zip(fluxes, places, strict=True))
     found = find_stars(image + 300.0, CentroidSettings(), LocalBackground(300.0, 10.0))
-    # The window is 4 px on each side: at 0.8 px of sigma and 0.45 px off its middle it cuts 4 sigmas off, under 1e-5.
+    # The window is 4 px on each side: at 0.8 px of sigma and 0.45 px off its middle it cuts 4
+    # sigmas off, under 1e-5.
     np.testing.assert_allclose(found.flux, sorted(fluxes, reverse=True), rtol=1e-5)
     np.testing.assert_allclose(found.x_px, [45.1, 30.2, 15.2], atol=0.0025)  # the S-curve at 0.8 px
     assert found.peak[0] == pytest.approx(image.max())
@@ -283,12 +298,15 @@ def test_the_background_is_found_under_stars_and_to_a_fraction_of_a_dn(gain_e_pe
     image = np.rint(sky / gain_e_per_dn).astype(np.uint16)
     found = estimate_background(image)
     noise_dn = math.hypot(noise_e / gain_e_per_dn, math.sqrt(1 / 12))
-    # 30 stars have some 30 pixels each within 3 sigma of the sky, 1 % of all, lifting the level by 1 % of 1.5 sigma and
-    # the noise by 2 %. Rounding of 0.5 DN of noise is not even: its first harmonic, exp(-2 pi^2 noise^2) / pi, is 0.002 DN.
-    # 3 sigma of whole codes cut up to half a code more on one side: 0.0044 / 2 DN.
+    # 30 stars have some 30 pixels each within 3 sigma of the sky, 1 % of all, lifting the level by
+    # 1 % of 1.5 sigma and
+    # the noise by 2 %. Rounding of 0.5 DN of noise is not even: its first harmonic, exp(-2 pi^2
+    # noise^2) / pi, is 0.002 DN. 3 sigma of whole codes cut up to half a code more on one side:
+    # 0.0044 / 2 DN.
     assert found.level == pytest.approx(1000.0 / gain_e_per_dn, abs=0.015 * noise_dn + 0.005)
     assert found.noise == pytest.approx(noise_dn, rel=0.04)
-    # The same in electrons, which are no whole numbers: most pixels share one value, and only the step tells their noise.
+    # The same in electrons, which are no whole numbers: most pixels share one value, and only the
+    # step tells their noise.
     in_electrons = estimate_background((image - 7.5) * gain_e_per_dn, gain_e_per_dn)
     assert in_electrons.level == pytest.approx((found.level - 7.5) * gain_e_per_dn, rel=1e-9)
     assert in_electrons.noise == pytest.approx(found.noise * gain_e_per_dn, rel=1e-9)

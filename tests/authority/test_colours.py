@@ -1,7 +1,8 @@
-"""What a coloured display does to each channel of a tracker, against sums on a fine grid that are not hilstar's.
+"""What a coloured display does to each channel of a tracker, against sums on a fine grid that are
+not hilstar's.
 
-Spectra of panels, sensors and stars are formulas here; what is summed is the light of the codes, through the panel's own
-formula, and the primaries' spectra through the sensor's.
+Spectra of panels, sensors and stars are formulas here; what is summed is the light of the codes,
+through the panel's own formula, and the primaries' spectra through the sensor's.
 """
 
 import numpy as np
@@ -16,8 +17,9 @@ from tests.unit.display.test_primaries import NM, PANELS, bump, written
 
 GRID_NM = np.arange(350.0, 1000.01, 0.5)
 SENSOR_NM = np.arange(350.0, 1001.0, 10.0)
-# Three sensors of three channels, the red of which reach the near infrared, as a colour camera's behind its cut filter do more
-# or less; the first channel of each is also a tracker of its own, as "mono" all of them are.
+# Three sensors of three channels, the red of which reach the near infrared, as a colour camera's
+# behind its cut filter do more or less; the first channel of each is also a tracker of its own, as
+# "mono" all of them are.
 SENSORS = {
     "narrow": {"r": bump(610, 45, SENSOR_NM), "g": bump(535, 45, SENSOR_NM), "b": bump(460, 40, SENSOR_NM)},
     "wide": {"r": bump(625, 70, SENSOR_NM), "g": bump(540, 75, SENSOR_NM), "b": bump(470, 65, SENSOR_NM)},
@@ -66,7 +68,9 @@ def bench(folder, panel, sensor, **render):
 
 
 def photons_of_panel(panel, curves):
-    """Each channel's electrons (channels, 3) by each primary, and the primaries' detected spectra (3, n)."""
+    """Each channel's electrons (channels, 3) by each primary, and the primaries' detected
+    spectra (3, n).
+    """
     glass = load_curve("n-bk7-10mm", "n-bk7-10mm")(GRID_NM)
     spectra = np.array([np.interp(GRID_NM, NM, one, left=0, right=0) for one in PANELS[panel]])
     seen = spectra * GRID_NM * glass
@@ -74,15 +78,20 @@ def photons_of_panel(panel, curves):
 
 
 def photons_of_stars(temperature_k, curves):
-    """Electrons (n, channels) of black bodies, in one unit for each star, and their detected spectra (n, grid)."""
+    """Electrons (n, channels) of black bodies, in one unit for each star, and their detected
+    spectra (n, grid).
+    """
     power = GRID_NM**-5 / np.expm1(0.0143877688 / (GRID_NM * 1e-9 * temperature_k[:, None]))
     seen = power * GRID_NM * load_curve("n-bk7-10mm", "n-bk7-10mm")(GRID_NM)
     ends = np.isin(GRID_NM, GRID_NM[[0, -1]])
-    return seen @ (curves * np.where(ends, 0.25, 0.5)).T, seen * curves.sum(axis=0)  # trapezia of 0.5 nm
+    # trapezia of 0.5 nm
+    return seen @ (curves * np.where(ends, 0.25, 0.5)).T, seen * curves.sum(axis=0)
 
 
 def drives(frame, opened):
-    """The drive (n, 3) of alone standing stars by the codes about them, with sRGB's own formula; and their rows."""
+    """The drive (n, 3) of alone standing stars by the codes about them, with sRGB's own formula;
+    and their rows.
+    """
     signal = frame.codes / (2.0**BITS - 1)
     light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
     rows = frame.truth
@@ -120,7 +129,8 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
         if clearly.any():  # no other mixture without negative light is nearer in electrons
             rng = np.random.default_rng(36)
             residual = np.square(shown - wanted).sum(axis=1)[clearly]
-            for _ in range(40):  # of a thousand stars: one that is not at its best is found by half of them
+            # of a thousand stars: one that is not at its best is found by half of them
+            for _ in range(40):
                 other = np.maximum(stars.primaries[clearly] * rng.normal(1, 0.05, (clearly.sum(), 3)), 0)
                 assert (
                     np.square((other / matrix.sum(axis=0)) @ matrix.T - wanted[clearly]).sum(axis=1) >= residual - 1e-12
@@ -150,7 +160,8 @@ def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, 
         np.testing.assert_allclose(stars.primaries.sum(axis=1), 1, rtol=1e-12)
         shown_nm = stars.primaries @ means[0]
         reach = np.clip(means[1], means[0].min(), means[0].max())
-        np.testing.assert_allclose(shown_nm, reach, atol=0.1)  # nm; beyond the reddest and bluest primary it is that one
+        # nm; beyond the reddest and bluest primary it is that one
+        np.testing.assert_allclose(shown_nm, reach, atol=0.1)
         drive, rows = drives(opened.frame(ORION_Q), opened)
         white = of_primaries.sum(axis=1) / of_primaries.sum()
         np.testing.assert_allclose(drive @ white, rows["electrons_per_s"], rtol=P95)
@@ -160,7 +171,9 @@ def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, 
 
 @pytest.mark.gpu
 def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_sky(tmp_path):
-    """A parabola about 560 nm, of which the mean wavelength says little: within the issue's 10 %."""
+    """A parabola about 560 nm, of which the mean wavelength says little: within the issue's 10
+    %.
+    """
     nm, at, side = np.linspace(420.0, 700.0, 6), np.arange(-8, 9) / 2, 1023
     places = [(x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm]
     lateral = [(1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y))) for x, y, one, _ in places]
@@ -179,7 +192,8 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
     spread, off, plain = (np.std(one) for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky))
     assert off < LATERAL * spread < plain
     means = of_primaries @ GRID_NM / of_primaries.sum(axis=1), of_stars @ GRID_NM / of_stars.sum(axis=1)
-    assert np.abs(shares @ means[0] - means[1]).max() < 60  # nm: the rest of the freedom stays near the star's colour
+    # nm: the rest of the freedom stays near the star's colour
+    assert np.abs(shares @ means[0] - means[1]).max() < 60
 
 
 def moved(nm):

@@ -9,7 +9,8 @@ from hilstar.basics.rotation import direction_of
 from hilstar.sky.constellations import constellation_of
 
 PLACES = 3000
-# Astropy precesses by way of the geocentre, with aberration: 20.5 arcsec. Places so near to a boundary may be across it.
+# Astropy precesses by way of the geocentre, with aberration: 20.5 arcsec. Places so near to a
+# boundary may be across it.
 NEAR_DEG = 2 * 20.5 / 3600
 STEPS = [(a * NEAR_DEG, b * NEAR_DEG) for a in (-1, 0, 1) for b in (-1, 0, 1)]
 

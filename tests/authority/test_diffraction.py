@@ -14,9 +14,11 @@ from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 
 poppy = pytest.importorskip("poppy")
 
-# A pupil of 256 samples across has grey edges: measured 3e-4 of the peak against 1024 samples of poppy.
+# A pupil of 256 samples across has grey edges: measured 3e-4 of the peak against 1024 samples of
+# poppy.
 EDGE = 1e-3
-# poppy's spiders have sharp edges on samples of 0.03 mm: 2.5 % of the spiders' 8 % of the pupil, in amplitude.
+# poppy's spiders have sharp edges on samples of 0.03 mm: 2.5 % of the spiders' 8 % of the pupil, in
+# amplitude.
 SPIDER = 5e-3
 BASE = {
     "aperture_mm": 30.0,
@@ -35,7 +37,9 @@ def image(per_px: int = 8, **keys) -> np.ndarray:
 
 
 def airy(nm: float, obstruction: float, per_px: int = 8) -> tuple[np.ndarray, float]:
-    """Born and Wolf, 8.6.2, eq. 24: an annular pupil; and the sum of its samples where all of its light is counted."""
+    """Born and Wolf, 8.6.2, eq. 24: an annular pupil; and the sum of its samples where all of
+    its light is counted.
+    """
     at_um = (np.arange(-4 * per_px, 4 * per_px + 1)) * 5.0 / per_px
     v = np.maximum(np.pi * np.hypot(at_um[None], at_um[:, None]) / (nm * 1e-3 * 2.0), 1e-9)
     e = obstruction
@@ -56,7 +60,9 @@ TERMS = {5: 60.0, 7: 80.0, 8: -50.0, 11: 40.0}
 
 
 def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
-    """poppy turns an image of its own right side up; here y is down, and with it the terms' sines."""
+    """poppy turns an image of its own right side up; here y is down, and with it the terms'
+    sines.
+    """
     terms = tuple(Term(kind="zernike", noll=noll, nm=nm) for noll, nm in TERMS.items())
     found = image(terms=terms, obstruction=0.3, spiders=4, spider_width_mm=0.6)
     coefficients = np.zeros(11)
@@ -77,7 +83,9 @@ def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
     [("W020", lambda x, y: (2 * x, 2 * y)), ("W040", lambda x, y: (4 * x * (x**2 + y**2), 4 * y * (x**2 + y**2)))],
 )
 def test_large_aberrations_have_the_second_moments_of_rays(kind, spread):
-    """Rays land at -R/a dW/dx. Diffraction adds a tail whose variance grows with the stamp, equal with and without it."""
+    """Rays land at -R/a dW/dx. Diffraction adds a tail whose variance grows with the stamp,
+    equal with and without it.
+    """
     at = (np.arange(400) + 0.5) / 200 - 1
     x, y = (part[np.hypot(*np.meshgrid(at, at)) <= 1] for part in np.meshgrid(at, at))
     widths = []
@@ -91,13 +99,16 @@ def test_large_aberrations_have_the_second_moments_of_rays(kind, spread):
 
 
 def test_coma_leads_to_the_axis_and_turns_with_the_field():
-    """W131 leads: rays go against its slope, towards the axis; their mean is at -R/a dW/dx, 2 F W131 / 2 along the field."""
+    """W131 leads: rays go against its slope, towards the axis; their mean is at -R/a dW/dx, 2 F
+    W131 / 2 along the field.
+    """
     stack = diffracted(Pupil(**(BASE | {"points": 3, "half_px": 8, "terms": (Term(kind="W131", nm=600.0),)})), 8)
     at_px = (np.arange(129) - 64) / 8
     for light, (x, y, *_) in zip(stack.images, stack.at, strict=True):
         off = np.array([x, y]) - 255.5
         mean = np.array([light.sum(axis=0) @ at_px, light.sum(axis=1) @ at_px]) / light.sum()
-        wanted = -off / np.hypot(255.5, 255.5) * 2 * 60 / 30 * 0.6 / 5.0  # the mean of rho^2 (1 + 2 cos^2) is 1
+        # the mean of rho^2 (1 + 2 cos^2) is 1
+        wanted = -off / np.hypot(255.5, 255.5) * 2 * 60 / 30 * 0.6 / 5.0
         assert mean == pytest.approx(wanted, abs=0.01)
 
 
@@ -112,7 +123,9 @@ RADIUS_PX = 4  # within which moments are compared
 
 
 def in_pixels(light: np.ndarray, per_px: int) -> np.ndarray:
-    """Samples of a stamp, integrated over the pixels of a star in a pixel's middle by the trapezoid rule."""
+    """Samples of a stamp, integrated over the pixels of a star in a pixel's middle by the
+    trapezoid rule.
+    """
     kernel = np.ones(per_px + 1) / per_px
     kernel[[0, -1]] /= 2
     spread = np.apply_along_axis(np.convolve, 1, np.apply_along_axis(np.convolve, 0, light, kernel, "same"), kernel, "same")
@@ -129,9 +142,12 @@ def moments(light: np.ndarray) -> np.ndarray:
 
 
 def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(rng):
-    """At places that are not the file's, by 13 wavelengths where the file has 5: flux 1e-3, centroid 0.003 px, widths 1 %."""
+    """At places that are not the file's, by 13 wavelengths where the file has 5: flux 1e-3,
+    centroid 0.003 px, widths 1 %.
+    """
     terms = (Term(kind="W131", nm=300.0), Term(kind="W222", nm=150.0), Term(kind="W220", nm=120.0), Term(kind="W040", nm=80.0))
-    terms += (Term(kind="W020", nm=0.0, per_nm=0.8), Term(kind="zernike", noll=7, nm=40.0))  # axial colour; decentred
+    # axial colour; decentred
+    terms += (Term(kind="W020", nm=0.0, per_nm=0.8), Term(kind="zernike", noll=7, nm=40.0))
     nodes_nm, fine_nm = (450.0, 525.0, 600.0, 675.0, 750.0), np.linspace(450, 750, 13)
     keys = BASE | {"points": 5, "wavelengths_nm": nodes_nm, "half_px": 6, "terms": terms, "focuses_um": (0.0, 8.0)}
     keys |= {"pixel_pitch_um": 3.0}

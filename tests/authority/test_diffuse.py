@@ -1,4 +1,6 @@
-"""Diffuse light against its own total: a disc of known flux, in any unit and projection, in electrons of the tracker."""
+"""Diffuse light against its own total: a disc of known flux, in any unit and projection, in
+electrons of the tracker.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from tests.support.benches import SMALL_BENCH
 
 RA_DEG, DEC_DEG, RADIUS_DEG, V_MAG_ARCSEC2 = 84.057, -1.2, 2.0, 18.0
 ARCSEC2 = 1 / 206_264.806**2
-# The issue's limit; 0.1 % by an edge that is a pixel of the map wide, 0.03 % by the bilinear places.
+# The issue's limit; 0.1 % by an edge that is a pixel of the map wide, 0.03 % by the bilinear
+# places.
 FLUX = 0.005
 # f_nu and f_lambda of V = 0 are tied at one wavelength, 545 nm.
 UNITS = ["mag/arcsec2", "mag/deg2", "W/(m2 um sr)", "erg/(s cm2 AA arcsec2)", "MJy/sr", "ph/(s m2 nm sr)"]
@@ -37,7 +40,9 @@ def light_of_disc() -> float:
 
 
 def write_disc(path: Path, unit: str = "mag/arcsec2", axes=("RA---TAN", "DEC--TAN"), centre=(RA_DEG, DEC_DEG), px_deg=0.02):
-    """A disc about `centre`, in a WCS image 5 deg wide, or wide enough for an image of the whole sky."""
+    """A disc about `centre`, in a WCS image 5 deg wide, or wide enough for an image of the whole
+    sky.
+    """
     n = 250 if px_deg < 0.5 else round(360 / px_deg)
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.cdelt = axes, [-px_deg, px_deg]
@@ -88,13 +93,16 @@ def test_a_disc_lies_where_its_coordinates_are(tmp_path):
     with Simulator(file) as tracker:
         seen = to_matrix(from_radec_roll_deg(RA_DEG + 2, DEC_DEG - 1, 70.0)) @ direction_of(RA_DEG, DEC_DEG)
         (x_px,), (y_px,) = tracker.camera.project((tracker.camera.cam_to_image @ seen)[None])
-        # A round disc's light is symmetric about its centre to second order in its radius, 2 deg: 0.06 % of 3 deg's 300 px.
+        # A round disc's light is symmetric about its centre to second order in its radius, 2 deg:
+        # 0.06 % of 3 deg's 300 px.
         assert (image * x).sum() / image.sum() == pytest.approx(x_px, abs=0.3)
         assert (image * y).sum() / image.sum() == pytest.approx(y_px, abs=0.3)
 
 
 def test_a_disc_smaller_than_a_pixel_has_its_flux_wherever_it_lies(tmp_path, rng):
-    """22 arcsec wide, 0.6 px: the Gaussian of the PSF, of sigma 0.62 px, leaves ripples of 2 %; without it they are 50 %."""
+    """22 arcsec wide, 0.6 px: the Gaussian of the PSF, of sigma 0.62 px, leaves ripples of 2 %;
+    without it they are 50 %.
+    """
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.cdelt = ("RA---TAN", "DEC--TAN"), [-0.0005, 0.0005]
     wcs.wcs.crval, wcs.wcs.crpix = (RA_DEG, DEC_DEG), [20.5, 20.5]
@@ -110,7 +118,9 @@ def test_a_disc_smaller_than_a_pixel_has_its_flux_wherever_it_lies(tmp_path, rng
 
 
 def test_other_projections_and_frames_have_the_same_light(tmp_path):
-    """Galactic coordinates, and an image of the whole sky, which becomes a cube: its coarse pixels have a coarser edge."""
+    """Galactic coordinates, and an image of the whole sky, which becomes a cube: its coarse
+    pixels have a coarser edge.
+    """
     place = SkyCoord(RA_DEG, DEC_DEG, unit="deg").galactic
     write_disc(tmp_path / "map.fits", axes=("GLON-SIN", "GLAT-SIN"), centre=(place.l.deg, place.b.deg))
     assert drawn_over_known(bench_in(tmp_path))[0] == pytest.approx(1, rel=FLUX)
@@ -127,7 +137,9 @@ def write_even_sky(path: Path) -> None:
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (45.0, 0.0), (45.0, 35.264), (10.0, 89.0), (179.5, -45.0)])
 def test_a_sky_of_one_brightness_has_no_seams(tmp_path, place):
-    """At a face's middle, on its edge, on the cube's corner, at a pole, and where the image's own edge lies."""
+    """At a face's middle, on its edge, on the cube's corner, at a pole, and where the image's
+    own edge lies.
+    """
     write_even_sky(tmp_path / "map.fits")
     file = bench_in(tmp_path)
     share, image = drawn_over_known(file, *place)
@@ -141,7 +153,9 @@ def test_a_sky_of_one_brightness_has_no_seams(tmp_path, place):
 
 
 def test_a_healpix_map_has_its_flux(tmp_path):
-    """In galactic coordinates, nested; a disc of nside 256's pixels, 14 arcmin wide, that the tracker's field holds."""
+    """In galactic coordinates, nested; a disc of nside 256's pixels, 14 arcmin wide, that the
+    tracker's field holds.
+    """
     healpix = pytest.importorskip("astropy_healpix")
     grid = healpix.HEALPix(256, "nested", frame="galactic")
     centre = SkyCoord(RA_DEG, DEC_DEG, unit="deg").galactic
@@ -169,7 +183,8 @@ def test_the_monitor_draws_what_passes_its_first_step_and_says_where_nothing_doe
         again = bench.light(bench.view(from_radec_roll_deg(RA_DEG + 1e-6, DEC_DEG, 0.0))).extended
         turned = bench.light(bench.view(from_radec_roll_deg(RA_DEG + 0.1, DEC_DEG, 0.0))).extended
         back = bench.light(bench.view(q)).extended
-        assert (first[0].image == back[0].image).all()  # whatever was drawn between: a replay has the same codes
+        # whatever was drawn between: a replay has the same codes
+        assert (first[0].image == back[0].image).all()
         assert len(first) == len(turned) == 1
         assert first[0] is again[0]  # the renderer has it already
         assert first[0] is not turned[0]
@@ -187,7 +202,9 @@ def test_the_monitor_draws_what_passes_its_first_step_and_says_where_nothing_doe
 
 
 def test_a_map_leaves_the_screen_over_any_edge(tmp_path):
-    """Step by step of a third of a cell: also where one row of cells' corners alone is near its light."""
+    """Step by step of a third of a cell: also where one row of cells' corners alone is near its
+    light.
+    """
     write_disc(tmp_path / "map.fits")
     with open_bench(bench_in(tmp_path)) as bench:
         cell_deg = np.degrees(16 / min(bench.camera.scales_px_rad()))
@@ -231,7 +248,9 @@ def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path, content):
 
 
 def test_the_map_of_a_catalogue_has_each_objects_magnitude_and_axes(tmp_path):
-    """Two rows in OpenNGC's form: a disc that lies at 35 deg from north to east, and a nebula; a cluster is left out."""
+    """Two rows in OpenNGC's form: a disc that lies at 35 deg from north to east, and a nebula; a
+    cluster is left out.
+    """
     (tmp_path / "NGC.csv").write_text(
         "Name;Type;RA;Dec;MajAx;MinAx;PosAng;B-Mag;V-Mag;Hubble\n"
         "NGC0224;G;00:42:44.35;+41:16:08.6;177.83;69.66;35;4.29;3.44;Sb\n"

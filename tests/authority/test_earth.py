@@ -1,4 +1,6 @@
-"""From the ICRS to a level frame on the Earth, against Astropy's frames and the matrix that the IERS publishes."""
+"""From the ICRS to a level frame on the Earth, against Astropy's frames and the matrix that the
+IERS publishes.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,17 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 
 MAS = np.radians(1 / 3.6e6)
-# Astropy interpolates the same table: s' (0.01 mas), the hour's interpolation and the rounding of a Time are left.
+# Astropy interpolates the same table: s' (0.01 mas), the hour's interpolation and the rounding of a
+# Time are left.
 ASTROPY_MAS = 0.05
-# The IERS's own parameters of that day were rapid ones: UT1 to 0.13 ms (2.0 mas), the pole to 0.4 mas.
+# The IERS's own parameters of that day were rapid ones: UT1 to 0.13 ms (2.0 mas), the pole to 0.4
+# mas.
 IERS_MAS = 3.0
-# AltAz has the light's aberration of the Earth's turning (0.32 arcsec at the equator), which is no part of an attitude.
+# AltAz has the light's aberration of the Earth's turning (0.32 arcsec at the equator), which is no
+# part of an attitude.
 DIURNAL_ARCSEC = 0.33
-POLE_RAD = np.radians(0.6 / 3600)  # the farthest that the pole of rotation is from the Earth's third axis
+# the farthest that the pole of rotation is from the Earth's third axis
+POLE_RAD = np.radians(0.6 / 3600)
 PLACES_DEG = [(0.0, 0.0), (48.1, 11.6), (-33.9, 151.2), (89.999, 12.0), (-89.999, -170.0), (90.0, 0.0), (-90.0, 180.0)]
 DATES = ["1975-03-01T12:34:56", "1999-12-31T23:59:59", "2016-12-31T23:30:00", "2024-02-29T06:00:00.25", "2026-11-22T10:00:00"]
 
@@ -67,7 +73,9 @@ def test_the_earths_axes_are_astropys(date):
 
 
 def test_the_earths_axes_are_those_that_the_iers_published():
-    """From hpiers.obspm.fr/eop-pc/products/matrice/matrice.php, with nutation, UT1 and pole switched on."""
+    """From hpiers.obspm.fr/eop-pc/products/matrice/matrice.php, with nutation, UT1 and pole
+    switched on.
+    """
     itrf_to_icrf = np.array(
         [
             [-0.600054079259, -0.799958492301, 0.001229861818],
@@ -82,7 +90,8 @@ def test_the_earths_axes_are_those_that_the_iers_published():
 @pytest.mark.parametrize("place", PLACES_DEG)
 @pytest.mark.parametrize("date", ["1999-12-31T23:59:59", "2026-11-22T10:00:00"])
 def test_a_star_stands_where_astropys_horizon_has_it(date, place):
-    star = SkyCoord(213.9, 19.2, unit="deg", frame=GCRS(obstime=Time(date, scale="utc")))  # a direction without parallax
+    # a direction without parallax
+    star = SkyCoord(213.9, 19.2, unit="deg", frame=GCRS(obstime=Time(date, scale="utc")))
     latitude_deg, longitude_deg = place
     site = EarthLocation.from_geodetic(longitude_deg, latitude_deg, 100.0)
     with warnings.catch_warnings():

@@ -1,7 +1,10 @@
-"""The errors that `effort` and `quantisation` = "auto" claim, against codes of the real renderer and a tracker of our own.
+"""The errors that `effort` and `quantisation` = "auto" claim, against codes of the real renderer
+and a tracker of our own.
 
-Nothing of the outside is hilstar's: a star is the exact integral of a Gaussian over pixels, codes become light
-by the formula of IEC 61966-2-1 or a power of 2.2, the tracker's optics and pixels are error functions, and its
+Nothing of the outside is hilstar's: a star is the exact integral of a Gaussian over pixels, codes
+become light
+by the formula of IEC 61966-2-1 or a power of 2.2, the tracker's optics and pixels are error
+functions, and its
 centroids are written here.
 """
 
@@ -21,15 +24,17 @@ SIZE_PX, STEP_PX, HALF_PX = (960, 540), 30, 12
 FRAMES = 3  # of 540 stars each
 FAINT_SHARE = 0.5  # of the stars looked at, which are the faintest tenth of those in the catalogue
 SUB = 6  # points along a lit pixel
-# The claim is of the worst star, by the worst of six centroiders; of 1600 stars by four of them the worst has 0.5 to 0.96 of
-# it. Where small sprites cut stars the claim is the sum of both parts' worst, at one star: 0.37 to 0.75 of it.
+# The claim is of the worst star, by the worst of six centroiders; of 1600 stars by four of them the
+# worst has 0.5 to 0.96 of it. Where small sprites cut stars the claim is the sum of both parts'
+# worst, at one star: 0.37 to 0.75 of it.
 MOST, MOST_CUT = 2.1, 3.0
 FRAME: dict[str, dict[str, object]] = {
     "tracker": {"resolution_px": [512, 512], "transmission": None},
     "monitor": {"resolution_px": list(SIZE_PX)},
     "collimator": {"focal_length_mm": 350},
 }
-# Bits, faintest V, tolerance (mag, px), calibration, effort, sigma of a sprite, pixel of the tracker (um; 11.5 are
+# Bits, faintest V, tolerance (mag, px), calibration, effort, sigma of a sprite, pixel of the
+# tracker (um; 11.5 are
 # as wide as the monitor's)
 BENCHES = [
     (8, 7.5, 0.05, 0.1, "srgb", "full", 0.85, 13),
@@ -61,7 +66,9 @@ def true_stamps(x, y, sigma):
 
 
 def seen_by_tracker(stamps, phases, pixel_px, blur_px):
-    """What pixels of a tracker collect of lit squares, and where those pixels are, monitor pixels from the square's middle."""
+    """What pixels of a tracker collect of lit squares, and where those pixels are, monitor
+    pixels from the square's middle.
+    """
     reach = math.ceil(HALF_PX / pixel_px)
     side = 2 * HALF_PX + 1
     points = (np.arange(side * SUB) + 0.5) / SUB - 0.5 - HALF_PX
@@ -76,7 +83,9 @@ def seen_by_tracker(stamps, phases, pixel_px, blur_px):
 
 
 def centroids(stamps, phases, pixel_px, blur_px, sigma_px, boxes):
-    """Centres of mass of all light, in 3 x 3 and 5 x 5 tracker pixels, and under a Gaussian that follows the star."""
+    """Centres of mass of all light, in 3 x 3 and 5 x 5 tracker pixels, and under a Gaussian that
+    follows the star.
+    """
     at = np.arange(-HALF_PX, HALF_PX + 1)
     light = stamps.sum(axis=(1, 2))
     found = {"moment": np.stack([stamps.sum(axis=1) @ at / light, stamps.sum(axis=2) @ at / light])}
@@ -103,7 +112,9 @@ def centroids(stamps, phases, pixel_px, blur_px, sigma_px, boxes):
 
 
 def worst_errors(bench, calibration, sigma, rng):
-    """The worst errors of lone stars that the real renderer draws: flux, mag, and place by each centroider, px."""
+    """The worst errors of lone stars that the real renderer draws: flux, mag, and place by each
+    centroider, px.
+    """
     bits, white = bench.config.monitor.bits, bench.flux_at_white_e_per_s
     rates = np.sort(bench.stars.electrons_per_s)
     rates = rates[rates * bench.psf.peak_share <= white]

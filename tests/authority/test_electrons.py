@@ -28,7 +28,9 @@ def planck(wavelength_nm: float, temperature_k: float | np.ndarray) -> float | n
 
 
 def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: str = "energy") -> float:
-    """Electrons per second of a V = 0 black body through 30 mm, CCD47-20 and N-BK7, by adaptive quadrature."""
+    """Electrons per second of a V = 0 black body through 30 mm, CCD47-20 and N-BK7, by adaptive
+    quadrature.
+    """
     qe_nm, qe = read("ccd47-20")
     glass_nm, glass = read("n-bk7-10mm")
     if zero_point == "vega":
@@ -46,7 +48,9 @@ def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: 
 
 
 def independent_rates(temperature_k: np.ndarray) -> np.ndarray:
-    """The same for many black bodies (n,) at once, each integrand in units of its value at 600 nm."""
+    """The same for many black bodies (n,) at once, each integrand in units of its value at 600
+    nm.
+    """
     qe_nm, qe = read("ccd47-20")
     glass_nm, glass = read("n-bk7-10mm")
     v_nm, v = read("johnson-v")
@@ -97,7 +101,9 @@ def test_five_magnitudes_are_a_factor_of_a_hundred(optics):
 
 
 def test_the_source_s_zero_point_is_a_quarter_low(optics):
-    """A 9602 K black body with the IAU's bolometric zero point has V = +0.33 (design, section 3)."""
+    """A 9602 K black body with the IAU's bolometric zero point has V = +0.33 (design, section
+    3).
+    """
     ratio = dgs_electrons_per_s(9602.0, optics, Photometry("iau-bolometric")) / dgs_electrons_per_s(
         9602.0, optics, Photometry()
     )
@@ -105,7 +111,9 @@ def test_the_source_s_zero_point_is_a_quarter_low(optics):
 
 
 def test_the_photon_weighting_costs_what_the_effective_wavelengths_say(optics):
-    """Against Vega's colour a 3000 K star loses the ratio of their effective wavelengths in V: 2.4 %."""
+    """Against Vega's colour a 3000 K star loses the ratio of their effective wavelengths in V:
+    2.4 %.
+    """
     cost = []
     for temperature_k in (3000.0, 9602.0):
         rates = [float(dgs_electrons_per_s(temperature_k, optics, Photometry("vega", w))) for w in ("energy", "photon")]
@@ -121,7 +129,8 @@ def test_the_photon_weighting_costs_what_the_effective_wavelengths_say(optics):
 def test_the_zero_point_is_that_of_vega_s_spectrum():
     """CALSPEC: Vega (V = 0.03) gives 989.5 photons/s/cm2/A at 550 nm."""
     photons = 3.631e-9 * 550e-7 / (h * 1e7 * c * 100) * 10 ** (-0.4 * 0.03)
-    # Bessell's flux is a mean over V, CALSPEC's one wavelength in it: their 2 % is the slope of an A0 spectrum.
+    # Bessell's flux is a mean over V, CALSPEC's one wavelength in it: their 2 % is the slope of an
+    # A0 spectrum.
     assert photons == pytest.approx(989.5, rel=0.02)
 
 

@@ -1,4 +1,6 @@
-"""Where a method fails on every machine: hilstar is right, the method named is not, and the tables that ship say so."""
+"""Where a method fails on every machine: hilstar is right, the method named is not, and the
+tables that ship say so.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from hilstar.sky.electrons import tabulate
 from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETECTOR_AND_ATTITUDE, field, sky
 
 CASES = (*CATALOGUE_AND_GEOMETRY, *DETECTOR_AND_ATTITUDE)
-# A failing method's figure is no matter of rounding; hilstar's own is, and is held by its tolerance.
+# A failing method's figure is no matter of rounding; hilstar's own is, and is held by its
+# tolerance.
 FAULT_SHARE = 0.01
 
 
@@ -86,7 +89,8 @@ def taken_as_it_is(_message):
     return AttitudeSample(1, field.START)
 
 
-# What a place would say if hilstar did as the method that fails there: the module's road is replaced by it.
+# What a place would say if hilstar did as the method that fails there: the module's road is
+# replaced by it.
 WRONG_ROADS = (
     (field.two_signs, "slerp", field.arccos_slerp),
     (field.antipodal, "slerp", field.arccos_slerp),

@@ -1,4 +1,6 @@
-"""Spectra by MK type: held-out library stars, bare and behind dust, and colours of Hipparcos that the choice did not use."""
+"""Spectra by MK type: held-out library stars, bare and behind dust, and colours of Hipparcos
+that the choice did not use.
+"""
 
 import numpy as np
 import pytest
@@ -16,16 +18,19 @@ from hilstar.sky.synthetic import ZERO_W_M2_M
 from tests.authority.test_pickles import BARE, REDDEST_VI_MAG, SENSORS
 from tests.support.benches import bench_text
 
-# 95 % of held-out stars: late M giants (the aim is 8 %; measured 5.5, 2.7, 6.4), the others (measured 1.5, 1.7, 1.4), and
-# all of V-I < 2.5 behind dust of E(B-V) = 0.5 (measured 1.3, 1.6, 1.4; by V-I 5.7, 4.5, 5.4).
+# 95 % of held-out stars: late M giants (the aim is 8 %; measured 5.5, 2.7, 6.4), the others
+# (measured 1.5, 1.7, 1.4), and all of V-I < 2.5 behind dust of E(B-V) = 0.5 (measured 1.3, 1.6,
+# 1.4; by V-I 5.7, 4.5, 5.4).
 LATE_GIANT_LIMIT, OTHERS_LIMIT, DUSTY_LIMIT = 0.08, 0.018, 0.018
 # Bare, without glass or filter: 11 % (by V-I 40 %) and 2.5 % (4.4 %).
 BARE_LATE_LIMIT, BARE_OTHERS_LIMIT = 0.12, 0.026
-# Error of B-V from type and V-I: 95 % of stars to V = 7.5 whose V-I is measured, mag, by subclass (by V-I alone 0.52, 0.34,
-# 0.11, 0.14, 0.17).
+# Error of B-V from type and V-I: 95 % of stars to V = 7.5 whose V-I is measured, mag, by subclass
+# (by V-I alone 0.52, 0.34, 0.11, 0.14, 0.17).
 HELD_OUT_BV_MAG = {(10, 20): 0.12, (20, 30): 0.12, (30, 40): 0.10, (40, 50): 0.15, (50, 60): 0.16}
-MEASURED_VI = [b"A", b"C", b"E", b"F", b"G"]  # field H42: Cousins, or transformed from other photometry in I
-M_GIANT_VI_MAG = 0.10  # median difference of V-I, M0 to M4 III, from that of the library's type. Measured: 0.08
+# field H42: Cousins, or transformed from other photometry in I
+MEASURED_VI = [b"A", b"C", b"E", b"F", b"G"]
+# median difference of V-I, M0 to M4 III, from that of the library's type. Measured: 0.08
+M_GIANT_VI_MAG = 0.10
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -56,7 +61,9 @@ def test_a_held_out_star_is_not_in_its_own_table():
 
 
 def test_dust_reddens_as_published():
-    """A(V) / E(B-V) = 3.1, and E(V-I) / E(B-V) = 1.38 to 1.28 of hot to cool stars: Bessell 1998 has 1.26 to 1.38."""
+    """A(V) / E(B-V) = 3.1, and E(V-I) / E(B-V) = 1.38 to 1.28 of hot to cool stars: Bessell 1998
+    has 1.26 to 1.38.
+    """
     library = bare_and_dusty()
     b, v = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("bessell-b", "johnson-v"))
     bv = magnitude(band_mean(library, b) / band_mean(library, v))

@@ -10,7 +10,8 @@ from tests.support.sources.nasa42 import BEGIN_NS, report
 DAY_2024_04_08 = 2_460_408.5
 TT_MINUS_UTC_S = 37 + 32.184
 SECONDS_PER_DAY = 86_400
-# 42's precession, nutation and sidereal time are of 1980 and take UT1 for UTC; PosN has seven digits. It comes to 4.6 arcsec.
+# 42's precession, nutation and sidereal time are of 1980 and take UT1 for UTC; PosN has seven
+# digits. It comes to 4.6 arcsec.
 MODELS_ARCSEC = 10.0
 # Precession since J2000 is 1220 arcsec in 2024: an N of date would be off by about as much.
 OF_DATE_ARCSEC = 1000.0

@@ -1,6 +1,8 @@
-"""The detector, measured as a laboratory would: photon transfer (Janesick 2007; EMVA 1288), and Poisson's own law.
+"""The detector, measured as a laboratory would: photon transfer (Janesick 2007; EMVA 1288), and
+Poisson's own law.
 
-Nothing here looks inside the detector: flats, darks and bias frames go in, gain, noise and non-uniformity come out.
+Nothing here looks inside the detector: flats, darks and bias frames go in, gain, noise and
+non-uniformity come out.
 `python -m tests.authority.test_photon_transfer` prints the figures.
 """
 
@@ -24,19 +26,24 @@ LEVELS_E = np.array([500.0, 2000.0, 5000.0, 10_000.0, 20_000.0, 30_000.0])
 FRAMES = 8  # per level, for maps
 
 # The issue's own limits. What the estimators below can do, with these frames:
-# - gain: a variance from 4 times 65536 differences is good to sqrt(2 / 262144) = 0.28 %, the mean of 6 levels to 0.11 %:
+# - gain: a variance from 4 times 65536 differences is good to sqrt(2 / 262144) = 0.28 %, the mean
+#   of 6 levels to 0.11 %:
 #   a margin of 9 sigmas.
-# - read noise: half of the relative error of the variance, 0.14 %, and the gain's 0.11 %: a margin of 28.
-# - PRNU, DSNU: 65536 pixels, 1 / sqrt(2 * 65536) = 0.28 %, and the subtraction of the noise left in the mean of 8 frames
+# - read noise: half of the relative error of the variance, 0.14 %, and the gain's 0.11 %: a margin
+#   of 28.
+# - PRNU, DSNU: 65536 pixels, 1 / sqrt(2 * 65536) = 0.28 %, and the subtraction of the noise left in
+#   the mean of 8 frames
 #   (PRNU at 30 000 e-: 61^2 against 900^2), nothing: a margin of 18.
-# - dark current: the mean of 65536 pixels that scatter by DSNU / dark = 30 %: 0.12 %, a margin of 40.
+# - dark current: the mean of 65536 pixels that scatter by DSNU / dark = 30 %: 0.12 %, a margin
+#   of 40.
 GAIN_TOLERANCE = 0.01
 READ_NOISE_TOLERANCE = 0.05
 PRNU_TOLERANCE = 0.05
 DARK_TOLERANCE = 0.05
 DSNU_TOLERANCE = 0.05
 
-# A sensor like the thesis's CCD47-20 (table 4.2), with a finer ADC: at 24 e-/DN, 2 e- of read noise are 0.08 DN, which
+# A sensor like the thesis's CCD47-20 (table 4.2), with a finer ADC: at 24 e-/DN, 2 e- of read noise
+# are 0.08 DN, which
 # no photon transfer can see under rounding.
 CCD = DetectorSettings(
     gain_e_per_dn=1.5,
@@ -82,7 +89,9 @@ def photon_transfer(settings: DetectorSettings, seed: int) -> dict[str, float]:
 
 
 def dark_frames(settings: DetectorSettings, exposure_s: float, seed: int) -> dict[str, float]:
-    """Dark current and DSNU (e-/s) of a sensor, from bias and dark frames; the gain is taken as known."""
+    """Dark current and DSNU (e-/s) of a sensor, from bias and dark frames; the gain is taken as
+    known.
+    """
     detector, rng = Detector(settings, SIZE_PX), np.random.default_rng(seed)
     bias, dark = (frames_dn(detector, 0.0, seconds, rng) for seconds in (0.0, exposure_s))
     e_per_s = settings.gain_e_per_dn / exposure_s
@@ -125,7 +134,8 @@ def test_prnu_is_proportional_to_the_signal():
 
 
 def test_the_adc_of_the_thesis_hides_its_read_noise():
-    # 2 e- at 24 e-/DN: the offset decides whether a bias frame shows any noise at all. At a half DN it is two codes.
+    # 2 e- at 24 e-/DN: the offset decides whether a bias frame shows any noise at all. At a half DN
+    # it is two codes.
     thesis = {"gain_e_per_dn": 24.0, "read_noise_e": 2.0}
     for offset_dn, codes in ((100.0, {100}), (100.5, {100, 101})):
         bias = Detector(DetectorSettings(offset_dn=offset_dn, **thesis), SIZE_PX).expose(
@@ -148,12 +158,14 @@ def test_electron_counts_follow_poissons_law(mean_e):
 
 
 def test_the_sampler_keeps_poissons_moments_up_to_the_largest_mean_that_is_taken():
-    # MAX_E is a claim about numpy's sampler, and 16 bits cannot show 1e12 +- 1e6: so the sampler itself is asked.
+    # MAX_E is a claim about numpy's sampler, and 16 bits cannot show 1e12 +- 1e6: so the sampler
+    # itself is asked.
     counts = np.random.default_rng(7).poisson(np.full(PIXELS, MAX_E)) - MAX_E
     sigma_e = math.sqrt(MAX_E)
     assert abs(counts.mean()) < 5 * sigma_e / math.sqrt(PIXELS)
     assert counts.std() == pytest.approx(sigma_e, rel=5 / math.sqrt(2 * PIXELS))
-    # The law's own skewness and excess kurtosis are 1e-6 and 1e-12; these are 5 errors of their estimates.
+    # The law's own skewness and excess kurtosis are 1e-6 and 1e-12; these are 5 errors of their
+    # estimates.
     assert abs(stats.skew(counts)) < 5 * math.sqrt(6 / PIXELS)
     assert abs(stats.kurtosis(counts)) < 5 * math.sqrt(24 / PIXELS)
 

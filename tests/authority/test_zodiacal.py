@@ -1,4 +1,6 @@
-"""Zodiacal light against Leinert's table 17 in directions by Astropy, its other unit (S10), and the thesis's integral."""
+"""Zodiacal light against Leinert's table 17 in directions by Astropy, its other unit (S10), and
+the thesis's integral.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ BENCH = SMALL_BENCH + f'[sky]\nepoch_utc = "{WHEN}Z"\nfaintest_v_mag = 1.0\n[bac
 LON_DEG, LAT_DEG = np.r_[0:50:5, 60:195:15], np.r_[0:35:5, 45:91:15]
 # Typed in from the paper's table 17: |longitude from the Sun|, |latitude|, 1e-8 W m-2 sr-1 um-1.
 PAPER = [(15, 0, 11500), (30, 0, 2480), (45, 15, 442), (60, 30, 183), (90, 0, 259), (90, 45, 104), (135, 60, 77), (180, 0, 230)]
-# The Sun by Astropy is apparent, and true of date against mean: 21 and 17 arcsec; the table falls by at most 16 % in a degree.
+# The Sun by Astropy is apparent, and true of date against mean: 21 and 17 arcsec; the table falls
+# by at most 16 % in a degree.
 SUN_PLACE = 0.002
 
 
@@ -60,7 +63,9 @@ def test_fifty_directions_by_astropy_have_the_tables_brightness(rng):
 
 
 def test_between_directions_it_is_within_the_error_that_is_stated():
-    """Every second longitude, or latitude, is found from its neighbours; at half the step the error is about a quarter."""
+    """Every second longitude, or latitude, is found from its neighbours; at half the step the
+    error is about a quarter.
+    """
     radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table())
     values = np.where(tabled, np.log(radiance), np.nan)
     errors = []
@@ -75,11 +80,14 @@ def test_between_directions_it_is_within_the_error_that_is_stated():
 
 
 def test_its_v_magnitude_is_that_of_the_papers_other_unit():
-    """60 S10 (stars of V = 10 to a square degree) at the pole, 202 at 90 degrees in the ecliptic (the paper's table 16)."""
+    """60 S10 (stars of V = 10 to a square degree) at the pole, 202 at 90 degrees in the ecliptic
+    (the paper's table 16).
+    """
     mean = v_mean(lambda nm: float(relative_spectrum(np.array([nm]))[0]), "energy")
     for radiance, s10 in ((77, 60), (259, 202)):
         v_mag = -2.5 * np.log10(radiance * 1e-2 * mean / VEGA_V0_W_M2_M / 206_264.806**2)
-        assert v_mag == pytest.approx(10 - 2.5 * np.log10(s10 / 3600**2), abs=0.05)  # 5 %; the tables have two digits
+        # 5 %; the tables have two digits
+        assert v_mag == pytest.approx(10 - 2.5 * np.log10(s10 / 3600**2), abs=0.05)
 
 
 def test_its_spectrum_is_table_19s_and_redder_near_the_sun():
@@ -90,13 +98,16 @@ def test_its_spectrum_is_table_19s_and_redder_near_the_sun():
     assert ratio == pytest.approx(
         [(1 - 1.2 * 0.09691) / (1 - 0.9 * 0.09691), 1, (1 + 0.8 * 0.25527) / (1 + 0.6 * 0.25527)], abs=1e-5
     )
-    # Equation 22 for sunlight and table 19 differ by 8 % in a silicon tracker: the paper's own two statements.
+    # Equation 22 for sunlight and table 19 differ by 8 % in a silicon tracker: the paper's own two
+    # statements.
     light = ZodiacalLight.through(Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "glass")))
     assert light.near_e_per_s_sr / light.far_e_per_s_sr == pytest.approx(1.017, abs=0.001)
 
 
 def test_its_electrons_are_those_of_sunlight_of_its_v_magnitude():
-    """One code for both: table 19 has 0.3 % more photons from 330 to 1100 nm than sunlight of the same V."""
+    """One code for both: table 19 has 0.3 % more photons from 330 to 1100 nm than sunlight of
+    the same V.
+    """
     perfect = Optics(2e3 / np.sqrt(np.pi), Curve(np.array([330.0, 1100.0]), np.ones(2)), Curve(np.empty(0), np.ones(1)))
     mean = v_mean(lambda nm: float(relative_spectrum(np.array([nm]))[0]), "energy")
     v_mag = -2.5 * np.log10(100 * 1e-2 * mean / VEGA_V0_W_M2_M / 206_264.806**2)
@@ -119,7 +130,9 @@ def look(simulator, dlon_deg: float, lat_deg: float):
 
 
 def test_a_frame_has_the_light_of_each_of_its_directions(simulator):
-    """In the middle by quadrature (thesis eq. 4.9 to 4.11). One value for a field at 45 deg is 30 % off."""
+    """In the middle by quadrature (thesis eq. 4.9 to 4.11). One value for a field at 45 deg is
+    30 % off.
+    """
     tracker = simulator.config.tracker
     mean_e = simulator.expose(look(simulator, 90.0, 0.0), None).mean_e
     qe_nm, qe = read("ccd47-20")
@@ -171,8 +184,9 @@ def test_a_bench_file_that_cannot_have_it_is_refused(tmp_path, before, after, sa
     assert said in str(error.value)
 
 
-# Orion's bench of the thesis, 25 degrees wide. Between 17 places a side, 0.0277 apart in tangent, light is linear: off by
-# 0.0277^2 / 8 times the second derivative of the cosine's cube, 3, in each of both directions.
+# Orion's bench of the thesis, 25 degrees wide. Between 17 places a side, 0.0277 apart in tangent,
+# light is linear: off by 0.0277^2 / 8 times the second derivative of the cosine's cube, 3, in each
+# of both directions.
 LATTICE_SHARE = 6e-4
 WIDE_BENCH = """[tracker]
 aperture_mm = 30
@@ -201,7 +215,9 @@ def triangle_sr(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
 
 
 def astropy_pixel_sr(x_px: int, y_px: int) -> float:
-    """The solid angle of a pixel between its four corners on the sky, which Astropy's tangent plane gives."""
+    """The solid angle of a pixel between its four corners on the sky, which Astropy's tangent
+    plane gives.
+    """
     plane = WCS(naxis=2)
     plane.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     plane.wcs.crval = [84.057, -1.2]

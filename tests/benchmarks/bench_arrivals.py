@@ -1,10 +1,13 @@
-"""When packets are stamped while a display draws: python -m tests.benchmarks.bench_arrivals [SECONDS] [zmq] [serial] [udp].
+"""When packets are stamped while a display draws: python -m tests.benchmarks.bench_arrivals
+[SECONDS] [zmq] [serial] [udp].
 
-One-way latency (the sender's CLOCK_MONOTONIC in the packet to hilstar's stamp, one machine, one clock) of 100 packets a
-second from a process of its own, for ZeroMQ, a serial line (a pty) and UDP, while 1000 stars are drawn 60 times a second:
-with the link read by a thread of the process that draws, and by a process of its own as `serve` has it, in turns; each
-beside a bare loop that receives the same packets and does nothing else. Then the same beside a busy process on each core.
-`--unprivileged` takes the right to real-time priority (CAP_SYS_NICE) from the process that serves, not from the sender.
+One-way latency (the sender's CLOCK_MONOTONIC in the packet to hilstar's stamp, one machine, one
+clock) of 100 packets a second from a process of its own, for ZeroMQ, a serial line (a pty) and UDP,
+while 1000 stars are drawn 60 times a second: with the link read by a thread of the process that
+draws, and by a process of its own as `serve` has it, in turns; each beside a bare loop that
+receives the same packets and does nothing else. Then the same beside a busy process on each core.
+`--unprivileged` takes the right to real-time priority (CAP_SYS_NICE) from the process that serves,
+not from the sender.
 """
 
 from __future__ import annotations
@@ -59,7 +62,9 @@ def bench_text(attitude: str) -> str:
 
 
 class Packets:
-    """Packets whose t_ns is put in last, at a microsecond's cost; a slow turn about the boresight."""
+    """Packets whose t_ns is put in last, at a microsecond's cost; a slow turn about the
+    boresight.
+    """
 
     def __init__(self) -> None:
         self._number = 0
@@ -95,7 +100,8 @@ def send(road: str, seconds: float) -> None:
             head, rest = packets.next()
             due_s += 1 / RATE_HZ
             time.sleep(max(0.0, due_s - time.monotonic()))
-            for put in puts if k % 2 else reversed(puts):  # the second is quicker: the first has woken the kernel for it
+            # the second is quicker: the first has woken the kernel for it
+            for put in puts if k % 2 else reversed(puts):
                 put(stamped(head, rest), where)
         sys.stdin.read()  # the roads stay open while there is somebody to read them
 
@@ -183,7 +189,9 @@ class Noting(LedgerSwitch):
 
 
 def show(bench_file: str, way: str, seconds: float) -> None:
-    """Draw for so long; print where packets are awaited, then the latencies and what the frames did."""
+    """Draw for so long; print where packets are awaited, then the latencies and what the frames
+    did.
+    """
     with load(bench_file) as bench, open_link(bench.config, Path(bench_file).parent, apart=way == "process") as link:
         print(link.endpoint, flush=True)
         noting = Noting()

@@ -1,9 +1,11 @@
-"""What the operator's page costs a run: missed frames and pacing with nobody looking, with two pages open, and under siege.
+"""What the operator's page costs a run: missed frames and pacing with nobody looking, with two
+pages open, and under siege.
 
-`python -m tests.benchmarks.bench_console [SECONDS]` measures all three in one run under Xvfb, turn by turn, so that whatever
-else the machine does falls on all of them. Xvfb stands for the display, at real-time priority where that is allowed, and the
-frames are drawn by the frame loop's own thread (LP_NUM_THREADS=0), which is at real-time priority too: other programs then
-hold up neither. Without a screen's own refresh the pacing is the program's. It says the machine's load.
+`python -m tests.benchmarks.bench_console [SECONDS]` measures all three in one run under Xvfb, turn
+by turn, so that whatever else the machine does falls on all of them. Xvfb stands for the display,
+at real-time priority where that is allowed, and the frames are drawn by the frame loop's own thread
+(LP_NUM_THREADS=0), which is at real-time priority too: other programs then hold up neither. Without
+a screen's own refresh the pacing is the program's. It says the machine's load.
 """
 
 from __future__ import annotations
@@ -65,7 +67,9 @@ def two_pages(page: PageAddress) -> Iterator[None]:
 
 @contextmanager
 def siege(page: PageAddress) -> Iterator[None]:
-    """Two hundred connections: half idle, half that send what is no request, and come again when they are closed."""
+    """Two hundred connections: half idle, half that send what is no request, and come again when
+    they are closed.
+    """
     stop = threading.Event()
 
     def attack(k: int) -> None:
@@ -90,7 +94,9 @@ KINDS = {"nobody": nobody, "two pages": two_pages, "200 connections": siege}
 
 
 class Turn(NamedTuple):
-    """What there was from when to when (host time, ns), and what the run and its page took of a core meanwhile, s."""
+    """What there was from when to when (host time, ns), and what the run and its page took of a
+    core meanwhile, s.
+    """
 
     kind: str
     begin_ns: int

@@ -1,4 +1,6 @@
-"""What the frame loop itself spends on the operator's page: python -m tests.benchmarks.bench_console_feed."""
+"""What the frame loop itself spends on the operator's page: python -m
+tests.benchmarks.bench_console_feed.
+"""
 
 from __future__ import annotations
 

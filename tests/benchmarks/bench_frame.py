@@ -1,4 +1,5 @@
-"""`hilstar benchmark` at 1920 x 1080, 1000 stars or `--stars N`: `python -m tests.benchmarks.bench_frame`.
+"""`hilstar benchmark` at 1920 x 1080, 1000 stars or `--stars N`: `python -m
+tests.benchmarks.bench_frame`.
 
 On demand, never in CI.
 """

@@ -1,7 +1,10 @@
-"""Whole frames of grey stars, of three primaries and of a tracker's glass, in turn, by image size and number of stars.
+"""Whole frames of grey stars, of three primaries and of a tracker's glass, in turn, by image size
+and number of stars.
 
-`python -m tests.benchmarks.bench_kinds [-o KINDS.csv] [--rounds N]`. On demand, never in CI: for a graphics card too.
-Times are of the wall clock, from the attitude to codes in memory; `times` is against grey frames of the same codes.
+`python -m tests.benchmarks.bench_kinds [-o KINDS.csv] [--rounds N]`. On demand, never in CI: for a
+graphics card too.
+Times are of the wall clock, from the attitude to codes in memory; `times` is against grey frames of
+the same codes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """A frame through a measured lens with a field of degree 6 against one through a pinhole, in turn.
 
-`python -m tests.benchmarks.bench_lens [--stars N] [--rounds N]`. On demand, never in CI. A lens moves stars and stretches their
-paths, so that the two frames differ in what they draw: `sprites` is what the lens itself costs.
+`python -m tests.benchmarks.bench_lens [--stars N] [--rounds N]`. On demand, never in CI. A lens
+moves stars and stretches their paths, so that the two frames differ in what they draw: `sprites` is
+what the lens itself costs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""One-way latency of both roads, beside the bare ones: python -m tests.benchmarks.bench_link [SECONDS]."""
+"""One-way latency of both roads, beside the bare ones: python -m tests.benchmarks.bench_link
+[SECONDS].
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,8 @@ def served(attitude: str, to: str, seconds: float, options: tuple[str, ...]) -> 
 
 def tell(name: str, sent: dict, summary: dict, bare_ms: np.ndarray) -> None:
     latency, packets, clock = summary["receive_latency_ms"], summary["packets"], summary["clock"]
-    least_ms = clock["offset_ms"] if clock["mode"] == "one-way" else 0.0  # both processes have one clock
+    # both processes have one clock
+    least_ms = clock["offset_ms"] if clock["mode"] == "one-way" else 0.0
     print(
         f"{name:24} sent {sent['sent']} of {sent['packets']} (corrupted {sent['corrupted']}, reordered {sent['reordered']}),"
         f" accepted {packets['accepted']}, refused {packets['refused_by']}\n"

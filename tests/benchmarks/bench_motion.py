@@ -1,4 +1,5 @@
-"""A turning frame against a still one, in turn: `python -m tests.benchmarks.bench_motion [--stars N]`.
+"""A turning frame against a still one, in turn: `python -m tests.benchmarks.bench_motion [--stars
+N]`.
 
 On demand, never in CI.
 """

@@ -1,9 +1,12 @@
-"""Processor time and memory against stars, pixels, workers, packets a second and hours: python -m tests.benchmarks.bench_scale.
+"""Processor time and memory against stars, pixels, workers, packets a second and hours: python -m
+tests.benchmarks.bench_scale.
 
-Writes results/scale.csv, and the tracker's rows of `hilstar benchmark` with a first frame as results/tracker.csv; `python
-results/charts.py` draws both. Each point is a process of its own, so that its peak of memory is its own. Times are of the
-processor, which other work on the machine changes least. Takes about ten minutes on two busy cores.
-With `ledger RUN.mcap HOURS` it only writes a ledger as its reports are timed with: a day's is 1.3 GB and takes 8 minutes.
+Writes results/scale.csv, and the tracker's rows of `hilstar benchmark` with a first frame as
+results/tracker.csv; `python results/charts.py` draws both. Each point is a process of its own, so
+that its peak of memory is its own. Times are of the processor, which other work on the machine
+changes least. Takes about ten minutes on two busy cores.
+With `ledger RUN.mcap HOURS` it only writes a ledger as its reports are timed with: a day's is 1.3
+GB and takes 8 minutes.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ FRAME_HZ, AXIS = 60, np.array([0.36, 0.48, 0.8])
 
 
 def spent(*command: str) -> tuple[str, float]:
-    """What a process of its own prints, and the seconds of processor time that it takes, its children's included."""
+    """What a process of its own prints, and the seconds of processor time that it takes, its
+    children's included.
+    """
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout is not None
         told = process.stdout.read()
@@ -53,14 +58,18 @@ def spent(*command: str) -> tuple[str, float]:
 
 
 def peak_mb() -> float:
-    """The peak of this process's memory. Not getrusage's, which is inherited from the process that started this one."""
+    """The peak of this process's memory. Not getrusage's, which is inherited from the process
+    that started this one.
+    """
     found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
     assert found is not None
     return int(found[1]) / 1024
 
 
 def frame(width: int, height: int, stars: int) -> tuple[float, float]:
-    """The processor time, ms, of a frame in `round` with so many stars in view, and the peak of memory, MB."""
+    """The processor time, ms, of a frame in `round` with so many stars in view, and the peak of
+    memory, MB.
+    """
     q = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -76,14 +85,18 @@ def frame(width: int, height: int, stars: int) -> tuple[float, float]:
 
 
 def report(path: str) -> tuple[float, float]:
-    """The processor time, ms, of reading a run's ledger, and the peak of memory, MB, without processes beside this one."""
+    """The processor time, ms, of reading a run's ledger, and the peak of memory, MB, without
+    processes beside this one.
+    """
     begin = time.process_time()
     assert figures_of(Path(path)).counted["frames"]
     return (time.process_time() - begin) * 1e3, peak_mb()
 
 
 class StepLedger(Ledger):
-    """A ledger whose writer makes a pass when it is told to, not five times a second by the clock."""
+    """A ledger whose writer makes a pass when it is told to, not five times a second by the
+    clock.
+    """
 
     def _run(self) -> None:
         """Leave the passes to `turn`."""
@@ -94,7 +107,9 @@ class StepLedger(Ledger):
 
 
 def write_ledger(path: Path, seconds: float) -> None:
-    """A run's ledger of FRAME_HZ frames and as many packets a second, as its recorder writes it, on a clock that is stepped."""
+    """A run's ledger of FRAME_HZ frames and as many packets a second, as its recorder writes it,
+    on a clock that is stepped.
+    """
     rng, count, now_ns = np.random.default_rng(1), round(seconds * FRAME_HZ), 10**12
     clock = SimpleNamespace(monotonic=lambda: now_ns / 1e9, monotonic_ns=lambda: now_ns, time_ns=time.time_ns)
     noise_ns = rng.integers(0, 10**5, (count, 2)).tolist()
@@ -137,7 +152,9 @@ def served(rate_hz: int) -> tuple[float, float]:
 
 
 def case_ms(workers: int) -> float:
-    """The time that a case takes each of so many workers, from the difference of a long and a short campaign."""
+    """The time that a case takes each of so many workers, from the difference of a long and a
+    short campaign.
+    """
     used = []
     for cases in CASES:
         with tempfile.TemporaryDirectory() as folder:
@@ -176,7 +193,9 @@ def measured() -> list[tuple[str, float, float, float]]:
 
 
 def first_frame_ms() -> list[float]:
-    """The processor time of processes that import hilstar and draw a frame of the benchmark's bench, and end."""
+    """The processor time of processes that import hilstar and draw a frame of the benchmark's
+    bench, and end.
+    """
     with tempfile.TemporaryDirectory() as folder:
         bench = own_bench_file(Path(folder) / "bench.toml", FULL_HD)
         q = map(repr, from_radec_roll_deg(*RADEC_ROLL_DEG).tolist())

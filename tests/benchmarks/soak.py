@@ -1,7 +1,9 @@
-"""Memory over a long run at 200 packets and 60 frames a second: python -m tests.benchmarks.soak [SECONDS] [BENCH.toml].
+"""Memory over a long run at 200 packets and 60 frames a second: python -m tests.benchmarks.soak
+[SECONDS] [BENCH.toml].
 
-The growth a day is a straight line through the memory that the run's own ledger recorded each second, without its first
-fifth. Its error is that of the line's slope over blocks of a twentieth, whose rests are not alike from second to second.
+The growth a day is a straight line through the memory that the run's own ledger recorded each
+second, without its first fifth. Its error is that of the line's slope over blocks of a twentieth,
+whose rests are not alike from second to second.
 The ledger's index of chunks grows too, and ends at 16 MB: it is said beside.
 """
 

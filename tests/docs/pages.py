@@ -1,8 +1,10 @@
-"""The fenced blocks of a Markdown page, and what a reader does with them. CONTRIBUTING.md says how pages are written for this.
+"""The fenced blocks of a Markdown page, and what a reader does with them. CONTRIBUTING.md says how
+pages are written for this.
 
-A block with `title="NAME"` is saved under that name. A console block's lines after `$ ` are run in that folder, those that end
-in `&` beside the next ones until the block's end; the lines between are what they print on stdout. Python is run. A bench
-file's tables are read. Only `<!-- not run: REASON -->` on the line before a block leaves it out.
+A block with `title="NAME"` is saved under that name. A console block's lines after `$ ` are run in
+that folder, those that end in `&` beside the next ones until the block's end; the lines between are
+what they print on stdout. Python is run. A bench file's tables are read. Only `<!-- not run: REASON
+-->` on the line before a block leaves it out.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ FENCE = re.compile(
     r"(?:^<!-- (?P<note>[^\n]*) -->\n)?^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?[^\n]*\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
-NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:\.\d+){2,}|-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")  # the first is a version, as 3.11.2
+# the first is a version, as 3.11.2
+NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:\.\d+){2,}|-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
 RELATIVE_ERROR = 0.01  # of a figure with a decimal point: drivers and processors round differently
 
 
@@ -75,8 +78,8 @@ def steps_of(text: str) -> list[Step]:
 def differs(shown: str, printed: str, figures_vary: bool) -> str | None:
     """Why `printed` is not what a page shows, or None where it is.
 
-    A line `...` stands for any lines, `...` within a line for any text. Whole numbers and versions must be the same, others
-    within RELATIVE_ERROR; with `figures_vary` any number will do.
+    A line `...` stands for any lines, `...` within a line for any text. Whole numbers and versions
+    must be the same, others within RELATIVE_ERROR; with `figures_vary` any number will do.
     """
     pattern = "".join(r"(?:.*\n)*?" if line == "..." else line_pattern(line) + "\n" for line in shown.splitlines())
     match = re.fullmatch(pattern, printed)

@@ -32,7 +32,8 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "configs" / "README.md", ROOT / "configs" / "CALIBRATION.md"]
 PAGES += [ROOT / "firmware_protocol" / "README.md", ROOT / "CONTRIBUTING.md"]
 EXAMPLES = {page: blocks for page in PAGES if (blocks := blocks_of(page.read_text()))}
-LANGUAGES = {"console", "python", "toml", "json", "text", "c"}  # no other shell's name: a console block is run
+# no other shell's name: a console block is run
+LANGUAGES = {"console", "python", "toml", "json", "text", "c"}
 DEFAULT_PORT = "5560"
 LISTEN = "0A"  # a state of /proc/net/tcp
 
@@ -110,7 +111,8 @@ def type_in(block: Block, port: str) -> None:
             words = shlex.split(step.command.replace(DEFAULT_PORT, port))
             if words[:2] == ["hilstar", "send"] and "--to" not in words:
                 words += ["--to", f"tcp://127.0.0.1:{port}"]
-            if words[:2] == ["hilstar", "campaign"]:  # each worker is a process, which takes a second to start
+            # each worker is a process, which takes a second to start
+            if words[:2] == ["hilstar", "campaign"]:
                 words += ["--workers", "1"]
             if step.beside:
                 beside.enter_context(running(words))
@@ -124,7 +126,9 @@ def type_in(block: Block, port: str) -> None:
 
 
 def hilstar(words: list[str]) -> str:
-    """What a hilstar command prints; it is run in this process, which saves a start of half a second."""
+    """What a hilstar command prints; it is run in this process, which saves a start of half a
+    second.
+    """
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         code = run(with_values(words))
     assert not code, f"exit code {code}: hilstar {' '.join(words)}"
@@ -150,7 +154,9 @@ def running(words: list[str]) -> Iterator[None]:
 
 
 def listens(port: int) -> bool:
-    """Whether somebody listens on a port of this machine; to connect would be to be taken for a listener."""
+    """Whether somebody listens on a port of this machine; to connect would be to be taken for a
+    listener.
+    """
     lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
     return any(line.split()[1].endswith(f":{port:04X}") and line.split()[3] == LISTEN for line in lines)
 

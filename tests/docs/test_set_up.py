@@ -1,4 +1,6 @@
-"""What has to be installed to run the tests is the same in the README, in CONTRIBUTING and in CI."""
+"""What has to be installed to run the tests is the same in the README, in CONTRIBUTING and in
+CI.
+"""
 
 from __future__ import annotations
 

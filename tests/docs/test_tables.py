@@ -11,7 +11,9 @@ PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("*.md"), *ROOT.glob("*/READM
 
 
 def torn_rows(text: str) -> list[str]:
-    """The paragraphs of a page that begin as a table's row: a blank line before them ended their table."""
+    """The paragraphs of a page that begin as a table's row: a blank line before them ended their
+    table.
+    """
     page = markdown.markdown(text, extensions=["tables", "fenced_code"])
     return re.findall(r"<(?:p|li)>\|[^\n]{0,80}", page)
 

@@ -1,4 +1,6 @@
-"""What the examples' tests share: a copy of the folder to run in, and the commands that its README gives."""
+"""What the examples' tests share: a copy of the folder to run in, and the commands that its
+README gives.
+"""
 
 from __future__ import annotations
 

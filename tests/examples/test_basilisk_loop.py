@@ -1,4 +1,6 @@
-"""Basilisk's controller before hilstar's display and tracker, as the example closes the loop: it slews and settles."""
+"""Basilisk's controller before hilstar's display and tracker, as the example closes the loop: it
+slews and settles.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,14 @@ import pytest
 from tests.examples.support import copied
 from tests.support.waiting import PATIENCE_S
 
-# 9 s of real time: 72 arcsec with a bandwidth of 0.6 rad/s have decayed to some arcsec by the last quarter; what is
-# left is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through the controller. Measured 0.3 to 3.6, and 3, with
-# half of the answers on a machine with eight times the work of its cores.
+# 9 s of real time: 72 arcsec with a bandwidth of 0.6 rad/s have decayed to some arcsec by the last
+# quarter; what is
+# left is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through the controller.
+# Measured 0.3 to 3.6, and 3, with half of the answers on a machine with eight times the work of its
+# cores.
 ACROSS_ARCSEC, ABOUT_ARCSEC = 10.0, 40.0
-# The loop is closed in real time: a machine that loses answers, or is late with them, flies another loop, of which nothing is
-# stated.
+# The loop is closed in real time: a machine that loses answers, or is late with them, flies another
+# loop, of which nothing is stated.
 MIN_ANSWERS, MAX_AGE_MS = 76, 250.0
 
 

@@ -1,4 +1,6 @@
-"""The Python sender with CURVE keys against `hilstar serve`: let in with its key, told where it is not."""
+"""The Python sender with CURVE keys against `hilstar serve`: let in with its key, told where it
+is not.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ def test_with_its_key_it_is_heard_and_with_another_it_is_told(tmp_path, monkeypa
     shutil.copy("keys/server.key", "strange/server.key")
 
     bench = folder / "curve_bench.toml"
-    endpoint = f"tcp://127.0.0.1:{free_port()}"  # the same keys, and nothing of a test is open to the network
+    # the same keys, and nothing of a test is open to the network
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
     assert EVERYWHERE in bench.read_text()
     bench.write_text(bench.read_text().replace(EVERYWHERE, endpoint))
     assert serve[1:4] == ["serve", bench.name, "--headless"]

@@ -19,7 +19,8 @@ from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
 STEP_S = 0.1
-# The trapezoidal rule's error in one step, h^3 / 12 times the largest second derivative of the rate, A/T (2 pi/T)^2.
+# The trapezoidal rule's error in one step, h^3 / 12 times the largest second derivative of the
+# rate, A/T (2 pi/T)^2.
 STEP_ERROR_RAD = STEP_S**3 / 12 * np.radians(20) / 20 * (2 * np.pi / 20) ** 2
 DIGITS_RAD = 1e-11  # of the file, in a difference of two attitudes
 

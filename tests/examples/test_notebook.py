@@ -1,4 +1,6 @@
-"""The notebook: its cells run in order in one namespace, and its plots show a sky that the catalogue agrees with."""
+"""The notebook: its cells run in order in one namespace, and its plots show a sky that the
+catalogue agrees with.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ import pytest
 
 from tests.examples.support import EXAMPLES, copied, section
 
-SIGMA_TOLERANCE = 0.3  # of 1: five standard errors of a standard deviation of 126 errors, 1 / sqrt(2 * 126)
+# of 1: five standard errors of a standard deviation of 126 errors, 1 / sqrt(2 * 126)
+SIGMA_TOLERANCE = 0.3
 
 
 @pytest.fixture

@@ -1,4 +1,6 @@
-"""The sender for MATLAB and Octave, in Octave: its packets bit for bit, and its stream into `hilstar serve`."""
+"""The sender for MATLAB and Octave, in Octave: its packets bit for bit, and its stream into
+`hilstar serve`.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ def test_its_stream_is_taken(tmp_path):
     with listening(bench, "bound to") as process:
         result = octave(call.replace("5560", str(port)).replace("10, ", "3, "))
         assert "sent 600" in result.stdout, result.stderr
-        assert any("the first attitude has come" in line for line in process.stderr)  # a busy machine begins to read late
+        # a busy machine begins to read late
+        assert any("the first attitude has come" in line for line in process.stderr)
         summary = interrupted(process)
     assert summary["packets"]["received"] == summary["packets"]["accepted"] == 600
     assert summary["clock"]["jumps"] == 0

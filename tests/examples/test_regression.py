@@ -1,4 +1,6 @@
-"""The user's own regression test: it passes on the golden frame's bench, and fails, and says why, on another sky."""
+"""The user's own regression test: it passes on the golden frame's bench, and fails, and says
+why, on another sky.
+"""
 
 from __future__ import annotations
 

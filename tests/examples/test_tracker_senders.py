@@ -1,4 +1,6 @@
-"""The examples of a tracker that answers, in C, C++ and Python: what they send is what hilstar reads."""
+"""The examples of a tracker that answers, in C, C++ and Python: what they send is what hilstar
+reads.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The two ways in which a software OpenGL draws levels: star by star, as it does, and by points, as a graphics card does."""
+"""The two ways in which a software OpenGL draws levels: star by star, as it does, and by points,
+as a graphics card does.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from hilstar.display.render.star_passes import LightUnits
 
 @pytest.fixture
 def on_llvmpipe() -> None:
-    """For what only a software OpenGL does: its threads, its image, the version that it is told to give."""
+    """For what only a software OpenGL does: its threads, its image, the version that it is told
+    to give.
+    """
     if not (drawn_by := gpus()[0].renderer).startswith("llvmpipe"):
         pytest.skip(f"{drawn_by} draws here")
 
@@ -23,7 +27,9 @@ def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def in_no_units(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sprites are blended as they are, as in frames with extended light: the image that is read is the one that is encoded."""
+    """Sprites are blended as they are, as in frames with extended light: the image that is read
+    is the one that is encoded.
+    """
     monkeypatch.setattr(LightUnits, "takes", staticmethod(lambda *target: False))
 
 

@@ -1,4 +1,6 @@
-"""Which GPU draws headless: EGL's list, the key that chooses from it, and what a wrong one is told."""
+"""Which GPU draws headless: EGL's list, the key that chooses from it, and what a wrong one is
+told.
+"""
 
 from __future__ import annotations
 

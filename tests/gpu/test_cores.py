@@ -1,4 +1,6 @@
-"""Which cores the threads of a software OpenGL are kept on; a process's first context begins them."""
+"""Which cores the threads of a software OpenGL are kept on; a process's first context begins
+them.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ while time.monotonic() < end_s:  # until the driver's threads have named themsel
     time.sleep(0.02)
 print(json.dumps(tasks()))
 """
-# On a busy machine a thread that has begun has no name of its own for some time: here for the first fifty looks at it.
+# On a busy machine a thread that has begun has no name of its own for some time: here for the first
+# fifty looks at it.
 NAMED_LATE = """
 from hilstar.basics.process import scheduling as cores
 threads, looks = cores._threads, iter(range(10**9))
@@ -38,7 +41,8 @@ ALL = sorted(os.sched_getaffinity(0))
 def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]:
     """Names of a new process's threads and the cores that they may run on."""
     run = [sys.executable, "-c", LOOK.format(before=before)]
-    own = {name: value for name, value in os.environ.items() if name != "LP_NUM_THREADS"}  # a campaign here has set it
+    # a campaign here has set it
+    own = {name: value for name, value in os.environ.items() if name != "LP_NUM_THREADS"}
     env = own | {"OPENBLAS_NUM_THREADS": "1"} | environment
     return json.loads(subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout)
 
@@ -46,7 +50,9 @@ def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]
 @pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize("before", ["", NAMED_LATE], ids=["at once", "named late"])
 def test_each_has_one_and_each_core_has_one_that_rasterises_and_one_that_computes(before):
-    """Where there are as many threads as cores: one core has nothing to part, and llvmpipe begins so many at most."""
+    """Where there are as many threads as cores: one core has nothing to part, and llvmpipe
+    begins so many at most.
+    """
     found = [(name, cores) for name, cores in threads(before) if ":" not in name]
     rasterisers = [cores for name, cores in found if name.startswith("llvmpipe-")]
     others = [cores for name, cores in found if not name.startswith("llvmpipe-")]
@@ -63,4 +69,5 @@ def test_where_threads_and_cores_are_not_as_many_they_stay_where_they_may(before
     """Several processes of one thread each would all be kept on the first core."""
     allowed = [ALL[0]] if before else ALL
     found = threads(before, **environment)
-    assert all(cores == allowed for name, cores in found if ":" not in name)  # the driver's own for its files is elsewhere
+    # the driver's own for its files is elsewhere
+    assert all(cores == allowed for name, cores in found if ":" not in name)

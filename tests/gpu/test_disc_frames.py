@@ -1,4 +1,6 @@
-"""Discs in frames: stars and bodies behind them, white, the edge of the screen, a turn, and every quantisation."""
+"""Discs in frames: stars and bodies behind them, white, the edge of the screen, a turn, and
+every quantisation.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ AT_START = View(np.array([1.0, 0.0, 0.0, 0.0]))
 SIZE, SIGMA, WHITE = (96, 80), (0.85, 0.85), 4e5
 CAMERA = Camera(SIZE, 900.0, (47.5, 39.5), np.eye(3))
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
-# The reference's own rays, five across a pixel, leave 0.3 % of a small crescent's light and 3 % of its brightest pixel.
+# The reference's own rays, five across a pixel, leave 0.3 % of a small crescent's light and 3 % of
+# its brightest pixel.
 FLUX_LIMIT, PIXEL_LIMIT = 0.01, 0.05
 
 
@@ -137,11 +140,14 @@ def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
         gl.draw(replace(none, extended=tuple(disc_lights(near, view, False))))
         alone = gl.linear().astype(float)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
-    assert got[38:44, 42:48] == pytest.approx(alone[38:44, 42:48], rel=1e-5)  # seven pixels within the limb
+    # seven pixels within the limb
+    assert got[38:44, 42:48] == pytest.approx(alone[38:44, 42:48], rel=1e-5)
 
 
 def test_a_disc_that_others_hide_as_a_whole_is_none():
-    """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last contact."""
+    """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last
+    contact.
+    """
     moon = disc(20.0, 170.0, (45.0, 41.0))
     for sun, seen in ((disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1), (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2)):
         layer = BodyLayer(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), Canvas(CAMERA, GaussianPsf(SIGMA)))
@@ -250,7 +256,9 @@ def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
 
 
 def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(bench):
-    """A turn of 3 degrees/s, 17 ms for a row: 0.9 px of this screen; a star at the Moon's middle is the truth for its place."""
+    """A turn of 3 degrees/s, 17 ms for a row: 0.9 px of this screen; a star at the Moon's middle
+    is the truth for its place.
+    """
     q, rate = aim(bench, "Moon"), np.array([0.0, np.radians(3.0), 0.0])
     scan = Scan(scanout_s=1 / 60, hold_s=1 / 60)
     layer = BodyLayer(bench.moving, bench.canvas)

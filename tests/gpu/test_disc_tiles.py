@@ -1,4 +1,6 @@
-"""A disc in tiles is the disc drawn whole, ray by ray: near the limb, the terminator, through a lens, and while it turns."""
+"""A disc in tiles is the disc drawn whole, ray by ray: near the limb, the terminator, through a
+lens, and while it turns.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ def test_light_and_cover_are_those_of_the_disc_drawn_whole(gl, name, monkeypatch
 
 @pytest.mark.parametrize("method", ["round", "dither", "exact"])
 def test_tiles_without_a_linear_image_have_its_levels(method, rng):
-    """Black, white and between, about sprites, the limb and the terminator; exact's stars are added to dither's levels."""
+    """Black, white and between, about sprites, the limb and the terminator; exact's stars are
+    added to dither's levels.
+    """
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as whole:
         stars = sprites_at(rng.uniform(0, SIZE, (12, 2)), 10.0 ** rng.uniform(4, 6, 12), whole.footprint_px)
         for name, white_share in (("low orbit, limb", 2e-3), ("low orbit, limb", 2.0), ("low orbit, terminator", 1e-2)):

@@ -1,4 +1,6 @@
-"""Discs of bodies on the GPU against rays in float64: light, limb and air, through a lens, near and far, small and vast."""
+"""Discs of bodies on the GPU against rays in float64: light, limb and air, through a lens, near
+and far, small and vast.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,9 @@ from tests.support.stars import sprites_at
 SIZE, SIGMA, FOCAL_PX = (64, 60), (0.85, 0.85), 3000.0
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
 SHARE = 0.6  # of Lommel-Seeliger
-# The issue's: 1 % of the light and 0.1 px of the limb. Where light varies over less than a pixel, a crescent's horns, single
-# pixels are within 3 % of the brightest; the truth's own rays scatter by 1 % there.
+# The issue's: 1 % of the light and 0.1 px of the limb. Where light varies over less than a pixel, a
+# crescent's horns, single pixels are within 3 % of the brightest; the truth's own rays scatter by 1
+# % there.
 FLUX_LIMIT, PLACE_LIMIT_PX, PIXEL_LIMIT = 0.01, 0.1, 0.04
 SUM_LIMIT = 0.004  # of the face's integral: measured 0.26 % at 140 degrees
 EARTH_KM, AIR = 6378.137, (8.0, 0.097)
@@ -75,7 +78,9 @@ def body_of(disc: Disc) -> Body:
 
 
 def limb_off_px(disc: Disc, cam: Camera, got: np.ndarray, truth: np.ndarray, lit_above: float = 0.3) -> np.ndarray:
-    """How far outward of the truth's an image has the limb, all round where the Sun shines on it."""
+    """How far outward of the truth's an image has the limb, all round where the Sun shines on
+    it.
+    """
     on = limb(body_of(disc), 72)
     across = on - (on @ disc.direction)[:, None] * disc.direction
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -130,7 +135,8 @@ def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
 def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px, aim_deg, lens):
     cam = camera(focal_px, lens)
     distance_km = EARTH_KM + altitude_km
-    angle = np.arcsin(EARTH_KM / distance_km) + np.radians(aim_deg)  # of the centre below the boresight
+    # of the centre below the boresight
+    angle = np.arcsin(EARTH_KM / distance_km) + np.radians(aim_deg)
     direction = np.array([0.05, np.sin(angle), np.cos(angle)])
     direction /= np.linalg.norm(direction)
     sun = sun_from(direction, 30.0)
@@ -157,6 +163,7 @@ def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     view = DiscView(cam, GaussianPsf(sigma_px), (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, GaussianPsf(sigma_px))) as gl:
         got = drawn(gl, *disc_lights(disc, view, covers=True))
-    truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)  # of the same middle
+    # of the same middle
+    truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
     assert np.abs(centroid_px(got) - centroid_px(truth)).max() < PLACE_LIMIT_PX

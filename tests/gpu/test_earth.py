@@ -1,4 +1,6 @@
-"""The Earth from low orbits to the Moon on the GPU against rays in float64: its limb, its light and its night."""
+"""The Earth from low orbits to the Moon on the GPU against rays in float64: its limb, its light
+and its night.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
 
 
 def scene(distance_km: float, focal_px: float, aim_rad: float, phase_deg: float) -> tuple[Disc, Body, Camera]:
-    """The Earth with its centre so far below the boresight, the Sun on the side of the limb in view."""
+    """The Earth with its centre so far below the boresight, the Sun on the side of the limb in
+    view.
+    """
     cam = Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3))
     towards = np.array([0.3 * np.sin(aim_rad), np.sqrt(1 - 0.09) * np.sin(aim_rad), np.cos(aim_rad)])
     side = np.array([0.2, -0.1, 1.0]) if aim_rad else np.array([1.0, 0.5, 0.0])

@@ -1,4 +1,6 @@
-"""What an observer above the Earth sees set: stars, the Moon and the Sun, through the air and behind the ground."""
+"""What an observer above the Earth sees set: stars, the Moon and the Sun, through the air and
+behind the ground.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from tests.support.ray_traced.bodies import Body, lambert, traced
 
 ALTITUDE_KM = 500.0
 ALNILAM = 26311
-# Of the air's share: heights above a stretched sphere, not above the spheroid (tests/unit/sky/bodies/test_disc.py)
+# Of the air's share: heights above a stretched sphere, not above the spheroid
+# (tests/unit/sky/bodies/test_disc.py)
 AIR_LIMIT = 0.02
 FLUX_LIMIT = 0.01
 T_NS = 0
@@ -41,7 +44,9 @@ def bench(tmp_path_factory) -> Iterator[Bench]:
 
 
 def above(direction: np.ndarray, height_rad: float, side: np.ndarray) -> np.ndarray:
-    """A place (3,), km, from which a direction is seen so far above the limb of a round Earth; the zenith is towards `side`."""
+    """A place (3,), km, from which a direction is seen so far above the limb of a round Earth;
+    the zenith is towards `side`.
+    """
     side = side - (side @ direction) * direction
     side /= np.linalg.norm(side)
     from_nadir = np.arcsin(EQUATOR_KM / (EQUATOR_KM + ALTITUDE_KM)) + height_rad

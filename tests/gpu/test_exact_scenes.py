@@ -1,4 +1,6 @@
-"""`exact` by the compute pass where it might fail: within the same limits as its NumPy oracle, and nearly its codes."""
+"""`exact` by the compute pass where it might fail: within the same limits as its NumPy oracle,
+and nearly its codes.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ from tests.support.exact_scenes import (
 
 pytestmark = pytest.mark.usefixtures("each_way")
 
-# Pixels that differ from the oracle's: of two choices that are as good it may take the other, and on 2 bits many are. Where
-# stars lie over each other a pixel that is nobody's by half stays rounded, which in NumPy the brighter one chooses.
+# Pixels that differ from the oracle's: of two choices that are as good it may take the other, and
+# on 2 bits many are. Where stars lie over each other a pixel that is nobody's by half stays
+# rounded, which in NumPy the brighter one chooses.
 OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
 
 
@@ -106,7 +109,9 @@ PAIRS = 400
 
 @pytest.mark.parametrize("sigma_px", [USUAL, NARROW])
 def test_codes_of_moving_neighbours_do_not_depend_on_the_order_of_stars(sigma_px):
-    """No pixel is two stars' own: threads that reach it in another order would choose another level."""
+    """No pixel is two stars' own: threads that reach it in another order would choose another
+    level.
+    """
     rng, size = np.random.default_rng(7), 20 * TILE
     middle = rng.uniform(10, size - 10, (2, PAIRS))
     apart = rng.uniform(2, 7, PAIRS) * np.exp(1j * rng.uniform(0, 2 * np.pi, PAIRS)) / 2

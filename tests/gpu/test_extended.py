@@ -1,4 +1,6 @@
-"""Light that is no star's: added, encoded and erased by every quantisation, and free where there is none."""
+"""Light that is no star's: added, encoded and erased by every quantisation, and free where there
+is none.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,12 @@ LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
 FLOAT32 = 2 * np.finfo(np.float32).eps
 # llvmpipe's pow is good to 2e-5.
 GLOW_LIMIT = 1e-4
-# Between nodes this strong lens is 0.01 px off; the glow falls by at most 3 of itself over its scale of 40 px.
+# Between nodes this strong lens is 0.01 px off; the glow falls by at most 3 of itself over its
+# scale of 40 px.
 GLOW_LENS_LIMIT = 0.01 * 3 / 40
-OTHER = 0.08  # of a star's pixels: of two choices that are as good GL may take the other (tests/gpu/test_exact_scenes.py)
+# of a star's pixels: of two choices that are as good GL may take the other
+# (tests/gpu/test_exact_scenes.py)
+OTHER = 0.08
 
 
 def camera(lens: Lens | None = None) -> Camera:
@@ -70,7 +75,9 @@ def test_a_map_is_added_to_the_stars_encoded_whole_and_gone_in_the_next_frame(me
 @pytest.mark.usefixtures("each_way")
 @pytest.mark.parametrize("uneven", [False, True])
 def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
-    """A star's light is the difference to the floor's; without light of its own a floor is that of `dither`."""
+    """A star's light is the difference to the floor's; without light of its own a floor is that
+    of `dither`.
+    """
     step_e = srgb_response(10).light[1] * WHITE
     target = target_of("exact", rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None)
     panel = target.panel()
@@ -92,7 +99,8 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
         assert np.abs(off).max() <= 1 and np.count_nonzero(off) <= OTHER * np.count_nonzero(plain)
         difference = both - shown_light(floor, panel)
         for px, py in np.rint(places).astype(int):
-            # Half a step of light: the method's own limit where steps are equal, as all are on an even panel.
+            # Half a step of light: the method's own limit where steps are equal, as all are on an
+            # even panel.
             assert abs(difference[py - 9 : py + 10, px - 9 : px + 10].sum() - 200 * step_e) < (1.2 if uneven else 0.6) * step_e
         gl.draw(some)
         assert (gl.levels() == plain).all()
@@ -107,7 +115,8 @@ def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
         shown = []
         for frame in range(4):
             gl.draw(none, frame)
-            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4  # ties alone
+            # ties alone
+            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4
             shown.append(shown_light(gl.levels(), panel))
             gl.draw(replace(few, extended=(light,)), frame)
             assert shown_light(gl.levels(), panel).sum() > shown[-1].sum() + 0.9 * few.data["electrons_per_s"].sum()

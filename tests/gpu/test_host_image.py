@@ -1,4 +1,6 @@
-"""The linear image in the process's own memory: that of rasterised sprites, the same bits each time, safe to keep."""
+"""The linear image in the process's own memory: that of rasterised sprites, the same bits each
+time, safe to keep.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA = (256, 192), (0.85, 0.85)
-# float32 shares of both ways are at most 1e-7 of a star's light off (scene/psf.py), and the sum of a few stars rounds.
+# float32 shares of both ways are at most 1e-7 of a star's light off (scene/psf.py), and the sum of
+# a few stars rounds.
 WAYS_LIMIT = 1e-6
 ROUNDING = 6e-8  # of float32, at each of the stars that meet in a pixel
 
@@ -41,7 +44,9 @@ def stars(gl: Renderer, count: int, rng: np.random.Generator, size=SIZE):
 
 @pytest.mark.parametrize("size", [SIZE, (255, 33), (7, 5), (640, 2)])
 def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
-    """Few are made black one by one, more by a clear; few are one band, more several, and the buffer grows."""
+    """Few are made black one by one, more by a clear; few are one band, more several, and the
+    buffer grows.
+    """
     with Renderer(Target(size, GaussianPsf(SIGMA))) as gl, Rasterised(Target(size, GaussianPsf(SIGMA))) as raster:
         assert raster._host is None
         for count in (3, 40, 2, 9000, 1, 300, 128, 129, 0, 40, 300, 131, 2, 0, 3):
@@ -88,7 +93,9 @@ def test_the_same_stars_give_the_same_bits_in_any_number_of_bands(gl, rng, monke
 
 @pytest.mark.parametrize("sigma", [SIGMA, (12.0, 12.0)])
 def test_no_star_is_lost_where_all_stand_in_one_band(sigma, rng):
-    """llvmpipe ends a shader's loops after 65 535 rounds in all: as many stars take several passes."""
+    """llvmpipe ends a shader's loops after 65 535 rounds in all: as many stars take several
+    passes.
+    """
     count = 30_000 if sigma == SIGMA else 700
     with Renderer(Target((512, 256), GaussianPsf(sigma))) as gl:
         pixels = rng.uniform([100, 122], [400, 124], size=(count, 2))

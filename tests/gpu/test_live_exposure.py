@@ -1,4 +1,6 @@
-"""The tracker before a running display sees what the campaign's tracker before the same display does, electron for electron."""
+"""The tracker before a running display sees what the campaign's tracker before the same display
+does, electron for electron.
+"""
 
 from __future__ import annotations
 

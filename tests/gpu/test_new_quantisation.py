@@ -1,4 +1,6 @@
-"""A quantisation that the package does not have: a class, a shader and a row in QUANTISERS, and everything draws by it."""
+"""A quantisation that the package does not have: a class, a shader and a row in QUANTISERS, and
+everything draws by it.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ PSF = GaussianPsf((0.85, 0.85))
 WHITE = 1e6
 FRAMES = 4
 TIES = 1e-4  # of lit pixels
-# Of lit pixels: of two choices of a star that are nearly as good the shader may take the other. Measured 0.011, and 0.39 from
-# the levels of `exact`.
+# Of lit pixels: of two choices of a star that are nearly as good the shader may take the other.
+# Measured 0.011, and 0.39 from the levels of `exact`.
 OTHER_CHOICE = 0.03
 SHADER = """
 uniform int turn;
@@ -38,7 +40,9 @@ bool rises(ivec2 pixel, float light, float low, float high) {
 
 
 class OrderedQuantiser(PixelQuantiser):
-    """Ordered dither by four thresholds along each row, which take turns: the mean of four frames is right to an eighth."""
+    """Ordered dither by four thresholds along each row, which take turns: the mean of four
+    frames is right to an eighth.
+    """
 
     words = "ordered dither."
 
@@ -92,7 +96,9 @@ def stars(count, rng, footprint_px):
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize("count", [150, 8000], ids=["under sprites", "whole image"])
 def test_a_new_pixel_quantiser_draws_its_oracle_s_levels_in_each_frame(count, mapped, rng):
-    """Pixel for pixel, but for light within float32 of a threshold, which a GL may round otherwise: none was seen."""
+    """Pixel for pixel, but for light within float32 of a threshold, which a GL may round
+    otherwise: none was seen.
+    """
     uniformity = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if mapped else None
     target = Target(SIZE, PSF, srgb_response(8), WHITE, "ordered", uniformity)
     oracle, sprites, drawn = OrderedQuantiser(target.panel(), SIZE, PSF), stars(count, rng, PSF.footprint_px), []

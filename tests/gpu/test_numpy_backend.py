@@ -17,8 +17,9 @@ from tools import same_codes
 EVERY, FRAMES = 4, 3  # of a log of ten attitudes: of bodies one before each of three
 LINEAR = 1e-6  # of a frame's brightest pixel, from stars: float32 and the GPU's erf
 BLOCK_PX = 16  # two stars wide: their light, whichever pixels show it
-# Lit pixels that may have another level. Without a choice between pixels only light within rounding of a threshold has one.
-# `exact` and `temporal` have many choices that are as good (see test_exact_scenes): of points few are taken otherwise,
+# Lit pixels that may have another level. Without a choice between pixels only light within rounding
+# of a threshold has one. `exact` and `temporal` have many choices that are as good (see
+# test_exact_scenes): of points few are taken otherwise,
 # of paths, whose sprites hand their errors on, many.
 TIES, CHOICES, PATHS = 1e-3, 0.12, 0.5
 OTHER = {
@@ -35,8 +36,9 @@ OTHER = {
 }
 
 
-# How much the errors of blocks of light may differ. With `effort` OpenGL cuts the wings of all stars within the tolerance,
-# by some levels next to a star over white; NumPy's `exact` has them whole, as where OpenGL lacks compute shaders.
+# How much the errors of blocks of light may differ. With `effort` OpenGL cuts the wings of all
+# stars within the tolerance, by some levels next to a star over white; NumPy's `exact` has them
+# whole, as where OpenGL lacks compute shaders.
 ERRORS, CUT_ERRORS = 0.12, 0.4
 
 

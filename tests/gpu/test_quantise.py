@@ -1,4 +1,6 @@
-"""The renderer's methods against their NumPy oracles, pixel for pixel, and the texture that a window would show."""
+"""The renderer's methods against their NumPy oracles, pixel for pixel, and the texture that a
+window would show.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +22,20 @@ from tests.support.stars import sprites_at
 SIZE = (256, 192)
 SIGMA = (0.85, 0.85)
 WHITE = 1e6
-# Of pixels that groups of stars light: light is within a few 64ths of a step under a threshold in as many of them.
+# Of pixels that groups of stars light: light is within a few 64ths of a step under a threshold in
+# as many of them.
 FLIPPED = 0.02
 GREY = srgb_response(8)
-UNIT = 2e-4  # of the faintest light that is shown: what light is rounded by where it is drawn star by star
+# of the faintest light that is shown: what light is rounded by where it is drawn star by star
+UNIT = 2e-4
 RESPONSES = {
     "srgb8": GREY,
     "srgb10": srgb_response(10),
     "gamma12": gamma_response(12),
     "stealing8": bit_stealing_response((GREY, GREY, GREY), (0.2126, 0.7152, 0.0722)),
 }
-# A GL may round light - low and its product with the threshold once more or less than NumPy: a tie is that near.
+# A GL may round light - low and its product with the threshold once more or less than NumPy: a tie
+# is that near.
 TIE = 4 * np.finfo(np.float32).eps
 
 
@@ -68,7 +73,9 @@ def assert_same_but_for_ties(found, expected, linear, panel):
 @pytest.mark.parametrize("method", ["round", "dither"])
 @pytest.mark.usefixtures("in_no_units")
 def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped, method, rng):
-    """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear image are one thing."""
+    """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear
+    image are one thing.
+    """
     target = target_of(response, method, uneven(rng) if mapped else None)
     panel = target.panel()
     with Renderer(target) as gl:
@@ -86,7 +93,9 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
 
 @pytest.mark.usefixtures("each_way")
 def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
-    """Groups of faint stars and bright ones: a star's light beyond its square is under a 32nd of what lights a pixel."""
+    """Groups of faint stars and bright ones: a star's light beyond its square is under a 32nd of
+    what lights a pixel.
+    """
     size, groups, each = (640, 480), 40, 16
     middles = rng.uniform([20, 20], [620, 460], size=(groups, 2))
     pixels = (middles[:, None] + rng.uniform(-8, 8, (groups, each, 2))).reshape(-1, 2)
@@ -121,7 +130,8 @@ def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
         assert len(np.unique(found)) > 100
 
 
-# The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
+# The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it
+# may take the other.
 OTHER_PIXELS = 0.03
 A_STAR = 32  # pixels: few stars may have one of them
 ERF = 2e-6  # of a star's light: what its pixels may differ by besides a step
@@ -159,7 +169,9 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
 
 @pytest.mark.usefixtures("each_way")
 def test_exact_paths_are_those_of_its_quantiser(rng):
-    """Streaks of up to 70 sprites, some over the edge: the same flux within a step of each, and as good."""
+    """Streaks of up to 70 sprites, some over the edge: the same flux within a step of each, and
+    as good.
+    """
     target = target_of(RESPONSES["srgb8"], "exact")
     panel, step = target.panel(), RESPONSES["srgb8"].light[1] * WHITE
     with Renderer(target) as gl:
@@ -181,7 +193,9 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
 
 @pytest.mark.usefixtures("each_way")
 def test_overlapping_stars_are_exact_together(rng):
-    """2000 stars over each other: light as right as that of the oracle, rounding is off by much more."""
+    """2000 stars over each other: light as right as that of the oracle, rounding is off by much
+    more.
+    """
     target = target_of(RESPONSES["srgb8"], "exact")
     panel = target.panel()
     sprites = sprites_at(
@@ -203,7 +217,9 @@ def test_overlapping_stars_are_exact_together(rng):
 
 @pytest.mark.usefixtures("each_way")
 def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
-    """A number not above the last one's, `begin_anew` and a blank frame begin a sequence; other drawings do not."""
+    """A number not above the last one's, `begin_anew` and a blank frame begin a sequence; other
+    drawings do not.
+    """
     with Renderer(target_of(GREY, "temporal")) as gl:
         sprites = stars(60, rng, gl.footprint_px)
 
@@ -240,7 +256,9 @@ def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
 
 
 def test_exact_and_round_draw_one_sky(rng):
-    """Two roads to one image: a pixel of `exact` is within a level of what `round` makes of the GPU's light."""
+    """Two roads to one image: a pixel of `exact` is within a level of what `round` makes of the
+    GPU's light.
+    """
     response = RESPONSES["srgb10"]
     with Renderer(target_of(response, "exact")) as gl:
         sprites = stars(60, rng, gl.footprint_px)

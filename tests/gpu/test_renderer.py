@@ -18,18 +18,20 @@ from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.sprites import Sprites
 from tests.support.stars import sprites_at
 
-# The issue's limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut (1e-6) the most of both.
+# The issue's limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut
+# (1e-6) the most of both.
 FLUX_LIMIT = 1e-5
 CENTROID_LIMIT_PX = 1e-4
-# A pixel's error relative to its star's flux: erf in float32 (sigma 0.4 px here) is at most 4.4e-7 off and the polynomials of
-# wider sprites 1e-7, so a share along one axis is too, and
+# A pixel's error relative to its star's flux: erf in float32 (sigma 0.4 px here) is at most 4.4e-7
+# off and the polynomials of wider sprites 1e-7, so a share along one axis is too, and
 # the other axis's share is 1 at most. Measured: 7e-8.
 PIXEL_LIMIT = 2 * 4.4e-7
 # Blending n stars in float32 rounds n times: for the few that overlap here.
 BLEND_LIMIT = 1e-6
 
 
-# A linear image beside codes is rasterised; alone, it is added up in the process's memory where this GL can (host_image.py).
+# A linear image beside codes is rasterised; alone, it is added up in the process's memory where
+# this GL can (host_image.py).
 BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alone"])
 
 
@@ -65,7 +67,8 @@ def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma, bi
         assert patch.sum() == pytest.approx(f, rel=FLUX_LIMIT)
         centroid_x = patch.sum(axis=0) @ np.arange(left, left + step) / patch.sum()
         centroid_y = patch.sum(axis=1) @ np.arange(top, top + step) / patch.sum()
-        # The centroid of the exact, infinite image is not the star itself but within 1e-4 px for sigma >= 0.4 ...
+        # The centroid of the exact, infinite image is not the star itself but within 1e-4 px for
+        # sigma >= 0.4 ...
         assert abs(centroid_x - exact_centroid(x, sigma[0])) < CENTROID_LIMIT_PX
         assert abs(centroid_y - exact_centroid(y, sigma[1])) < CENTROID_LIMIT_PX
 
@@ -120,7 +123,9 @@ def test_the_footprint_cuts_no_more_than_it_says():
 @pytest.mark.parametrize("count", [150, 8000])
 @pytest.mark.usefixtures("in_no_units")
 def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
-    """150 stars take the footprint pass, 8000 the full-screen pass: the codes of one linear image are one thing."""
+    """150 stars take the footprint pass, 8000 the full-screen pass: the codes of one linear
+    image are one thing.
+    """
     pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))
     flux = 10.0 ** rng.uniform(1, 7, count)
     target = target_of(bits=bits)
@@ -135,7 +140,8 @@ def test_overlapping_stars_add_up(bits, rng):
     pixels = np.full((1000, 2), 100.25) + rng.normal(scale=0.01, size=(1000, 2))
     linear, _, sprites = draw(target_of(bits=bits), pixels, np.ones(1000))
     oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
-    # 1000 additions round by up to half a step of the running sum each: 1000 x 6e-8 at the very worst.
+    # 1000 additions round by up to half a step of the running sum each: 1000 x 6e-8 at the very
+    # worst.
     assert np.abs(linear - oracle).max() / oracle.max() < 6e-5
     assert linear.sum(dtype=np.float64) == pytest.approx(1000, rel=6e-5)
 
@@ -179,7 +185,9 @@ def test_nothing_remains_of_the_frame_before(rng):
 @pytest.mark.parametrize("read", [False, True], ids=["unread", "light is read between"])
 @pytest.mark.usefixtures("each_way")
 def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
-    """Few are erased one by one, more by a clear, and those that cover the image by the pass itself."""
+    """Few are erased one by one, more by a clear, and those that cover the image by the pass
+    itself.
+    """
     size = (640, 480)
     with Renderer(target_of(size)) as gl, Renderer(target_of(size)) as fresh:
         for count in (3, 40, 2, 9000, 1, 300, 9000, 0, 40, 300, 2, 0, 3):

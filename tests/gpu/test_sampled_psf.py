@@ -1,4 +1,6 @@
-"""A sampled PSF on a real OpenGL against NumPy: in light and in levels, by every way that a frame is drawn."""
+"""A sampled PSF on a real OpenGL against NumPy: in light and in levels, by every way that a
+frame is drawn.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from tests.support.psfs import airy, coma, sampled
 from tests.support.stars import sprites_at
 
 SIZE = (160, 120)
-# float32 of a table's interpolation, in a pixel where a few stars meet, over the brightest star's flux. Measured: 2.1e-7.
+# float32 of a table's interpolation, in a pixel where a few stars meet, over the brightest star's
+# flux. Measured: 2.1e-7.
 PIXEL_LIMIT = 6e-7
 COMA, AIRY = SampledPsf(sampled(coma(), 5, 7), 5), SampledPsf(sampled(airy(1.5), 4, 12), 4)
 

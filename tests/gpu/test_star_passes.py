@@ -1,4 +1,6 @@
-"""Frames drawn star by star: the levels of the light within the stars' reach, in whatever order and after whatever frame."""
+"""Frames drawn star by star: the levels of the light within the stars' reach, in whatever order
+and after whatever frame.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
 PANELS = {"srgb6": srgb_response(6), "srgb8": srgb_response(8), "srgb10": srgb_response(10), "gamma8": gamma_response(8)}
-# Light is summed in float32 by blending, in whole units here: both round by that of what they sum, at most.
+# Light is summed in float32 by blending, in whole units here: both round by that of what they sum,
+# at most.
 FLOAT32 = 1e-6
 CUT = 1e-4  # of a star: what lies past a sprite two pixels smaller
 
@@ -79,7 +82,9 @@ def test_no_sum_is_too_large_for_its_pixel(count):
 
 
 def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
-    """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a step: the same as by points."""
+    """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a
+    step: the same as by points.
+    """
     bright = stars(20_000, rng, decades=(6, 7))
     for response, sprites in ((srgb_response(16), stars(300, rng)), (gamma_response(8, 3.0), bright)):
         target = Target(SIZE, GaussianPsf(SIGMA), response, WHITE)
@@ -91,7 +96,9 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
 
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
 def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
-    """Stars, none, few and many, too many for units, and extended light: each frame is as if it were the first."""
+    """Stars, none, few and many, too many for units, and extended light: each frame is as if it
+    were the first.
+    """
     target = Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
     few, many, bright = stars(9, rng), stars(600, rng), stars(20_000, rng, decades=(6, 7))
@@ -127,7 +134,9 @@ def test_no_pixel_outside_the_ellipse_has_more_than_its_share(sigma):
 
 
 def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
-    """Sides as `effort = "auto"` chooses them: a quarter of what lights a pixel, and nothing past the largest side."""
+    """Sides as `effort = "auto"` chooses them: a quarter of what lights a pixel, and nothing
+    past the largest side.
+    """
     response = PANELS["srgb8"]
     lit, size = response.threshold[0] * WHITE, GaussianPsf(SIGMA).footprint_px
     sides = (
@@ -153,7 +162,9 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
 
 @pytest.mark.parametrize("sigma", [(24.0, 24.0), (25.0, 25.0)])
 def test_the_largest_sprites_are_whole(sigma):
-    """A shader's loops may end early without a word: the largest sprites drawn star by star, and the smallest that are not."""
+    """A shader's loops may end early without a word: the largest sprites drawn star by star, and
+    the smallest that are not.
+    """
     target = Target((400, 300), GaussianPsf(sigma), PANELS["srgb8"], WHITE)
     with Renderer(target) as gl:
         assert (gl._units is not None) == (sigma[0] < 24.5)

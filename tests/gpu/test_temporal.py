@@ -1,4 +1,6 @@
-"""`temporal` on the GPU: its aims there, the same as the oracle frame by frame, and frames that NumPy draws in between."""
+"""`temporal` on the GPU: its aims there, the same as the oracle frame by frame, and frames that
+NumPy draws in between.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ SIZE = (TILE * SIDE, TILE * SIDE)
 SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / GaussianPsf(SIGMA).peak_share
 FRAMES = 6
 AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/display/test_temporal.py
-# The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
+# The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it
+# may take the other.
 OTHER_PIXELS = 0.03
 LEFT = 0.02
 UNEVEN = np.random.default_rng(5).uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
@@ -72,7 +75,9 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make
 @pytest.mark.parametrize("uniformity", [None, UNEVEN], ids=["even", "uneven"])
 @pytest.mark.parametrize("bits", [1, 8])
 def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
-    """Each frame begins with what the GPU's last one left; some stars go and come, and are half off the image."""
+    """Each frame begins with what the GPU's last one left; some stars go and come, and are half
+    off the image.
+    """
     target = Target(SIZE, GaussianPsf(SIGMA), table_response(bits, np.linspace(0, 1, 2**bits)), WHITE, "temporal", uniformity)
     panel, rng = target.panel(), np.random.default_rng(3)
     x, y = places()
@@ -87,7 +92,8 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
             assert (found != wanted).sum() <= OTHER_PIXELS * (wanted > 0).sum() + 4
             with gl.context:
                 left = gl._exact_passes[0].left
-            same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (some.star >= SIDE)  # and whole
+            # and whole
+            same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (some.star >= SIDE)
             assert same.mean() > 0.5
             assert np.abs(left.error - oracle.left.error)[:, same].max() < LEFT
             oracle.left = left
@@ -127,7 +133,9 @@ def test_paths_keep_their_light_over_the_frames():
 
 @pytest.mark.usefixtures("each_way")
 def test_frames_with_extended_light_go_on_where_others_stopped():
-    """A map lights the image in every second frame, by points drawn by NumPy: the light of all is right within a step."""
+    """A map lights the image in every second frame, by points drawn by NumPy: the light of all
+    is right within a step.
+    """
     panel = Panel(table_response(2, np.linspace(0, 1, 4)), WHITE)
     sprites = stars(*places(), 1.3 * WHITE / 3)
     none = replace(sprites, data=sprites.data[:0], star=sprites.star[:0], x_px=sprites.x_px[:0], y_px=sprites.y_px[:0])

@@ -1,4 +1,6 @@
-"""The codes of both ways to draw: star by star, as a software OpenGL does, and by points, as a graphics card does."""
+"""The codes of both ways to draw: star by star, as a software OpenGL does, and by points, as a
+graphics card does.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,16 @@ from tests.support.waiting import PATIENCE_S
 SIZE, WHITE, FRAMES = (640, 480), 1e6, 3
 USUAL = (0.85, 0.85)
 SRGB8 = srgb_response(8)
-# Of lit pixels, on one driver: both ways add the same whole units and do the same operations. Measured: none of 2 273 578.
-# Where three stars or more share a pixel of over 2^24 units, a blended float32 sum may be off by its last bit.
+# Of lit pixels, on one driver: both ways add the same whole units and do the same operations.
+# Measured: none of 2 273 578. Where three stars or more share a pixel of over 2^24 units, a blended
+# float32 sum may be off by its last bit.
 OTHER = 1e-4
 
 
 def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
-    """Stars all over the image and its edges, many faint ones and few that clip, or paths of `per_star` sprites."""
+    """Stars all over the image and its edges, many faint ones and few that clip, or paths of
+    `per_star` sprites.
+    """
     place = rng.uniform([-5, -5], [SIZE[0] + 5, SIZE[1] + 5], size=(count, 2))
     rate = 10**6.5 * 10 ** (-0.4 * 8 * rng.uniform(0, 1, count) ** 0.4)
     along = np.arange(per_star)
@@ -128,7 +133,9 @@ def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(quantisation, ch
 
 
 def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
-    """Frames with extended light are blended in both ways, those between them drawn in each one's own."""
+    """Frames with extended light are blended in both ways, those between them drawn in each
+    one's own.
+    """
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
     frames = [stars(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
     frames[1] = replace(frames[1], extended=(glow,))
@@ -138,7 +145,9 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
 @pytest.mark.parametrize("sigma_px", [(0.4, 0.4), USUAL, (1.2, 0.8)])
 @pytest.mark.usefixtures("each_way")
 def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
-    """`temporal` chooses among all near pixels, some of which lie a little beyond its reach: they are erased too."""
+    """`temporal` chooses among all near pixels, some of which lie a little beyond its reach:
+    they are erased too.
+    """
     frames = [stars(600, sigma_px, rng) for _ in range(12)]
     side = GaussianPsf(sigma_px).footprint_px
     for codes, sprites in zip(
@@ -197,7 +206,8 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     assert max(codes.max() for codes in first.values()) > 0
 
 
-ZINK = {"MESA_LOADER_DRIVER_OVERRIDE": "zink", "LIBGL_ALWAYS_SOFTWARE": "1"}  # over lavapipe, of Debian's mesa-vulkan-drivers
+# over lavapipe, of Debian's mesa-vulkan-drivers
+ZINK = {"MESA_LOADER_DRIVER_OVERRIDE": "zink", "LIBGL_ALWAYS_SOFTWARE": "1"}
 DRAW = """
 import sys
 import hilstar, numpy as np

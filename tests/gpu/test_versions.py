@@ -1,4 +1,6 @@
-"""OpenGL from 3.3 on: the newest is asked for, and what is said of it is so. Mesa gives the version that it is told to give."""
+"""OpenGL from 3.3 on: the newest is asked for, and what is said of it is so. Mesa gives the
+version that it is told to give.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,8 @@ for codes in ("round", "dither", "exact"):
     found[codes] = [int((drawn != oracle).sum()), int(abs(drawn - oracle).max()), int((oracle > 0).sum())]
 print(json.dumps(found))
 """
-# Of lit pixels, against the oracle: choices of `exact` have ties that the last bit decides, and the next primary follows.
+# Of lit pixels, against the oracle: choices of `exact` have ties that the last bit decides, and the
+# next primary follows.
 OTHER = {"round": 0.0, "dither": 1e-3, "exact": 0.03}
 
 

@@ -1,4 +1,6 @@
-"""No screen goes dark during a run, and what the X server was set to comes back, however the run ends."""
+"""No screen goes dark during a run, and what the X server was set to comes back, however the run
+ends.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +119,9 @@ def test_what_somebody_sets_meanwhile_is_prevented_and_comes_after(server, tmp_p
 
 
 class StandIn:
-    """Stands for libX11 and libXext before a server with DPMS: no server that runs without a monitor has it."""
+    """Stands for libX11 and libXext before a server with DPMS: no server that runs without a
+    monitor has it.
+    """
 
     def __init__(self) -> None:
         self.saver, self.level, self.on, self.calls = [600, 300, 1, 1], 3, 1, []

@@ -1,4 +1,6 @@
-"""The page's picture is what the display shows, with what an operator lays over it from the page."""
+"""The page's picture is what the display shows, with what an operator lays over it from the
+page.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tm
                 link.want(picture=True, hz=10)
 
                 def shown_anew() -> bool:
-                    """Whether the page's next picture is what the screen shows, and not what it showed before the switch."""
+                    """Whether the page's next picture is what the screen shows, and not what it
+                    showed before the switch.
+                    """
                     _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
                     if (seen and np.array_equal(seen[-1], levels)) or not np.array_equal(screen.pixels()[:, :, 0], levels):
                         return False

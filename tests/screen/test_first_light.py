@@ -1,4 +1,6 @@
-"""hilstar first-light on a real X server's screen: past the gate, then each pattern while a command takes its image."""
+"""hilstar first-light on a real X server's screen: past the gate, then each pattern while a
+command takes its image.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from tests.support.x11.diode import Diode
 from tests.support.x11.events import client
 
 ADDED_MS = 25.0
-MEDIAN_MS = 4.0  # a swap is on Xvfb's screen within 2 ms; the diode is a thread here, and a busy machine holds it up
+# a swap is on Xvfb's screen within 2 ms; the diode is a thread here, and a busy machine holds it up
+MEDIAN_MS = 4.0
 
 
 def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path):
@@ -67,7 +70,9 @@ def settled(screen):
 
 
 def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_path):
-    """The tracker's rows are reversed: the largest square is at the bottom left, which is the third of the keys."""
+    """The tracker's rows are reversed: the largest square is at the bottom left, which is the
+    third of the keys.
+    """
     bench = tmp_path / "bench.toml"
     bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
     command = [*HILSTAR, "first-light", str(bench), "-o", str(tmp_path / "s")]
@@ -100,7 +105,9 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
 
 @best_of_three("the diode is a thread of this process: while it has no core, it sees a light late")
 def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
-    """The command that takes images fails, so only what needs none is measured: what is added to the diode's line comes out."""
+    """The command that takes images fails, so only what needs none is measured: what is added to
+    the diode's line comes out.
+    """
     bench = tmp_path / "bench.toml"
     bench.write_text(bench_text({"monitor": {"resolution_px": [640, 480], "photodiode_px": 40, "scanout_ms": 0}}))
     with Cable(tmp_path) as cable, Diode(screen, cable.sender, ADDED_MS):

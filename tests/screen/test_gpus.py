@@ -16,7 +16,9 @@ from tests.support.x11.screens import xvfb
 
 @pytest.fixture(scope="module")
 def softpipe_screen(tmp_path_factory):
-    """A screen whose windows softpipe draws: GLX asks another driver than EGL's list begins with elsewhere."""
+    """A screen whose windows softpipe draws: GLX asks another driver than EGL's list begins with
+    elsewhere.
+    """
     with xvfb(tmp_path_factory.mktemp("softpipe")) as running:
         yield running
 

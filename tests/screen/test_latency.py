@@ -1,4 +1,6 @@
-"""Latency by a photodiode: a watcher of the X server's real frame buffer tells of edges over a real pty."""
+"""Latency by a photodiode: a watcher of the X server's real frame buffer tells of edges over a
+real pty.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from tests.support.wire.ptys import Cable
 from tests.support.x11.diode import Diode
 from tests.support.x11.screens import Screen, xvfb
 
-# The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
+# The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that
+# now and then.
 MIN_EDGES, MAX_UNMATCHED = 60, 0.05  # share of the edges
 MEDIAN_MS = 2.0
 ADDED_MS = 40.0
@@ -75,7 +78,9 @@ def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_cl
 
 
 def measured_undisturbed(*wanted, edges: int = MIN_EDGES) -> tuple[dict, Path]:
-    """A measurement in which the diode saw what was shown: the diode is a thread here, and a busy machine holds it up."""
+    """A measurement in which the diode saw what was shown: the diode is a thread here, and a
+    busy machine holds it up.
+    """
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         found, bench = measured(*wanted)
@@ -86,11 +91,14 @@ def measured_undisturbed(*wanted, edges: int = MIN_EDGES) -> tuple[dict, Path]:
 
 @best_of_three("the diode is a thread of this process: while it has no core, it sees a light late")
 def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen, tmp_path):
-    """The screen shows a swap within a millisecond; what is added to the diode's line comes out as the panel's delay."""
+    """The screen shows a swap within a millisecond; what is added to the diode's line comes out
+    as the panel's delay.
+    """
     plain, _ = measured_undisturbed(screen, tmp_path, "code", 0.0, False)
     in_time(abs(plain["latency_ms"]["p50"]) < MEDIAN_MS, plain)
     assert not plain["ambiguous"]
-    # Its line keeps this diode from looking for so long: not every edge is seen, and those that are, are as late as this.
+    # Its line keeps this diode from looking for so long: not every edge is seen, and those that
+    # are, are as late as this.
     late, bench = measured(screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml")
     added_ms = late["latency_ms"]["p50"] - plain["latency_ms"]["p50"]
     in_time(abs(added_ms - ADDED_MS) < MEDIAN_MS, (plain, late))
@@ -108,9 +116,11 @@ def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_o
     found, _ = measured_undisturbed(screen, tmp_path, "toggle", 0.0, True, edges=100)
     run = read_run(tmp_path / "run.mcap")
     steady = np.abs(np.diff([frame.swap_ns for frame in run.frames]) - PERIOD_NS) < STEADY_NS
-    # A busy machine swaps at uneven times, and they tell one pair of frames from the next as a code does.
+    # A busy machine swaps at uneven times, and they tell one pair of frames from the next as a code
+    # does.
     assert found["ambiguous"] or steady.mean() < 0.95
-    # The device's stamps are of its own clock; its least delay on the line, 1 ms here, is what a one-way line cannot tell.
+    # The device's stamps are of its own clock; its least delay on the line, 1 ms here, is what a
+    # one-way line cannot tell.
     in_time(abs(found["latency_ms"]["p50"] - 1.0) < MEDIAN_MS, found)
     assert [frame.marker for frame in run.frames] == [marker_light(frame.frame, "toggle") for frame in run.frames]
     assert run.process and run.process[0].resident_bytes > 1e6

@@ -1,4 +1,6 @@
-"""Which monitor this is, on a real X.Org server (dummy driver): a change is refused, and what is forced stays visible."""
+"""Which monitor this is, on a real X.Org server (dummy driver): a change is refused, and what is
+forced stays visible.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def first_identity(server: Xorg) -> MonitorIdentity:
 
 
 def ddcutil(folder: Path, brightness: int = 40, preset: int = 5) -> None:
-    """A stand-in for the program, whose answers are in the form of ddcutil 1.4.1; no such monitor was there."""
+    """A stand-in for the program, whose answers are in the form of ddcutil 1.4.1; no such
+    monitor was there.
+    """
     program = folder / "ddcutil"
     program.write_text(DDCUTIL.replace("'\n", f"' {brightness} {preset}\n"))
     program.chmod(0o755)
@@ -174,7 +178,8 @@ def test_calibrate_writes_the_monitor_that_this_machine_has(here, tmp_path):
         assert "measured on DEL DELL U2412M, serial CN0F00BAR123, on DUMMY0 at 640x480@59.94" in made.stderr
         assert tomllib.loads((tmp_path / written).read_text())["monitor_identity"]["serial"] == "CN0F00BAR123"
     path.write_text(path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [320, 240]"))
-    assert "measured on" not in run_hilstar_here("calibrate", *alignment).stderr  # another display than the bench's
+    # another display than the bench's
+    assert "measured on" not in run_hilstar_here("calibrate", *alignment).stderr
 
 
 def test_the_kernel_is_asked_where_x_gives_no_edid(tmp_path):
@@ -208,7 +213,9 @@ def test_old_files_are_refused_by_their_date_and_undated_or_built_in_ones_are_no
 
 @pytest.mark.parametrize(("days", "valid", "code"), [(180, 180, 0), (181, 180, 3), (181, 400, 0)])
 def test_a_monitor_that_says_nothing_is_doubted_and_its_files_grow_old(here, tmp_path, days, valid, code):
-    """`doctor` as an example: the files were measured on this connector and in this mode, and more is not known."""
+    """`doctor` as an example: the files were measured on this connector and in this mode, and
+    more is not known.
+    """
     when = TODAY - datetime.timedelta(days=days)
     told = run_hilstar_here("doctor", measured_bench(tmp_path, identity_here(0), when, f"calibration_valid_days = {valid}"))
     assert told.returncode == code, told.stderr

@@ -1,4 +1,6 @@
-"""Monitors that have names, gamma ramps and a refresh rate, and that come and go: a real X.Org server, dummy driver."""
+"""Monitors that have names, gamma ramps and a refresh rate, and that come and go: a real X.Org
+server, dummy driver.
+"""
 
 from __future__ import annotations
 
@@ -158,7 +160,9 @@ def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_pat
 
 
 def test_a_compositing_manager_is_refused(server, tmp_path):
-    """Owning the selection is what makes a compositing manager (EWMH): a real X client owns it here."""
+    """Owning the selection is what makes a compositing manager (EWMH): a real X client owns it
+    here.
+    """
     x11 = ctypes.CDLL("libX11.so.6")
     x11.XOpenDisplay.restype = ctypes.c_void_p
     x11.XOpenDisplay.argtypes = [ctypes.c_char_p]

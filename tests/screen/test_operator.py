@@ -1,4 +1,6 @@
-"""What an operator does to the window is in the record: the status, the ledger's frames and events, and --json."""
+"""What an operator does to the window is in the record: the status, the ledger's frames and
+events, and --json.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Settings of a display on a real X.Org server (dummy driver): wrong ones are refused, and their own advice mends them."""
+"""Settings of a display on a real X.Org server (dummy driver): wrong ones are refused, and their
+own advice mends them.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +123,8 @@ def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server
     assert "TearFree of DUMMY0 is on" in forced.stderr
     screen = json.loads(forced.stdout)["screen"]
     assert screen["output"]["properties"]["dithering mode"] == "auto"
-    assert screen["presented"] == "unknown" and screen["gamma"] == {"frames": 0, "s": 0.0}  # llvmpipe does not use Present
+    # llvmpipe does not use Present
+    assert screen["presented"] == "unknown" and screen["gamma"] == {"frames": 0, "s": 0.0}
     assert json.loads(read_run(ledger).head["output"])["properties"]["TearFree"] == "on"
 
 

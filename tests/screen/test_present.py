@@ -1,4 +1,6 @@
-"""What a window shows of a frame is what NumPy presents of it: turned, with aids, stolen bits and the photodiode's square."""
+"""What a window shows of a frame is what NumPy presents of it: turned, with aids, stolen bits
+and the photodiode's square.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""4 s on a 1080p window under Xvfb, over 200 stars, 200 Hz of packets: every frame accounted for, and what it shows is true."""
+"""4 s on a 1080p window under Xvfb, over 200 stars, 200 Hz of packets: every frame accounted
+for, and what it shows is true.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from tests.support.x11.screens import xvfb
 
 DURATION_S, REFRESH_HZ, PACKET_HZ = 4, 60, 200
 RATE_DEG_S = 0.5
-# A packet's rate is float32 of 0.0087 rad/s: 5e-10 of it, over at most 0.25 s of prediction; and the clock's own line, 5 us.
+# A packet's rate is float32 of 0.0087 rad/s: 5e-10 of it, over at most 0.25 s of prediction; and
+# the clock's own line, 5 us.
 POINTING_ARCSEC = 0.02
 ARCSEC_PER_RAD = 206_264.8
 
@@ -38,7 +41,8 @@ def run(tmp_path_factory) -> tuple[dict, Path]:
     text = resource_path("configs", "demo.toml").read_text()
     port = free_port()
     text = text.replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}").replace("faintest_v_mag = 7.5", "faintest_v_mag = 8.0")
-    text = text.replace('quantisation = "exact"', 'quantisation = "round"')  # frames in a row, on a busy machine too
+    # frames in a row, on a busy machine too
+    text = text.replace('quantisation = "exact"', 'quantisation = "round"')
     assert '"round"' in text
     bench, ledger = folder / "bench.toml", folder / "run.mcap"
     bench.write_text(text)
@@ -102,7 +106,8 @@ def test_the_report_says_it_on_one_page(run, tmp_path):
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     assert found["frames"] == summary["frames"] and found["missed_frames"] <= summary["missed_frames"]
-    assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"])  # None without a row
+    # None without a row
+    assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"])
     for key in ("attitude_age_ms", "packet_to_swap_ms", "swap_late_ms"):
         assert found[key]["p50"] is not None
     assert found["packets"]["accepted"] == summary["packets"]["accepted"]

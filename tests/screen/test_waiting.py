@@ -59,7 +59,8 @@ def test_another_thread_advances_while_a_frame_is_waited_for(screen):
     found = json.loads(ran.stdout)
     counted, waited_s = found.pop("finish")  # moderngl's own keeps the lock
     assert waited_s > MIN_WAITED_S
-    assert counted < MIN_SHARE * waited_s * 1000 / 10, (counted, waited_s)  # a turn before the call, and one after
+    # a turn before the call, and one after
+    assert counted < MIN_SHARE * waited_s * 1000 / 10, (counted, waited_s)
     for counted, waited_s in found.values():
         assert waited_s > MIN_WAITED_S
         assert counted > MIN_SHARE * waited_s * 1000

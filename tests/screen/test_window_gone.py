@@ -1,4 +1,6 @@
-"""An X server that dies and a window that another program takes away: the run ends in order, and says why."""
+"""An X server that dies and a window that another program takes away: the run ends in order, and
+says why.
+"""
 
 from __future__ import annotations
 

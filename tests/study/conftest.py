@@ -1,6 +1,8 @@
-"""Every chart that a study draws in these tests is looked at as it is saved, and saved as PNG alone.
+"""Every chart that a study draws in these tests is looked at as it is saved, and saved as PNG
+alone.
 
-That a chart without an ending becomes a PNG and an SVG is held by test_study_charts.py; an SVG takes as long as its PNG.
+That a chart without an ending becomes a PNG and an SVG is held by test_study_charts.py; an SVG
+takes as long as its PNG.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ from hilstar.instruments.study.sweep import Load, OtherWork
 
 @pytest.fixture(scope="package", autouse=True)
 def idle_machine() -> Iterator[None]:
-    """Studies of times take this machine for an idle one; test_other_work.py measures, and plants a busy one."""
+    """Studies of times take this machine for an idle one; test_other_work.py measures, and
+    plants a busy one.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OtherWork, "load", lambda self: Load())
         yield
@@ -25,7 +29,8 @@ def idle_machine() -> Iterator[None]:
 
 @pytest.fixture(scope="package", autouse=True)
 def every_chart_is_legible() -> Iterator[None]:
-    """No text over another or off the canvas, no curve without a name, no figure in a title that is not drawn.
+    """No text over another or off the canvas, no curve without a name, no figure in a title that is
+    not drawn.
 
     See tests/support/figures.py.
     """
@@ -41,5 +46,6 @@ def every_chart_is_legible() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(charts, "save", looked_at)
-        patch.setattr(charts, "PNG_DPI", 100)  # the figure's own: half the pixels, and texts are measured once
+        # the figure's own: half the pixels, and texts are measured once
+        patch.setattr(charts, "PNG_DPI", 100)
         yield

@@ -1,4 +1,6 @@
-"""Beside other work no study that draws times names a winner: each of them is run on a machine that is planted as busy."""
+"""Beside other work no study that draws times names a winner: each of them is run on a machine
+that is planted as busy.
+"""
 
 from __future__ import annotations
 

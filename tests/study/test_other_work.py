@@ -19,7 +19,8 @@ def test_processes_that_are_not_this_one_s_are_counted_while_they_run():
     work = OtherWork()
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(CORES)]
     try:
-        wait_for(lambda: Load(work.cores()).busy, "nothing else ran")  # a child counts as its own only once it has ended
+        # a child counts as its own only once it has ended
+        wait_for(lambda: Load(work.cores()).busy, "nothing else ran")
     finally:
         for process in busy:
             process.kill()

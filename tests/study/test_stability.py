@@ -1,4 +1,6 @@
-"""The study of stability: hilstar is right wherever it draws, the methods named there are not, and a verdict can be wrong."""
+"""The study of stability: hilstar is right wherever it draws, the methods named there are not,
+and a verdict can be wrong.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,8 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
         assert float(row["error"]) <= float(row["tolerance"])
         assert not float(row["its error"]) <= float(row["tolerance"])
     peaks = {float(row["sigma_px"]): float(row["sampled_peak_error"]) for row in table(folder / "narrow_stars.csv")}
-    assert all(peak > 0.02 for peak in peaks.values())  # a Gaussian's middle is over the mean of its pixel
+    # a Gaussian's middle is over the mean of its pixel
+    assert all(peak > 0.02 for peak in peaks.values())
     assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(0.12, abs=0.02)
     for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
         assert_drawn(folder / f"{stem}.png")
@@ -86,7 +89,8 @@ def rounded_codes(scene):
     return image.codes_of(scene, "round")
 
 
-# What a place would say if hilstar did as the method that fails there: the module's road is replaced by it.
+# What a place would say if hilstar did as the method that fails there: the module's road is
+# replaced by it.
 WRONG_ROADS = (
     (image.narrow_star, "by_renderer", rendered_by(image.point_sampled)),
     (image.popping, "by_renderer", rendered_by(image.point_sampled)),

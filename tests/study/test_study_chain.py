@@ -1,4 +1,6 @@
-"""The whole chain: its table's fronts, its errors against what they must be, its budgets, and what the command refuses."""
+"""The whole chain: its table's fronts, its errors against what they must be, its budgets, and
+what the command refuses.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +52,11 @@ tolerance_mag = 0.01  # sprites of 8 px: what edges of 6 cut, `exact` makes up f
 tolerance_px = 0.05
 """
 PLAN = Rounds(exposures=1, time_s=0.05)
-# The centroider's own error for stars of sigma 1.05 px is 0.0012 px in the median (0.05 arcsec); a display's is ten times that.
+# The centroider's own error for stars of sigma 1.05 px is 0.0012 px in the median (0.05 arcsec); a
+# display's is ten times that.
 FLOOR_PX = 0.005
-# A long path's middle is its mean to the second order of the field: 1 deg/s over 0.1 s in a field of 3 degrees.
+# A long path's middle is its mean to the second order of the field: 1 deg/s over 0.1 s in a field
+# of 3 degrees.
 PATH_FLOOR_PX = 0.01
 # Of an error by a late attitude, whatever the codes do: they add 1 arcsec rms to 140.
 LATE_SHARE = 0.02
@@ -85,7 +89,8 @@ def study(tmp_path_factory):
     """What the command prints of the small bench, and the folder of its files."""
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)
-    with pytest.MonkeyPatch.context() as patch:  # two frames of each combination: no claim here is of a time
+    # two frames of each combination: no claim here is of a time
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "MIN_ROUNDS", 2)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
         patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
@@ -126,7 +131,9 @@ def test_auto_and_default_are_each_one_point_of_each_scene(study):
 
 
 def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
-    """Each PSF that may stand for it, the more components the nearer, and the whole is right to 1e-3 px."""
+    """Each PSF that may stand for it, the more components the nearer, and the whole is right to
+    1e-3 px.
+    """
     monkeypatch.setattr(chain_glass, "QUICK_TIME_S", 0.1)
     write_glass(tmp_path / "psf.fits", glass_of(stack(3)))
     tracker = "[tracker]\nfocal_length_mm = 12\nresolution_px = [256, 256]"
@@ -195,7 +202,8 @@ def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
     (judge,) = scene.judges
     moved_px = math.radians(10.0) * predictors.AXIS[0] * bench.camera.focal_length_px
     share = moved_px * bench.scan.scanout_s / bench.camera.resolution_px[1]
-    # A star of equal light in each frame would be too faint by that share; what is left is its part of the ends' frames.
+    # A star of equal light in each frame would be too faint by that share; what is left is its part
+    # of the ends' frames.
     ends = share * bench.scan.hold_s / judge.seen.length_s
     assert len(judge) > 2 and ends < share / 5
     assert error_budget(scene, scene.marks.auto)[0].error_mag < MAG_PER_RELATIVE * ends
@@ -239,7 +247,9 @@ def planted(**figures) -> CombinationRow:
 
 @pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
 def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, place):
-    """The slowest or fastest point, the worst or best of them, is the default, and the one beside it auto."""
+    """The slowest or fastest point, the worst or best of them, is the default, and the one
+    beside it auto.
+    """
     time_ms, error = sorted((1.0, 9.0))[place[0]], sorted((0.1, 900.0))[place[1]]
     rows = [planted(time_ms=t, error_arcsec=e) for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
     rows += [planted(time_ms=time_ms * k, error_arcsec=error, chosen=name) for name, k in (("default", 1), ("auto", 1.01))]
@@ -301,7 +311,8 @@ def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
 
 def test_a_directory_without_the_right_to_write_is_refused_before_the_study(tmp_path, monkeypatch):
     (tmp_path / "bench.toml").write_text(SMALL)
-    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)  # root may write anywhere
+    # root may write anywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)
     monkeypatch.setattr(run, "run", lambda *given: pytest.fail("the study has begun"))
     refused = run_hilstar_here("study", "chain", tmp_path / "bench.toml", "-o", tmp_path / "out")
     assert_refused(refused, 2, "out: cannot be written (Permission denied)")
@@ -333,7 +344,9 @@ def test_the_study_ends_with_answers_from_its_own_rows(study):
 
 
 def answered(given: answers.Given, rate_deg_s: float = 0.0, **errors: float) -> CombinationRow:
-    """The answer among planted rows: the error of each, arcsec, by codes, then `s` for bit stealing and `t` for two samples."""
+    """The answer among planted rows: the error of each, arcsec, by codes, then `s` for bit
+    stealing and `t` for two samples.
+    """
     rows = []
     for name, arcsec in errors.items():
         codes, _, flags = name.partition("_")

@@ -1,4 +1,6 @@
-"""What the study of colour finds: a Bayer tracker sees each star's own colour, and what no monitor can show is stated."""
+"""What the study of colour finds: a Bayer tracker sees each star's own colour, and what no
+monitor can show is stated.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ def test_mixtures_reach_every_star_of_a_mosaic_and_not_the_near_infrared_of_a_mo
     assert all(float(row["subtypes"]) < AIM_SUBTYPES for row in gamut if row["sensor"] in SENSORS)
     assert all(float(row["subtypes"]) < 1e-3 for row in gamut if row["sensor"] == "ccd47-20 to 700 nm")
     by_class = {(row["panel"], row["sensor"], row["class"]): float(row["subtypes"]) for row in rows("colour_class")}
-    assert all(by_class["OLED", "ccd47-20", kind] < AIM_SUBTYPES for kind in "OBAF")  # the near infrared is what is missing
+    # the near infrared is what is missing
+    assert all(by_class["OLED", "ccd47-20", kind] < AIM_SUBTYPES for kind in "OBAF")
     assert all(by_class["OLED", "ccd47-20", kind] > AIM_SUBTYPES for kind in "GKM")
     wide = [row for row in gamut if row["sensor"] == "ccd47-20"]
     assert all(0.3 < float(row["out_share"]) < 0.7 and float(row["subtypes"]) > AIM_SUBTYPES for row in wide)
@@ -56,7 +59,8 @@ def test_mixtures_reach_every_star_of_a_mosaic_and_not_the_near_infrared_of_a_mo
 def test_lateral_colour_of_a_known_glass_and_of_one_that_is_linear_in_wavelength_is_the_skys(study):
     _, rows = study
     off = {(row["lens"], row["panel"], row["colour"]): float(row["off_share"]) for row in rows("colour_lateral")}
-    assert {panel for _, panel, _ in off} == {"OLED", "sRGB LCD"}  # the planar's filter has none of a laser's blue
+    # the planar's filter has none of a laser's blue
+    assert {panel for _, panel, _ in off} == {"OLED", "sRGB LCD"}
     assert {lens for lens, *_ in off} == {"planar-1897", "linear"}
     assert all((share < AIM_LATERAL) == (colour == "star") for (_, _, colour), share in off.items())
 

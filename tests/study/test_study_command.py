@@ -11,9 +11,11 @@ from hilstar.sky.catalog import load_catalog
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.pictures import assert_drawn, table
 
-# The thesis's own figures: the hottest star of Orion (figure 5.5), the mean temperature before Rosetta (figure 5.16).
+# The thesis's own figures: the hottest star of Orion (figure 5.5), the mean temperature before
+# Rosetta (figure 5.16).
 HOTTEST_IN_ORION_K, MEAN_OF_ROSETTA_K = 23_559.0, 6931.0
-# Stars to V = 7.5 or 9 whose centre is on the image, by Astropy's own projection (test_centres_are_astropy_s).
+# Stars to V = 7.5 or 9 whose centre is on the image, by Astropy's own projection
+# (test_centres_are_astropy_s).
 ON_IMAGE = {"orion": 572, "lyra": 127, "rosetta": 77}
 BENCH = """[tracker]
 aperture_mm = 20
@@ -56,7 +58,9 @@ def test_the_thesis_s_outputs_are_drawn_as_published_and_mended(published):
 
 
 def test_the_published_figures_have_the_thesis_s_temperatures(published):
-    """Drawn with the mended temperatures, Orion's hottest star had 15 260 K and Rosetta's mean was 7288 K."""
+    """Drawn with the mended temperatures, Orion's hottest star had 15 260 K and Rosetta's mean
+    was 7288 K.
+    """
     folder, lines = published
     assert temperatures_k(folder, "orion_as_published").max() == pytest.approx(HOTTEST_IN_ORION_K, abs=1)
     assert temperatures_k(folder, "rosetta_as_published").mean() == pytest.approx(MEAN_OF_ROSETTA_K, abs=1)
@@ -76,7 +80,9 @@ def test_the_published_temperatures_are_equation_3_13(published):
 
 @pytest.mark.parametrize("name", ON_IMAGE)
 def test_centres_are_astropy_s(published, name):
-    """How many of the table's stars are on the image, by the header's coordinates and Astropy alone."""
+    """How many of the table's stars are on the image, by the header's coordinates and Astropy
+    alone.
+    """
     with fits.open(published[0] / f"{name}_as_published.fits") as hdus:
         plane, truth, shape = WCS(hdus[0].header), hdus["TRUTH"].data, hdus[0].data.shape
     catalog = load_catalog()
@@ -104,7 +110,9 @@ def test_a_bench_of_one_s_own_has_seven_outputs_in_four_fields(tmp_path):
 
 
 def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):
-    """The KAI-4021's third ratio at 9000 K is 1.055 behind glass (figure 5.22), and 0.847 is the CCD47-20's."""
+    """The KAI-4021's third ratio at 9000 K is 1.055 behind glass (figure 5.22), and 0.847 is the
+    CCD47-20's.
+    """
     glass = BENCH.replace('"kai-4021"\n', '"kai-4021"\ntransmission = "n-bk7-10mm"\n')
     (tmp_path / "bench.toml").write_text(glass)
     result = run_hilstar_here("study", "models", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out")
@@ -116,7 +124,8 @@ def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):
     stars = table(tmp_path / "out" / "rapp_stars.csv")
     assert {row["field"] for row in stars} == {"orion", "lyra", "zeta_cas", "field"}
     cool = [float(row["rapp3"]) for row in stars if float(row["bv_mag"]) > 1.4]
-    assert np.median(cool) > 1.1  # of red stars the average model has too little light, by any sensor
+    # of red stars the average model has too little light, by any sensor
+    assert np.median(cool) > 1.1
 
 
 def test_what_a_study_does_not_use_is_refused(tmp_path):

@@ -1,4 +1,6 @@
-"""hilstar study faults: a chart of what each kind costs, and where stray light takes the stars with it."""
+"""hilstar study faults: a chart of what each kind costs, and where stray light takes the stars
+with it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Where hilstar fails: each method is within its tolerance where it is easy, and leaves it between two of its own rows."""
+"""Where hilstar fails: each method is within its tolerance where it is easy, and leaves it
+between two of its own rows.
+"""
 
 from __future__ import annotations
 
@@ -59,14 +61,17 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
     for stress in ("distance from the pole [deg]", "angle short of 90 deg [deg]"):
         _, error, meets, tolerance = rows_of(rows, stress)
         assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
-    # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes (run/sync.py), to first order.
+    # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
+    # (run/sync.py), to first order.
     at, error, _, _ = rows_of(rows, limits.TURN)
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
     assert error == pytest.approx(per_deg_s * at, rel=0.02)
 
 
 def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
-    """Along x the depth grows by x sin t, so a place x is off by x^2 t / f less what a rotation takes."""
+    """Along x the depth grows by x sin t, so a place x is off by x^2 t / f less what a rotation
+    takes.
+    """
     _, _, rows = study
     at, error, _, _ = rows_of(rows, limits.TILT)
     assert error[5] / at[5] == pytest.approx(error[0] / at[0], rel=0.01)

@@ -1,4 +1,6 @@
-"""The models study: its tables against figures from elsewhere, its titles against its tables, its pictures not blank."""
+"""The models study: its tables against figures from elsewhere, its titles against its tables,
+its pictures not blank.
+"""
 
 import csv
 import re
@@ -25,23 +27,28 @@ STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", 
 STEMS += ("catalogue_errors", "passbands", "curves", "detector_laws", "zodiacal")
 STEMS += ("star_density", "frames", "sun", "vega_logarithmic", "backgrounds")
 
-# Planck, the zero point and Johnson V written a second time, integrated by pieces to 1e-15; the study's
+# Planck, the zero point and Johnson V written a second time, integrated by pieces to 1e-15; the
+# study's
 # Gauss-Legendre is good to 1e-13, and the constants below are CODATA's, rounded at 1e-9.
 QUADRATURE_LIMIT = 1e-6
 HC_OVER_K_NM_K = 1.438776877e7
 REFERENCE_K = 9602.0
 BOLOMETRIC_MAG_LIMIT = 5e-4  # what three decimals of a magnitude hold
 
-# E. Mamajek's mean dwarf sequence, version 2022.04.16 (Pecaut & Mamajek 2013, ApJS 208, 9): B-V, K; A0V, F0V, G2V, K0V, K5V.
+# E. Mamajek's mean dwarf sequence, version 2022.04.16 (Pecaut & Mamajek 2013, ApJS 208, 9): B-V, K;
+# A0V, F0V, G2V, K0V, K5V.
 PECAUT_MAMAJEK = ((0.000, 9700), (0.295, 7220), (0.650, 5770), (0.816, 5270), (1.150, 4440))
-# Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as much. Measured: 2.2 %.
+# Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as
+# much. Measured: 2.2 %.
 SCALES_AGREE = 0.03
 
-# tests/authority/test_pickles.py holds the same: median and 95 % of the errors of held-out stars, %, V-I < 2.5.
+# tests/authority/test_pickles.py holds the same: median and 95 % of the errors of held-out stars,
+# %, V-I < 2.5.
 HELD_OUT = {"ccd47-20": (0.79, 2.42), "kai-4021": (0.58, 2.57)}
 HUNDREDTH_OF_A_PERCENT = 0.006
 
-# The table that benches use, against the integral that the study uses: 1e-6 of the rate (electrons.py).
+# The table that benches use, against the integral that the study uses: 1e-6 of the rate
+# (electrons.py).
 TABLE_MAG_LIMIT = 2e-6
 
 
@@ -120,7 +127,9 @@ def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
 
 
 def test_rapp_is_one_where_both_models_are_the_same(study):
-    """RAPP1 at the reference's own temperature; and the thesis's '15 % up to 5 %' of hot stars on the CCD47-20."""
+    """RAPP1 at the reference's own temperature; and the thesis's '15 % up to 5 %' of hot stars
+    on the CCD47-20.
+    """
     ratios = rapp_ratios(np.array([9602.0]), study_optics("ccd47-20"), "energy")
     assert ratios[0, 0] == pytest.approx(1.0, rel=1e-9)
     rows = columns(study[0] / "rapp_ccd47-20.csv")
@@ -156,7 +165,9 @@ def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(study):
 
 
 def test_a_held_out_star_is_not_in_its_own_table():
-    """A star made ten times brighter moves no other star's error by more than its share, and its own by all of it."""
+    """A star made ten times brighter moves no other star's error by more than its share, and its
+    own by all of it.
+    """
     library = load_library()
     rates = np.exp(library.vi_mag)
     plain = held_out_errors(rates)
@@ -172,7 +183,9 @@ def test_the_zero_point_costs_the_same_at_every_colour(study):
 
 
 def test_hot_stars_differ_as_the_thesis_says(study):
-    """Section 5.4, CCD47-20: 'higher than 9000 K ... results that differ from 15 % up to 5 %'; 5 % is passed at 25 000 K."""
+    """Section 5.4, CCD47-20: 'higher than 9000 K ... results that differ from 15 % up to 5 %'; 5
+    % is passed at 25 000 K.
+    """
     table = columns(study[0] / "rapp_ccd47-20.csv")
     hot = table["temperature_k"] >= 9000
     off = 1 - table["rapp3_photon"][hot]
@@ -191,14 +204,17 @@ def test_the_source_s_step_is_in_the_table(study):
     assert (table["bv_mag"][0], table["bv_mag"][-1]) == (-0.35, 1.8)
     zero = np.flatnonzero(table["bv_mag"] == 0)[0]
     step_k = table["wang2021_k"][zero] - table["wang2021_k"][zero - 1]
-    assert step_k == pytest.approx(8906.09411 + 3.633 - (1079.20644 + 8180.59419), abs=0.01)  # thesis eq. 3.13
+    # thesis eq. 3.13
+    assert step_k == pytest.approx(8906.09411 + 3.633 - (1079.20644 + 8180.59419), abs=0.01)
     assert abs(np.diff(table["ballesteros2012_k"])[zero - 1]) < 0.01
     ratio = table["ballesteros2012_k"] / table["torres2010_k"]
     assert table["ballesteros2012_percent"] == pytest.approx(100 * (ratio - 1), abs=1e-9)
 
 
 def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
-    """2.518e-8 W/m2 over sigma T^4, times pi B through Johnson V, against 3.631e-9 erg/s/cm2/A (Bessell 1998)."""
+    """2.518e-8 W/m2 over sigma T^4, times pi B through Johnson V, against 3.631e-9 erg/s/cm2/A
+    (Bessell 1998).
+    """
     johnson = curve("johnson-v")
     h, c, k, sigma = 6.62607015e-34, 299792458.0, 1.380649e-23, 5.670374419e-8
 
@@ -235,7 +251,8 @@ def test_choices_cost_what_a_bench_would_see(study):
     rapp = columns(study[0] / "rapp_ccd47-20.csv")
     at = electrons.star_temperatures_k(np.array([1.0]), "ballesteros2012")
     ags_mag = 2.5 * np.log10(np.interp(at, rapp["temperature_k"], rapp["rapp3_energy"]))
-    assert table["brightness_ags_mag"][row] == pytest.approx(ags_mag[0], abs=1e-4)  # straight lines between 400 points
+    # straight lines between 400 points
+    assert table["brightness_ags_mag"][row] == pytest.approx(ags_mag[0], abs=1e-4)
 
 
 def test_there_are_no_percentiles_where_stars_are_few():
@@ -293,7 +310,8 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
         assert here[name] == pytest.approx(thesis[name], abs=0.025)  # table 2.3
     bands = columns(folder / "passbands.csv")
     assert list(bands["band"]) == ["U", "B", "V", "R", "I"]
-    assert bands["vega_v0"] == pytest.approx(bands["thesis_bessell"], rel=0.02)  # table 2.5; Vega's own colours are not all 0
+    # table 2.5; Vega's own colours are not all 0
+    assert bands["vega_v0"] == pytest.approx(bands["thesis_bessell"], rel=0.02)
     assert bands["effective_nm"] == pytest.approx(bands["thesis_effective_nm"], rel=0.02)
     dark = columns(folder / "detector_laws.csv")
     at = np.flatnonzero(dark["temperature_k"] == 293)[0]
@@ -336,7 +354,9 @@ def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
 
 
 def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
-    """Figure 2.2: each cell has its stars, counted here one by one; the whole sky has 41 253 square degrees."""
+    """Figure 2.2: each cell has its stars, counted here one by one; the whole sky has 41 253
+    square degrees.
+    """
     table, catalog = columns(study[0] / "star_density.csv"), load_catalog()
     cell_deg2 = 41_252.96 / len(table["ra_deg"])
     assert table["stars_deg2"].sum() * cell_deg2 == pytest.approx(len(catalog), rel=1e-5)
@@ -348,7 +368,9 @@ def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
 
 
 def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
-    """Figure 2.11: x and y over z are Astropy's tangent plane at the boresight, west and south of it."""
+    """Figure 2.11: x and y over z are Astropy's tangent plane at the boresight, west and south
+    of it.
+    """
     table = columns(study[0] / "frames.csv")
     plane = WCS(naxis=2)
     plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [84.057, -1.2], [1.0, 1.0]
@@ -361,9 +383,12 @@ def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
 
 
 def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
-    """Figure 4.11: table 6.4's high zodiacal light is V = 22.1 through Johnson V, as the handbook says."""
+    """Figure 4.11: table 6.4's high zodiacal light is V = 22.1 through Johnson V, as the
+    handbook says.
+    """
     table, (nm, response) = columns(study[0] / "backgrounds.csv"), curve("johnson-v")
-    per_nm = table["zodiacal"] * 6.62607015e-34 * 299_792_458 / (table["wavelength_nm"] * 1e-9)  # W/m2/arcsec2/nm
+    # W/m2/arcsec2/nm
+    per_nm = table["zodiacal"] * 6.62607015e-34 * 299_792_458 / (table["wavelength_nm"] * 1e-9)
     weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
     v_mag = -2.5 * np.log10((per_nm * weight).sum() / weight.sum() / (3.631e-9 * 1e-2))
     assert v_mag == pytest.approx(22.1, abs=0.03)
@@ -372,7 +397,9 @@ def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
 
 
 def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(study):
-    """Figures 3.1 and 2.13: both curves have one mean through V, or Vega's flux; Planck's law is written here."""
+    """Figures 3.1 and 2.13: both curves have one mean through V, or Vega's flux; Planck's law is
+    written here.
+    """
     nm, response = curve("johnson-v")
     for stem, star, kelvin in (("sun", "g2v", 5772.0), ("vega_logarithmic", "vega", 9602.0)):
         table = columns(study[0] / f"{stem}.csv")

@@ -42,7 +42,9 @@ def outcomes(study):
 
 
 def test_holding_costs_the_rate_times_the_age(outcomes):
-    """Three axes swing at up to 2 pi 3 deg / 20 s each; the age is the latency and half a sample on the mean."""
+    """Three axes swing at up to 2 pi 3 deg / 20 s each; the age is the latency and half a sample
+    on the mean.
+    """
     fastest_arcsec_s = math.sqrt(3) * 2 * math.pi * SLEW_DEG / SLEW_S * 3600
     for ms in LATENCIES_MS:
         found = outcomes["hold", USUAL_HZ, ms]
@@ -64,7 +66,9 @@ def shaken(study):
 
 
 def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
-    """What is shown, 1 + i x of a wave, and what is true, exp(i x), for x = 2 pi f age; ages within 5 ms of their mean."""
+    """What is shown, 1 + i x of a wave, and what is true, exp(i x), for x = 2 pi f age; ages
+    within 5 ms of their mean.
+    """
     for hz in (2.0, 5.0, 10.0, 14.0):
         x = math.tau * hz * USUAL_MS / 1e3
         assert shaken["rate", "with rates", hz].gain == pytest.approx(math.hypot(1, x), rel=0.05)
@@ -78,7 +82,8 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
         for hz in (20.0, 45.0):
             assert shaken["auto", packets, hz].residual < 0.7 * shaken["rate", packets, hz].residual
             assert shaken["auto", packets, hz].residual < 2.0 * shaken["newest", packets, hz].residual
-        assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16  # sin x = x / 2: 15 Hz with rates
+        # sin x = x / 2: 15 Hz with rates
+        assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16
     assert study[1][-1].startswith("Of a vibration above 1")
 
 

@@ -14,7 +14,8 @@ from hilstar.instruments.study.quantisation import run
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.pictures import assert_drawn
 
-# Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64 stars.
+# Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64
+# stars.
 MOST_LEFT = 0.6
 
 
@@ -58,6 +59,7 @@ def test_the_study_writes_charts_tables_and_findings(tmp_path):
     left = {(r["panel"], r["method"], r["frames"]): float(r["flux_rms_mag"]) for r in rows}
     for panel in dict.fromkeys(r["panel"] for r in rows):
         assert left[panel, "temporal", "6"] < left[panel, "temporal", "2"]
-        # Exposures that are no whole turn of the mask have what it leaves; steps of one light are within 1 / 6 for both.
+        # Exposures that are no whole turn of the mask have what it leaves; steps of one light are
+        # within 1 / 6 for both.
         assert left[panel, "temporal", "6"] < 0.8 * left[panel, "dither", "6"]
     assert left["sRGB, 8 bits", "temporal", "6"] < 0.003

@@ -1,4 +1,6 @@
-"""A slew on a simulated panel that scans: what compensation is worth, and that the measure would see it missing."""
+"""A slew on a simulated panel that scans: what compensation is worth, and that the measure would
+see it missing.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from tests.support.pictures import assert_drawn, table
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
 PERIOD_S = 1 / 60
-# The codes of stars that move, six frames or fewer: 0.03 to 0.15 arcsec rms by the study itself, whatever the beat.
+# The codes of stars that move, six frames or fewer: 0.03 to 0.15 arcsec rms by the study itself,
+# whatever the beat.
 CODES_ARCSEC, CODES_MAG = 0.3, 0.01
 # A frame's motion at this rate: 2 deg/s over 1/60 s.
 FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
@@ -59,7 +62,9 @@ def test_compensation_leaves_a_twentieth_of_the_error_at_most(outcomes):
 
 
 def test_each_step_takes_away_what_physics_says_it_should(outcomes):
-    """A row's light is half a frame old on the mean; rows at top and bottom are half a scan-out early and late."""
+    """A row's light is half a frame old on the mean; rows at top and bottom are half a scan-out
+    early and late.
+    """
     assert outcomes["+ scan-out"].rms_arcsec == pytest.approx(FRAME_ARCSEC / 2, rel=0.02)
     assert outcomes["+ scan-out"].worst_arcsec == pytest.approx(FRAME_ARCSEC / 2, rel=0.02)
     assert FRAME_ARCSEC / 2 < outcomes["prediction"].rms_arcsec < FRAME_ARCSEC

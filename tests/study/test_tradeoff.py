@@ -1,4 +1,6 @@
-"""The study of trade-offs: exact methods are exact, worse ones worse, and each default stands on the front or says why not."""
+"""The study of trade-offs: exact methods are exact, worse ones worse, and each default stands on
+the front or says why not.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,10 @@ from tests.support.pictures import assert_drawn
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
 # A relative error in magnitudes: 2.5 / ln 10.
 MAG_PER_SHARE = 1.0858
-# Of the brightest star, in a pixel that holds 0.44 of it along each axis. The exp erf: two edges of 1.5e-7, halved, times
-# 0.44, 0.7e-7. The table of 4096: (6 px / 4095)^2 / 8 times the profile's curvature of 0.55 / px^2, times 0.44, 0.7e-7.
-# float32: 0.6e-7 of 1 at each edge, 0.3e-7, and as much of the sum.
+# Of the brightest star, in a pixel that holds 0.44 of it along each axis. The exp erf: two edges of
+# 1.5e-7, halved, times 0.44, 0.7e-7. The table of 4096: (6 px / 4095)^2 / 8 times the profile's
+# curvature of 0.55 / px^2, times 0.44, 0.7e-7. float32: 0.6e-7 of 1 at each edge, 0.3e-7, and as
+# much of the sum.
 PROFILE_SHARE = 2e-7
 
 
@@ -157,7 +160,8 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
     step = measured(planted(clock, 4.0), 0.02)
     assert [row.method for row in step.trials if not row.on_front] == ["slow and rough"]
     assert step.default.beaten == "" and step.default.time_ms == pytest.approx(4.0)
-    beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)  # all errors count as none: the fastest is best
+    # all errors count as none: the fastest is best
+    beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)
     assert not beaten.default.on_front
     assert beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
@@ -170,7 +174,8 @@ def test_every_round_has_every_work_and_slow_works_drop_out(clock):
     times = in_turn(works, MAX_ROUNDS, 0.01)
     rounds = [sorted(calls[k : k + 2]) for k in range(0, 2 * (MIN_ROUNDS + 1), 2)]
     assert rounds == [[1.5, 50.0]] * (MIN_ROUNDS + 1)
-    # The slow one has had its 10 ms after one round; the fast one is over its own after the seventh.
+    # The slow one has had its 10 ms after one round; the fast one is over its own after the
+    # seventh.
     assert {name: len(taken) for name, taken in times.items()} == {"slow": MIN_ROUNDS, "fast": 7}
 
 

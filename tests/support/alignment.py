@@ -1,4 +1,6 @@
-"""A tracker that reports attitudes from the stars that it sees on a bench: Wahba's problem by Markley's SVD (1988)."""
+"""A tracker that reports attitudes from the stars that it sees on a bench: Wahba's problem by
+Markley's SVD (1988).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ HEADER = "qw,qx,qy,qz,tw,tx,ty,tz"
 
 
 def reported(bench: Bench, true: BenchGeometry, q_icrs_to_cam: FloatArray) -> FloatArray:
-    """The attitude (4,) that fits best to where the tracker sees a frame's stars, of the bench as it truly stands."""
+    """The attitude (4,) that fits best to where the tracker sees a frame's stars, of the bench
+    as it truly stands.
+    """
     truth = bench.frame(q_icrs_to_cam).truth
     order = np.argsort(bench.stars.hip)
     catalogue = bench.stars.vectors[order[np.searchsorted(bench.stars.hip, truth["hip"], sorter=order)]]

@@ -40,13 +40,16 @@ def bench_text(*changes: Tables) -> str:
 # A monitor of 320 x 240: a frame takes a millisecond.
 SMALL_BENCH = bench_text()
 
-# The same where frames have to be in time, whatever else the machine does: exact codes take several milliseconds.
+# The same where frames have to be in time, whatever else the machine does: exact codes take several
+# milliseconds.
 LIVE_BENCH = bench_text({"render": {"quantisation": "round"}})
 
-# The size of the X servers of tests/support/x11/screens.py. On a busy machine `auto` might choose other codes than `frame`.
+# The size of the X servers of tests/support/x11/screens.py. On a busy machine `auto` might choose
+# other codes than `frame`.
 SCREEN_BENCH = bench_text({"monitor": {"resolution_px": [640, 480]}, "render": {"quantisation": "exact"}})
 
-# Changes that make a bench of it whose light the twin can see whole: 10 bits, and a tracker's pixel for a monitor's.
+# Changes that make a bench of it whose light the twin can see whole: 10 bits, and a tracker's pixel
+# for a monitor's.
 TWIN: Tables = {
     "tracker": {"focal_length_mm": 25, "resolution_px": [400, 400], "transmission": None},
     "sky": {"faintest_v_mag": 5.5},

@@ -1,4 +1,6 @@
-"""Debian's chromium without a window, through Selenium: its pages, what their consoles said, and pictures of them."""
+"""Debian's chromium without a window, through Selenium: its pages, what their consoles said, and
+pictures of them.
+"""
 
 from __future__ import annotations
 
@@ -96,11 +98,15 @@ class Browser(Chrome):
         WebDriverWait(self, patience_s, poll_frequency=0.02).until(lambda _: self.run(f"return {condition}"), condition)
 
     def overflowing(self) -> list[str]:
-        """What reaches out of the page's window to the right, and what text is wider than its box."""
+        """What reaches out of the page's window to the right, and what text is wider than its
+        box.
+        """
         return list(self.run(OVERFLOWING))
 
     def complaints(self) -> list[str]:
-        """What the console has said since it was last asked, violations of the page's policy among it."""
+        """What the console has said since it was last asked, violations of the page's policy
+        among it.
+        """
         return [f"{entry['level']} {entry['message']}" for entry in self.get_log("browser")]
 
 
@@ -122,7 +128,9 @@ def browser() -> Iterator[Browser]:
 
 
 def assert_fits_every_size_in_light_and_dark(page: Browser, directory: Path) -> None:
-    """Nothing is wider than the window, and the ground above everything is the theme's; pictures go to the directory."""
+    """Nothing is wider than the window, and the ground above everything is the theme's; pictures
+    go to the directory.
+    """
     for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
         page.size(*SIZES_PX[size])
         page.prefer(color_scheme=theme)

@@ -1,7 +1,9 @@
-"""A tracker before a campaign on the bench, in a process of its own: it sees what `now.json` says is lit, and answers over UDP.
+"""A tracker before a campaign on the bench, in a process of its own: it sees what `now.json` says
+is lit, and answers over UDP.
 
-`python -m tests.support.campaign_tracker '{"now": "out/now.json", "port": 5000}'`; the keys are those of `Planted`. An exposure
-that was not lit by one attitude alone has no answer that is valid. It prints the wild answers' times when its input ends.
+`python -m tests.support.campaign_tracker '{"now": "out/now.json", "port": 5000}'`; the keys are
+those of `Planted`. An exposure that was not lit by one attitude alone has no answer that is valid.
+It prints the wild answers' times when its input ends.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ FIRST_DIRECTION = np.array([0.163, 0.926, 0.342])  # RA 80, Dec 20: its phase is
 
 @dataclass(frozen=True)
 class Planted:
-    """What is planted: one sigma an axis, arcsec, across the boresight (`noise_arcsec` about x, y, z), and shares."""
+    """What is planted: one sigma an axis, arcsec, across the boresight (`noise_arcsec` about x,
+    y, z), and shares.
+    """
 
     now: str
     port: int
@@ -49,7 +53,9 @@ class Planted:
 
 
 def seen(planted: Planted, middle_ns: int, known: list[dict[str, Any]]) -> tuple[int, np.ndarray] | None:
-    """The case and the attitude that were lit over the whole exposure; None where none was. `known`: the last two cases."""
+    """The case and the attitude that were lit over the whole exposure; None where none was.
+    `known`: the last two cases.
+    """
     with contextlib.suppress(OSError, ValueError):
         told = json.loads(Path(planted.now).read_text())
         if told not in known[-1:]:
@@ -64,7 +70,9 @@ def seen(planted: Planted, middle_ns: int, known: list[dict[str, Any]]) -> tuple
 
 
 def wave(q: np.ndarray, length_px: float) -> np.ndarray:
-    """A wave (..., 2) of rms 1 over many lengths, in x and y, of where attitudes (..., 4) put FIRST_DIRECTION."""
+    """A wave (..., 2) of rms 1 over many lengths, in x and y, of where attitudes (..., 4) put
+    FIRST_DIRECTION.
+    """
     star = to_matrix(q) @ FIRST_DIRECTION
     return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[..., :2] / star[..., 2:] / length_px))
 

@@ -1,4 +1,5 @@
-"""Centroiders as trackers have them, on images of single stars: each (n, side, side), the star near the middle.
+"""Centroiders as trackers have them, on images of single stars: each (n, side, side), the star near
+the middle.
 
 Each gives x and y (n,) px from the middle; they share no code with hilstar.
 """
@@ -65,7 +66,9 @@ def _profile(at, place, sigma_px):
 
 
 def box_mean(stars, half, about):
-    """The centre of mass in a box about the brightest pixel of `about`, of pixels over a fiftieth of the peak."""
+    """The centre of mass in a box about the brightest pixel of `about`, of pixels over a
+    fiftieth of the peak.
+    """
     at = axis(stars)
     peak = about.reshape(len(about), -1).argmax(1)
     rows, columns = peak // len(at), peak % len(at)
@@ -78,7 +81,9 @@ def box_mean(stars, half, about):
 
 
 def family_errors_px(shown, wanted, sigma_px):
-    """By how much each centroider places the stars of `shown` elsewhere than those of `wanted`, rms along an axis, px."""
+    """By how much each centroider places the stars of `shown` elsewhere than those of `wanted`,
+    rms along an axis, px.
+    """
     seen, sky = blurred(shown), blurred(wanted)
     wide = float(np.hypot(sigma_px, BLUR_PX))
     pairs = {

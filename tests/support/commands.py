@@ -1,4 +1,6 @@
-"""hilstar's commands: in a process of their own as a user runs them, or in this one where the process is not what is tested."""
+"""hilstar's commands: in a process of their own as a user runs them, or in this one where the
+process is not what is tested.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from tests.support.waiting import PATIENCE_S
 def run_hilstar(
     *arguments: str | Path, cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """The command as a user runs it, in a process of its own, without the half second of its imports (see `Started`)."""
+    """The command as a user runs it, in a process of its own, without the half second of its
+    imports (see `Started`).
+    """
     return run_started([*HILSTAR, *map(str, arguments)], cwd, timeout, env)
 
 
@@ -30,7 +34,8 @@ def run_started(
 ) -> subprocess.CompletedProcess[str]:
     """Any command of Python's, the same way."""
     env = dict(os.environ) if env is None else env
-    # A group of its own: what the command has started (`demo` a sender) ends with it, however it ends.
+    # A group of its own: what the command has started (`demo` a sender) ends with it, however it
+    # ends.
     with Started(
         command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
@@ -45,9 +50,11 @@ def run_started(
 def run_hilstar_here(
     *arguments: str | Path, cwd: Path | None = None, timeout: int = PATIENCE_S
 ) -> subprocess.CompletedProcess[str]:
-    """The command line in this process: the same words, refusals and exit code, and milliseconds instead of a new process.
+    """The command line in this process: the same words, refusals and exit code, and milliseconds
+    instead of a new process.
 
-    For what is said, written and returned. The process itself (streams, signals, the workers it starts) is `run_hilstar`'s.
+    For what is said, written and returned. The process itself (streams, signals, the workers it
+    starts) is `run_hilstar`'s.
     """
     words = [str(argument) for argument in arguments]
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True) for _ in range(2))
@@ -72,7 +79,9 @@ def logging_to(stream: TextIO) -> Iterator[None]:
 
 @contextlib.contextmanager
 def bounded_by(seconds: int) -> Iterator[None]:
-    """An alarm: what waits for ever in this process fails (TimeoutError), and does not stop the suite."""
+    """An alarm: what waits for ever in this process fails (TimeoutError), and does not stop the
+    suite.
+    """
 
     def too_long(*_: object) -> None:
         raise TimeoutError(f"it takes over {seconds} s")

@@ -1,4 +1,6 @@
-"""Bytes that are no JSON, each for a reason of its own: msgspec does not raise one error for all of them."""
+"""Bytes that are no JSON, each for a reason of its own: msgspec does not raise one error for all
+of them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Where `exact` might fail: edges, stars a pixel apart, narrow ones, uneven, coarse and fine panels, what is over white."""
+"""Where `exact` might fail: edges, stars a pixel apart, narrow ones, uneven, coarse and fine
+panels, what is over white.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +16,27 @@ from hilstar.optics.sprites import Sprites, pack_sprites
 from tests.support.centroiders import family_errors_px
 
 WHITE = 1e6  # e-/s of a pixel
-COUNT, TILE = 8, 22  # groups of stars along either side, and the side of each one's part of the image, px
+# groups of stars along either side, and the side of each one's part of the image, px
+COUNT, TILE = 8, 22
 SIDE = COUNT * TILE
 USUAL, NARROW = (0.85, 0.85), (0.3, 0.3)
 CUT_PX = 8  # about a lone star, for centroiders
 FRAMES = 9
 PHASES = (0.0, 0.3, 0.8, 1.5, 2.6)
-# Of one frame of `round`, rms over phases and stars; measured 0.02 to 0.15 and 0.06 to 0.46, the most by stars of 0.3 px that
-# the edge cuts in half.
+# Of one frame of `round`, rms over phases and stars; measured 0.02 to 0.15 and 0.06 to 0.46, the
+# most by stars of 0.3 px that the edge cuts in half.
 OF_ROUND_MAG, OF_ROUND_PX = 0.2, 0.55
-# An exposure of 6.3 refreshes has what two frames leave at each end and no more: measured 0.9 to 1.3 of one of six.
+# An exposure of 6.3 refreshes has what two frames leave at each end and no more: measured 0.9 to
+# 1.3 of one of six.
 NO_BEAT = 1.4
 ROUNDING = 2e-6  # mag and px, of float32
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Groups of stars, each alone in its window, on a panel; `lone` where each group is one whole star."""
+    """Groups of stars, each alone in its window, on a panel; `lone` where each group is one
+    whole star.
+    """
 
     sprites: Sprites
     windows: list[tuple[slice, slice]]
@@ -94,13 +100,16 @@ def pairs(mags, apart_px, response, sigma_px=USUAL):
 
 
 def at_edge(inside_px, mag, response, sigma_px=USUAL, uniformity=None):
-    """Stars about so far within all four edges (negative: beyond), at every phase along and across, and at the corners."""
+    """Stars about so far within all four edges (negative: beyond), at every phase along and
+    across, and at the corners.
+    """
     along = np.arange(1, COUNT - 1) * TILE + TILE / 2 - 0.5 + (np.arange(1, COUNT - 1) + 0.5) / COUNT - 0.5
     near = inside_px - 0.5 + (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 0.5
     far, corner = SIDE - 1 - near, np.array([0.1, -0.3]) + inside_px - 0.5
     x = np.concatenate([near, far, along, along, corner, SIDE - 1 - corner])
     y = np.concatenate([along, along, near, far, SIDE - 1 - corner[::-1], corner[::-1]])
-    keep = [*range(4 * len(along)), 4 * len(along), 4 * len(along) + 3]  # a star in either of two corners
+    # a star in either of two corners
+    keep = [*range(4 * len(along)), 4 * len(along), 4 * len(along) + 3]
     x, y = x[keep], y[keep]
     windows = [
         tuple(slice(max(round(at) - 11, 0), min(round(at) + 12, SIDE)) for at in place) for place in zip(y, x, strict=True)
@@ -109,7 +118,9 @@ def at_edge(inside_px, mag, response, sigma_px=USUAL, uniformity=None):
 
 
 def uneven():
-    """Pixels 5 % apart, a fall of a fifth to the corners, and one pixel in a hundred at half of its light."""
+    """Pixels 5 % apart, a fall of a fifth to the corners, and one pixel in a hundred at half of
+    its light.
+    """
     rng = np.random.default_rng(7)
     y, x = np.mgrid[:SIDE, :SIDE]
     even = 1 - 0.3 * np.hypot(x - SIDE / 2, y - SIDE / 2) / SIDE + rng.normal(0, 0.05, (SIDE, SIDE))
@@ -141,8 +152,8 @@ SCENES = {
     "all clipped": lambda: single(-4, S8),
 }
 
-# Of `round`'s error, rms over a scene: light and plain moment; and by how much a star may be farther off than by `round`: mag
-# and px. Measured, and a quarter on top.
+# Of `round`'s error, rms over a scene: light and plain moment; and by how much a star may be
+# farther off than by `round`: mag and px. Measured, and a quarter on top.
 LIMITS = {
     "on the edge": (0.15, 0.8, 0.0015, 0.0045),
     "on the edge, faint": (0.12, 0.65, 0.003, 0.02),
@@ -172,7 +183,9 @@ NODES, LENGTH_PX = 26, 14.0  # of a streak
 
 
 def streaks(mag, response, sigma_px=USUAL, uniformity=None, cut=False):
-    """A streak in the middle of each 2 x 2 tiles, in all directions; or `cut` by the left edge, others left out."""
+    """A streak in the middle of each 2 x 2 tiles, in all directions; or `cut` by the left edge,
+    others left out.
+    """
     rng, side = np.random.default_rng(1), 2 * TILE
     middle = [axis.ravel() for axis in np.meshgrid(*[np.arange(COUNT // 2) * side + side / 2 - 0.5] * 2)]
     x, y = middle[0] + rng.uniform(-0.5, 0.5, len(middle[0])), middle[1] + rng.uniform(-0.5, 0.5, len(middle[1]))
@@ -272,7 +285,9 @@ def over(refreshes, frames, scene):
 
 
 def assert_right_over_frames(frames, scene):
-    """The light (h, w) of FRAMES frames in a row: over six of them, and over six and a part, at any phase."""
+    """The light (h, w) of FRAMES frames in a row: over six of them, and over six and a part, at
+    any phase.
+    """
     frames = np.stack(frames)
     rounded = np.array(errors_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene).rms())
     whole, more = over(6.0, frames, scene), over(6.3, frames, scene)

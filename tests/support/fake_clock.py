@@ -1,4 +1,6 @@
-"""A clock that stands still until somebody waits or works: runs of minutes in no time, to the nanosecond."""
+"""A clock that stands still until somebody waits or works: runs of minutes in no time, to the
+nanosecond.
+"""
 
 from __future__ import annotations
 

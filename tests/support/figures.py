@@ -1,4 +1,6 @@
-"""What every chart has to be, whatever its data: read at the width of its page, with nothing over anything else."""
+"""What every chart has to be, whatever its data: read at the width of its page, with nothing
+over anything else.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ MAX_TITLE_LINES = 2
 TOUCH_PX = 1.5  # boxes are whole pixels of a hinted font: this much is no overlap
 # A figure of a title that stands alone: no part of a name, no power of ten.
 TITLE_FIGURE = re.compile(r"(?<![\w.\-·⁻])\d+(?:\.\d+)?(?![\w·⁻]|-\d|\.\d)")
-# Charts whose titles have figures that are found from what is drawn and not drawn themselves, and how.
+# Charts whose titles have figures that are found from what is drawn and not drawn themselves, and
+# how.
 DERIVED = {
     "economy": "the ratio of two bars",
     "prediction_jitter": "where two lines cross, and the largest ratio of two",
@@ -39,12 +42,15 @@ DERIVED = {
     "frames": "a count of stars, each a point",
     "confront": "the limit of the stars that count",
 }
-DRAWN_AS = (1.0, 1e2, 1e3, 1e-6)  # a share is told in percent, a second in ms, electrons in millions
-PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}  # of axes and of what a text beside it names
+# a share is told in percent, a second in ms, electrons in millions
+DRAWN_AS = (1.0, 1e2, 1e3, 1e-6)
+# of axes and of what a text beside it names
+PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}
 
 
 def assert_legible(figure: Figure, *, drawn: bool = False) -> None:
-    """No text overlaps another, leaves the canvas or is small; no curve leaves its axes or lies under a legend.
+    """No text overlaps another, leaves the canvas or is small; no curve leaves its axes or lies
+    under a legend.
 
     `drawn`: at the figure's own resolution, so that its texts are where they belong.
     """
@@ -69,7 +75,9 @@ def assert_legible(figure: Figure, *, drawn: bool = False) -> None:
 
 
 def assert_title_is_drawn(figure: Figure, stem: str) -> None:
-    """Each figure of a title stands in the chart: as a word, or as a value that is drawn, rounded as the title rounds it."""
+    """Each figure of a title stands in the chart: as a word, or as a value that is drawn,
+    rounded as the title rounds it.
+    """
     if stem in DERIVED:
         return
     title = figure.get_suptitle()

@@ -1,9 +1,11 @@
-"""hilstar's commands in processes of their own that begin where the imports are over: half of what a start costs.
+"""hilstar's commands in processes of their own that begin where the imports are over: half of what
+a start costs.
 
-A fork server has imported hilstar and forks itself for each command, which is `python -m MODULE` or `python -c CODE`. The
-fork is the caller's child, with its own number, streams, session, folder and environment; it ends as any command does. What
-some commands import as they go, the server imports before its first fork of one. Imports, and what a shell limits, are
-tested by `subprocess.Popen` of `HILSTAR`.
+A fork server has imported hilstar and forks itself for each command, which is `python -m MODULE` or
+`python -c CODE`. The fork is the caller's child, with its own number, streams, session, folder and
+environment; it ends as any command does. What some commands import as they go, the server imports
+before its first fork of one. Imports, and what a shell limits, are tested by `subprocess.Popen` of
+`HILSTAR`.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from hilstar.basics.process.interrupts import leave
 from tests.support.benches import LIVE_BENCH, SCREEN_BENCH, SMALL_BENCH
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
-# What a bench imports before its first frame, and the commands that tests start most; no window, no browser, no thread.
+# What a bench imports before its first frame, and the commands that tests start most; no window, no
+# browser, no thread.
 MODULES = (
     "server.bench.build",
     "server.console.publisher",
@@ -64,7 +67,8 @@ ROOM = "a" * 2000  # room in the command line for those of its forks
 
 
 class Started(subprocess.Popen):
-    """A command of Python's, forked from the fork server, that finds the signals `ignored` as a shell or nohup leaves them.
+    """A command of Python's, forked from the fork server, that finds the signals `ignored` as a
+    shell or nohup leaves them.
 
     Any other command is started as `subprocess.Popen` does it.
     """
@@ -91,7 +95,9 @@ class Started(subprocess.Popen):
 
 
 def python_of(environment: Mapping[str, str]) -> dict[str, str]:
-    """What an environment says to Python itself and to its loader of libraries, which hear it as they start."""
+    """What an environment says to Python itself and to its loader of libraries, which hear it as
+    they start.
+    """
     return {name: value for name, value in environment.items() if name.startswith(("PYTHON", "LD_"))}
 
 
@@ -141,13 +147,16 @@ def prepare() -> None:
     from hilstar.server.bench.bench_file import bench_file_of
     from hilstar.server.bench.build import open_bench
 
-    with mock.patch("hilstar.server.bench.build.headless_context", return_value=None):  # each fork makes its own
-        for text in (SMALL_BENCH, LIVE_BENCH, SCREEN_BENCH):  # what a process computes once: stars, effort, paths
+    # each fork makes its own
+    with mock.patch("hilstar.server.bench.build.headless_context", return_value=None):
+        # what a process computes once: stars, effort, paths
+        for text in (SMALL_BENCH, LIVE_BENCH, SCREEN_BENCH):
             open_bench(bench_file_of(Path("none.toml"), text)).warm_up()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         for words in COMMANDS:
             run_command(words)  # refused: their options are built
-    for driver in Path("/usr/lib").glob("*/dri/swrast_dri.so"):  # and LLVM with it: 20 ms that each fork needs not spend
+    # and LLVM with it: 20 ms that each fork needs not spend
+    for driver in Path("/usr/lib").glob("*/dri/swrast_dri.so"):
         with contextlib.suppress(OSError):
             ctypes.CDLL(str(driver))
 
@@ -169,7 +178,8 @@ def main(made: socket.socket) -> None:
         read, write = os.pipe()
         between = os.fork()
         if not between:
-            # Its parent ends at once, so that it becomes the child of the process that asked: that one adopts orphans.
+            # Its parent ends at once, so that it becomes the child of the process that asked: that
+            # one adopts orphans.
             if not os.fork():
                 made.close()
                 os.close(read)
@@ -184,7 +194,9 @@ def main(made: socket.socket) -> None:
 
 
 def settle() -> None:
-    """Keep the collector from what is there: it would write to every page of it, which the forks share."""
+    """Keep the collector from what is there: it would write to every page of it, which the forks
+    share.
+    """
     gc.collect()
     gc.freeze()
 
@@ -230,7 +242,9 @@ def become_command(request: dict[str, Any], streams: list[int], told: int) -> No
 
 
 def show_command_line(command: list[str]) -> None:
-    """Make this the command line that /proc shows (its fields 48 and 49 are where the kernel reads it)."""
+    """Make this the command line that /proc shows (its fields 48 and 49 are where the kernel
+    reads it).
+    """
     begin, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[45:47])
     text = b"".join(word.encode(errors="surrogateescape") + b"\0" for word in command)[: end - begin - 1]
     ctypes.memmove(begin, text.ljust(end - begin, b"\0"), end - begin)

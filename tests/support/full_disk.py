@@ -1,6 +1,7 @@
 """A limit on the size of files, which stands for a disk without room.
 
-Python would write its compiled modules under the limit as well, and a truncated one stops whoever imports it afterwards.
+Python would write its compiled modules under the limit as well, and a truncated one stops whoever
+imports it afterwards.
 """
 
 from __future__ import annotations

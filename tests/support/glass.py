@@ -1,4 +1,6 @@
-"""A glass in closed form: coma, field curvature, axial and lateral colour, and its PSFs by brute force."""
+"""A glass in closed form: coma, field curvature, axial and lateral colour, and its PSFs by brute
+force.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ HALF_PX = 7
 
 
 def profile(x_px: float, y_px: float, nm: float, focus_um: float = 0.0):
-    """Light a px^2 at x, y px from the camera's place of a star: two Gaussians, off the chief ray towards the corners."""
+    """Light a px^2 at x, y px from the camera's place of a star: two Gaussians, off the chief
+    ray towards the corners.
+    """
     u, v = (2 * np.array([x_px, y_px]) - SIDE_PX + 1) / SIDE_PX
     colour = (nm - 600) / 150
     sigma = np.sqrt(0.5**2 + 0.06 * (u * u + v * v) + 0.03 * colour**2 + (focus_um / 40) ** 2)

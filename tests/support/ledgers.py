@@ -10,7 +10,9 @@ from hilstar.server.record.ledger_records import FrameRecord, PacketTally, Proce
 
 @dataclass(slots=True)
 class Run:
-    """The head of a ledger, its frames, the process's state, and packets by "accepted" or why refused."""
+    """The head of a ledger, its frames, the process's state, and packets by "accepted" or why
+    refused.
+    """
 
     head: dict[str, str]
     frames: list[FrameRecord] = field(default_factory=list)

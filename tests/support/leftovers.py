@@ -1,4 +1,6 @@
-"""Processes that outlive their test, as when a command that was killed had started another: they are found and ended."""
+"""Processes that outlive their test, as when a command that was killed had started another: they
+are found and ended.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def adopt_orphans() -> None:
 
 
 def living_children() -> dict[int, str]:
-    """The command lines of this process's children that run (dead ones that nobody waited for are nothing)."""
+    """The command lines of this process's children that run (dead ones that nobody waited for
+    are nothing).
+    """
     found = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError, ValueError, IndexError):

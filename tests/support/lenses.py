@@ -1,4 +1,6 @@
-"""Small lens files, and an own trace of what is read from them: paraxial (y, nu) and by Snell's law in vectors."""
+"""Small lens files, and an own trace of what is read from them: paraxial (y, nu) and by Snell's
+law in vectors.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def zmx(
     far="INFINITY",
     behind=(),
 ) -> bytes:
-    """The doublet as a .zmx file. `system` lines stand in place of ENPD's, `more` has lines of surfaces by their numbers."""
+    """The doublet as a .zmx file. `system` lines stand in place of ENPD's, `more` has lines of
+    surfaces by their numbers.
+    """
     head = system or (f"ENPD {20 / mm}",)
     lines = [
         "VERS 140124 258 36214",
@@ -51,7 +55,9 @@ def zmx(
 
 
 def seq(*system: str, surfaces=DOUBLET, more: dict[int, list[str]] | None = None, mm=1.0, far="0.1e14") -> bytes:
-    """The doublet as a .seq file. `system` lines come first; what they do not say is RDM, DIM M and EPD 20."""
+    """The doublet as a .seq file. `system` lines come first; what they do not say is RDM, DIM M
+    and EPD 20.
+    """
     said = {line.split()[0].split(";")[0].upper() for line in system}
     lines = list(system)
     lines += [] if "RDM" in said else ["RDM;LEN"]
@@ -85,7 +91,9 @@ def index(glass, um: float) -> float:
 
 
 def focal_length_mm(lens) -> float:
-    """The paraxial focal length of a centred lens at its primary wavelength: y, nu from surface to surface."""
+    """The paraxial focal length of a centred lens at its primary wavelength: y, nu from surface
+    to surface.
+    """
     um = lens.wavelengths_um[lens.primary]
     y, nu, before = 1.0, 0.0, 1.0
     gaps = np.diff([surface.origin_mm[2] for surface in lens.surfaces])
@@ -98,7 +106,9 @@ def focal_length_mm(lens) -> float:
 
 
 def real_rays(lens, at, along):
-    """Places and directions (3, n) in the image's axes, and which rays pass all apertures: Newton, and Snell in vectors."""
+    """Places and directions (3, n) in the image's axes, and which rays pass all apertures:
+    Newton, and Snell in vectors.
+    """
     um = lens.wavelengths_um[lens.primary]
     passed = np.ones(at.shape[1], dtype=bool)
     before = 1.0
@@ -142,7 +152,9 @@ def _sag(surface, r2):
 
 
 def axial_bundle(lens, rays: int = 101):
-    """Rays (3, n) of a star on the axis, evenly in a pupil of the lens's diameter, from before its first surface."""
+    """Rays (3, n) of a star on the axis, evenly in a pupil of the lens's diameter, from before
+    its first surface.
+    """
     grid = np.array(np.meshgrid(*[(np.arange(rays) + 0.5) / rays * 2 - 1] * 2)).reshape(2, -1)
     inside = grid[:, (grid**2).sum(axis=0) <= 1] * lens.pupil / 2
     at = np.concatenate([inside, np.full((1, inside.shape[1]), -50.0)])

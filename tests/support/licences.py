@@ -8,15 +8,19 @@ from importlib import metadata
 
 from packaging.requirements import Requirement
 
-# A package under the MIT licence pulls nothing that asks more of whoever passes it on. The LGPL is refused as well: nothing is
-# under it today, and a bench's frozen image would have to keep such a library exchangeable.
+# A package under the MIT licence pulls nothing that asks more of whoever passes it on. The LGPL is
+# refused as well: nothing is under it today, and a bench's frozen image would have to keep such a
+# library exchangeable.
 COPYLEFT = re.compile(r"\b[AL]?GPL|GNU (Affero |Lesser |Library (or Lesser )?)?General Public", re.IGNORECASE)
 UNKNOWN = "states no licence"
-MAX_NAME_CHARACTERS = 100  # the field `License` holds a name, or the whole text, whose beginning names it
+# the field `License` holds a name, or the whole text, whose beginning names it
+MAX_NAME_CHARACTERS = 100
 
 
 def licence_of(package: metadata.Distribution) -> str:
-    """What a distribution states: its SPDX expression, else its classifiers, else the beginning of its field `License`."""
+    """What a distribution states: its SPDX expression, else its classifiers, else the beginning
+    of its field `License`.
+    """
     said = package.metadata
     if expression := said.get("License-Expression"):
         return str(expression)
@@ -30,7 +34,9 @@ def is_copyleft(licence: str) -> bool:
 
 
 def pulled_by(requirements: Iterable[str]) -> dict[str, str]:
-    """The licence of each distribution that requirements install here, and of all that those require, by name."""
+    """The licence of each distribution that requirements install here, and of all that those
+    require, by name.
+    """
     found: dict[str, str] = {}
     seen: set[tuple[str, str]] = set()
     waiting = [(Requirement(text), "") for text in requirements]

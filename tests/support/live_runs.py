@@ -1,4 +1,6 @@
-"""A live run in this process that lasts as long as what is asked of it takes, on a machine of any speed."""
+"""A live run in this process that lasts as long as what is asked of it takes, on a machine of
+any speed.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ LONGER_THAN_A_STALL = 60  # frames; their median is what the program does
 def serve_until(
     bench: Bench, link: AnyLink, enough: Callable[[list[Shown], Running], object], outlet: Outlet | None = None
 ) -> tuple[RunSummary, list[Shown]]:
-    """Serve until `enough` is true of the frames so far and of the run's counts, PATIENCE_S at most; the frames."""
+    """Serve until `enough` is true of the frames so far and of the run's counts, PATIENCE_S at
+    most; the frames.
+    """
     frames: list[Shown] = []
     runs: list[Running] = []
 
@@ -38,7 +42,8 @@ def serve_until(
 
 
 def attitudes(frames: list[Shown]) -> list[tuple[int, Attitude]]:
-    """Of the frames that show one: the time whose attitude that is, on the sender's clock, and the attitude.
+    """Of the frames that show one: the time whose attitude that is, on the sender's clock, and the
+    attitude.
 
     It is the frame's own time, unless its packet came so long ago that no more is predicted.
     """
@@ -50,6 +55,8 @@ def attitudes(frames: list[Shown]) -> list[tuple[int, Attitude]]:
 
 
 def median_age_ns(frames: list[Shown]) -> int:
-    """The median age of the newest frames' attitudes: one that a machine that stood still made old does not count."""
+    """The median age of the newest frames' attitudes: one that a machine that stood still made
+    old does not count.
+    """
     ages = sorted(each.attitude.age_ns for each in frames[-LONGER_THAN_A_STALL:] if each.attitude is not None)
     return ages[len(ages) // 2]

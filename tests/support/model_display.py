@@ -1,4 +1,6 @@
-"""A model of a display, its driver and the kernel's time stamps, on a clock that moves only when somebody waits."""
+"""A model of a display, its driver and the kernel's time stamps, on a clock that moves only when
+somebody waits.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ DRAW_NS = 1_000_000  # of a frame
 
 
 def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
-    """What a window on a display that is as the small bench has it says of it, but for `changes`."""
+    """What a window on a display that is as the small bench has it says of it, but for
+    `changes`.
+    """
     plain = {
         "size_px": (320, 240),
         "by_wayland": False,
@@ -42,7 +46,9 @@ def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
 
 
 def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Screen, ModelDisplay]:
-    """The small bench on a model display, before the gate: all but the window and what is drawn on it is real."""
+    """The small bench on a model display, before the gate: all but the window and what is drawn
+    on it is real.
+    """
     clock = FakeClock(FIRST_NS + 123_456)
     model = ModelDisplay(clock, round(1e9 / hz), **display)
     config = parse_config(folder / "bench.toml", SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"))
@@ -63,10 +69,11 @@ def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Scree
 class ModelDisplay:
     """A window whose frames flip at vertical blanks, `period_ns` apart.
 
-    A frame is flipped at the first blank that is `deadline_ns` after its swap, one frame a blank. The driver has `buffers`
-    with the one on the screen: with two of them whoever asks for the next one waits for the flip. `stamp_ns` is how far the
-    driver's time stamp of a flip lies after its blank, None where it gives none; `stampless` are flips without one. A
-    `variable` display has no grid: it shows a frame at once, a period after the last one at the earliest.
+    A frame is flipped at the first blank that is `deadline_ns` after its swap, one frame a blank.
+    The driver has `buffers` with the one on the screen: with two of them whoever asks for the next
+    one waits for the flip. `stamp_ns` is how far the driver's time stamp of a flip lies after its
+    blank, None where it gives none; `stampless` are flips without one. A `variable` display has no
+    grid: it shows a frame at once, a period after the last one at the earliest.
     """
 
     def __init__(
@@ -108,12 +115,16 @@ class ModelDisplay:
         return swapped_ns
 
     def wait(self) -> None:
-        """Wait for the next back buffer, as the presenter does: no more frames than are held wait for their flip."""
+        """Wait for the next back buffer, as the presenter does: no more frames than are held
+        wait for their flip.
+        """
         if len(self.flips_ns) > self._held:
             self._until(self.flips_ns[-1 - self._held])
 
     def _stamp(self) -> int | None:
-        """The driver's own wait for the last flip, and its time; the wait ends at the blank, whatever its stamp says."""
+        """The driver's own wait for the last flip, and its time; the wait ends at the blank,
+        whatever its stamp says.
+        """
         if self._stamp_ns is None or self._stampless(len(self.flips_ns)):
             return None
         self._until(self.flips_ns[-1])

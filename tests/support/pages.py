@@ -1,4 +1,6 @@
-"""The operator's page from outside: requests as bytes on a socket, and a WebSocket without hilstar."""
+"""The operator's page from outside: requests as bytes on a socket, and a WebSocket without
+hilstar.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ class PageAddress:
     def ask(
         self, path: str, method: str = "GET", body: bytes | str | None = None, headers: dict[str, str] | None = None
     ) -> tuple[int, dict[str, str], bytes]:
-        """Status, headers (lower case) and body of the answer; with the token unless `headers` says otherwise."""
+        """Status, headers (lower case) and body of the answer; with the token unless `headers`
+        says otherwise.
+        """
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         own = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         try:
@@ -153,7 +157,9 @@ class Live:
 
 @contextmanager
 def live(page: PageAddress, headers: dict[str, str] | None = None, token: str | None = None) -> Iterator[Live]:
-    """A WebSocket to a page that lets it in. Raises ConnectionRefusedError with the status where it does not."""
+    """A WebSocket to a page that lets it in. Raises ConnectionRefusedError with the status where
+    it does not.
+    """
     token = page.token if token is None else token
     with socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S) as connection:
         protocol = WSConnection(ConnectionType.CLIENT)

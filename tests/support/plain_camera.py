@@ -1,7 +1,9 @@
-"""A tracker that is none of hilstar's, with a snapshot command: ... SCREEN OUTPUT.png [--reversed] [--exposure S].
+"""A tracker that is none of hilstar's, with a snapshot command: ... SCREEN OUTPUT.png [--reversed]
+[--exposure S].
 
-Points of light through a pinhole before the screen of the twin's small bench, with noise; `--reversed` turns the rows round.
-SCREEN is a picture of 16 bits or the file of an X server's screen.
+Points of light through a pinhole before the screen of the twin's small bench, with noise;
+`--reversed` turns the rows round. SCREEN is a picture of 16 bits or the file of an X server's
+screen.
 """
 
 from __future__ import annotations
@@ -70,7 +72,9 @@ class _Request(socketserver.StreamRequestHandler):
 
 @contextmanager
 def on_duty() -> Iterator[str]:
-    """A camera that need not be started for each image: the command that asks it, to be followed by SCREEN OUTPUT.png."""
+    """A camera that need not be started for each image: the command that asks it, to be followed
+    by SCREEN OUTPUT.png.
+    """
     with socketserver.TCPServer(("127.0.0.1", 0), _Request) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()

@@ -1,4 +1,6 @@
-"""Benches whose truth is planted: what `hilstar certify` has to find, drawn without any of its code."""
+"""Benches whose truth is planted: what `hilstar certify` has to find, drawn without any of its
+code.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ sprite_sigma_px = [0.85, 0.85]
 
 @dataclass(frozen=True)
 class Plant:
-    """What is drawn of a bench: one number each, so that a test can hold one and draw the others."""
+    """What is drawn of a bench: one number each, so that a test can hold one and draw the
+    others.
+    """
 
     gamma: float
     wave: float
@@ -102,7 +106,9 @@ def drawn(rng: np.random.Generator) -> Plant:
 
 
 def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") -> tuple[Path, Path]:
-    """Write BENCH.toml, which knows nothing of the plant, and TRUTH.toml with its files; their paths."""
+    """Write BENCH.toml, which knows nothing of the plant, and TRUTH.toml with its files; their
+    paths.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     codes = np.arange(256) / 255
     light = codes**one.gamma * (1 + one.wave * np.sin(4 * codes)) / (1 + one.wave * np.sin(4.0)) + one.black
@@ -137,7 +143,8 @@ def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") 
 
 @dataclass
 class Counted:
-    """A figure of a kind and region over many benches: whether each interval held the truth, its error and its uncertainty.
+    """A figure of a kind and region over many benches: whether each interval held the truth, its
+    error and its uncertainty.
 
     `absent` counts the benches whose certificate did not assess it.
     """
@@ -149,7 +156,9 @@ class Counted:
 
     @property
     def ratio(self) -> float:
-        """The stated uncertainty over the true error, by the median of their ratios: 1 where errors are as large as stated."""
+        """The stated uncertainty over the true error, by the median of their ratios: 1 where
+        errors are as large as stated.
+        """
         return NORMAL_MEDIAN / float(np.median(np.abs(self.error) / np.maximum(self.standard, 1e-300)))
 
 
@@ -160,7 +169,9 @@ EXACT_LENS = "[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = 0
 
 
 def stated_lens() -> str:
-    """A statement of the tracker's lens as it is planted in `own_lens`: the largest of its field, k = 2."""
+    """A statement of the tracker's lens as it is planted in `own_lens`: the largest of its
+    field, k = 2.
+    """
     largest_arcsec = TRACKER_K1 * SEEN_TANGENT**3 * ARCSEC
     return f"[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = {2 * largest_arcsec!r}\n"
 
@@ -175,7 +186,8 @@ def coverage(
         bench = BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
         path.write_text(f"{bench}[certify]\nfields = 1\n{keys}{tables}")
         file = read_bench_file(path)
-        # Every bench file is the same, so that its stars are; one batch of trials knows an end within 2 % of the half width.
+        # Every bench file is the same, so that its stars are; one batch of trials knows an end
+        # within 2 % of the half width.
         stars = assembly.reference_stars(file)
         patch.setattr(assembly, "reference_stars", lambda file: stars)
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
@@ -191,14 +203,17 @@ DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
 
 
 def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted]:
-    """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin draws it."""
+    """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin
+    draws it.
+    """
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with pytest.MonkeyPatch.context() as patch:
         stars = None
         for number in range(benches):
             with TemporaryDirectory() as name:
                 folder, keys = Path(name), f"[certify]\nfields = 1\n{EXACT_LENS}{DETECTOR}"
-                # The virtual monitor warms up from its first image on: with a drift the truth file is not the first reading's.
+                # The virtual monitor warms up from its first image on: with a drift the truth file
+                # is not the first reading's.
                 one = replace(drawn(np.random.default_rng((seed, number))), drift_percent_per_h=0.0)
                 bench, truth = (read_bench_file(path) for path in plant(folder, one, keys, DETECTOR))
                 if stars is None:

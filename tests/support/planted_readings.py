@@ -1,7 +1,9 @@
-"""Benches whose truth is planted by code of its own, and their readings, of each kind that certificates have to hold.
+"""Benches whose truth is planted by code of its own, and their readings, of each kind that
+certificates have to hold.
 
-Nothing here goes through certify's fits, hilstar's lens or its response: a pixel's direction is a polynomial of its own,
-light a table by code, and errors are drawn here. A star's place and pixels alone are the certificate's: it certifies them.
+Nothing here goes through certify's fits, hilstar's lens or its response: a pixel's direction is a
+polynomial of its own, light a table by code, and errors are drawn here. A star's place and pixels
+alone are the certificate's: it certifies them.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ SEEN_TANGENT = 512 / TRACKER_FOCAL_PX  # half of the tracker's field
 
 
 class SmoothField:
-    """A random field of unit variance whose correlation falls as exp(-d^2 / 2 L^2), by random cosines."""
+    """A random field of unit variance whose correlation falls as exp(-d^2 / 2 L^2), by random
+    cosines.
+    """
 
     def __init__(self, length_px: float, rng: np.random.Generator) -> None:
         self._wave = rng.standard_normal((2, WAVES)) / length_px
@@ -128,7 +132,9 @@ def in_time(rng: np.random.Generator) -> Truth:
 
 
 def in_place(rng: np.random.Generator, length_px: float = 0.0, share: float = 0.0) -> Truth:
-    """Dots whose errors have a smooth part, of 30 to 300 px and 1 to 50 % of the noise's variance."""
+    """Dots whose errors have a smooth part, of 30 to 300 px and 1 to 50 % of the noise's
+    variance.
+    """
     one = supposed(rng)
     length_px, share = length_px or _between(rng, 30, 300), share or _between(rng, 0.01, 0.5)
     size = one.dot_noise_px * math.sqrt(share)
@@ -228,7 +234,9 @@ class PlantedReader:
 
 
 def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int | None], float]:
-    """The figures of a bench with `calibration = "srgb"`, an ideal lens and a delay of DELAY_MS, by quantity and star."""
+    """The figures of a bench with `calibration = "srgb"`, an ideal lens and a delay of DELAY_MS,
+    by quantity and star.
+    """
     signal = np.arange(256) / 255
     expected = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
     found: dict[tuple[str, int | None], float] = {}
@@ -236,7 +244,8 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
     for star in stars:
         code = np.array([int(np.argmin(np.abs(expected - math.exp(light)))) for light in star.log_light])
         x, y = np.array([star.x_px]), np.array([star.y_px])
-        # Light of a star's pixels is even over it: a field of 30 px changes by 0.1 % of itself over a star's sigma.
+        # Light of a star's pixels is even over it: a field of 30 px changes by 0.1 % of itself over
+        # a star's sigma.
         here = one.white / WHITE_E_PER_S * one.even(np.rint(x), np.rint(y))[0]
         found["flux", star.hip] = -2.5 * math.log10(here * float(star.share @ (one.light[code] / expected[code])))
         wanted = np.array([(x[0] - (SIZE_PX[0] - 1) / 2) / FOCAL_PX, (y[0] - (SIZE_PX[1] - 1) / 2) / FOCAL_PX])
@@ -245,7 +254,8 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
         ray, true = np.append(wanted, 1.0), np.append(seen, 1.0)
         ray, true = ray / np.linalg.norm(ray), true / np.linalg.norm(true)
         a, b, c = ray
-        rows.append(np.array([[0, c, -b], [-c, 0, a], [b, -a, 0]]))  # the cross product turn x ray, by the turn
+        # the cross product turn x ray, by the turn
+        rows.append(np.array([[0, c, -b], [-c, 0, a], [b, -a, 0]]))
         moved.append(true)
         rays.append(ray)
     # The rotation that brings the commanded rays nearest to the true ones, by Gauss and Newton.

@@ -1,4 +1,6 @@
-"""The ledger of a run that showed a planted tracker's attitudes, and that tracker's telemetry, as files."""
+"""The ledger of a run that showed a planted tracker's attitudes, and that tracker's telemetry,
+as files.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ def write_ledger(
     bench: str = SMALL_BENCH,
     missed_before: Sequence[int] = (),
 ) -> Path:
-    """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none.
+    """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the
+    attitudes (n, 4), or none.
 
     The sender's clock is the host's; `records` are written among the frames by their host time.
     """

@@ -1,4 +1,6 @@
-"""Photographs of a planted camera, by a renderer of their own: no part of hilstar's cameras, PSFs, light or detector."""
+"""Photographs of a planted camera, by a renderer of their own: no part of hilstar's cameras,
+PSFs, light or detector.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ FAINTEST_V_MAG = 12.0
 
 @dataclass(frozen=True)
 class Planted:
-    """A camera: lens, PSF sigmas (px, in the middle and by the square of the half diagonals), light and detector."""
+    """A camera: lens, PSF sigmas (px, in the middle and by the square of the half diagonals),
+    light and detector.
+    """
 
     focal_px: float = 3000.0
     centre_px: tuple[float, float] = (326.0, 234.0)
@@ -38,7 +42,9 @@ class Planted:
 
 @dataclass(frozen=True)
 class Extras:
-    """What is wrong in a photograph: false stars (x, y, electrons), a trail's two ends, a cloud over the lower right corner."""
+    """What is wrong in a photograph: false stars (x, y, electrons), a trail's two ends, a cloud
+    over the lower right corner.
+    """
 
     false_stars: tuple[tuple[float, float, float], ...] = ()
     trail_px: tuple[tuple[float, float], tuple[float, float]] | None = None
@@ -46,7 +52,8 @@ class Extras:
     sky_times: float = 1.0
     smear_px: float = 0.0
     stars: bool = True
-    zenith: tuple[float, ...] | None = None  # ICRS: 58.3 arcsec tan z of refraction, and k_mag sec z of extinction
+    # ICRS: 58.3 arcsec tan z of refraction, and k_mag sec z of extinction
+    zenith: tuple[float, ...] | None = None
     k_mag: float = 0.0
     blur_px: float = 0.0
 

@@ -1,4 +1,6 @@
-"""A tracker whose errors are known: attitudes by SciPy's rotations, errors written as functions of where a star is."""
+"""A tracker whose errors are known: attitudes by SciPy's rotations, errors written as functions
+of where a star is.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def still(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def attitude(motion: Motion, t_s: FloatArray) -> Rotation:
-    """q_icrs_to_cam: A3(-roll) A1(90 - dec) A3(90 - ra) of vectors, as the thesis' eq. 2.3 has it the other way round."""
+    """q_icrs_to_cam: A3(-roll) A1(90 - dec) A3(90 - ra) of vectors, as the thesis' eq. 2.3 has
+    it the other way round.
+    """
     ra, dec, roll = motion(t_s)
     from_cam = Rotation.from_euler("ZXZ", np.stack([ra - 90, dec - 90, roll], axis=1), degrees=True)
     return from_cam.inv()
@@ -62,7 +66,9 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Planted:
-    """A run and a tracker's telemetry, and what was planted in it; `fov` (3,) is the rms that came of it."""
+    """A run and a tracker's telemetry, and what was planted in it; `fov` (3,) is the rms that
+    came of it.
+    """
 
     frames_s: FloatArray
     frames_q: FloatArray
@@ -80,7 +86,9 @@ def star_px(rotation: Rotation, q_at: Rotation) -> FloatArray:
 
 
 def odometer_px(rotation: Rotation) -> FloatArray:
-    """How far the field has moved across the boresight, px (n, 2), summed over the turns from answer to answer."""
+    """How far the field has moved across the boresight, px (n, 2), summed over the turns from
+    answer to answer.
+    """
     step = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
     moved = np.concatenate([np.zeros((1, 2)), np.cumsum(step[:, 1::-1] * [1, -1], axis=0)])
     return SCALE.focal_px * moved

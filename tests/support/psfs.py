@@ -1,4 +1,6 @@
-"""Point spread functions in closed form, their samples, and their light in pixels by brute force."""
+"""Point spread functions in closed form, their samples, and their light in pixels by brute
+force.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import j1
 
-Profile = Callable[[np.ndarray, np.ndarray], np.ndarray]  # light a px^2 at x, y in px from the chief ray
+# light a px^2 at x, y in px from the chief ray
+Profile = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def gaussian(sigma_x: float, sigma_y: float, x0: float = 0.0, y0: float = 0.0) -> Profile:
@@ -40,7 +43,9 @@ def sampled(profile: Profile, per_px: int, half_px: int) -> np.ndarray:
 
 
 def in_pixels(profile: Profile, x_px: np.ndarray, y_px: np.ndarray, nodes: int = 12) -> np.ndarray:
-    """The light in pixels centred at these columns and rows, by Gauss-Legendre quadrature in each of four quarters."""
+    """The light in pixels centred at these columns and rows, by Gauss-Legendre quadrature in
+    each of four quarters.
+    """
     place, weight = np.polynomial.legendre.leggauss(nodes)
     place, weight = np.concatenate([(place - 1) / 4, (place + 1) / 4]), np.tile(weight / 4, 2)
     x, y = x_px[None, :, None, None] + place[None, None, None, :], y_px[:, None, None, None] + place[None, None, :, None]

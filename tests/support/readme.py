@@ -17,6 +17,8 @@ def blocks(language: str) -> list[str]:
 
 
 def plain_pytest(folder: Path) -> dict[str, str]:
-    """The environment of a reader whose pytest has no plugins of others, and no configuration above the folder."""
+    """The environment of a reader whose pytest has no plugins of others, and no configuration
+    above the folder.
+    """
     (folder / "pytest.ini").write_text("[pytest]\n")
     return os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}

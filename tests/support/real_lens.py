@@ -1,4 +1,6 @@
-"""A strongly bent lens of 17 degrees before a tilted screen, as a geometry file, and its truth by textbook formulas alone."""
+"""A strongly bent lens of 17 degrees before a tilted screen, as a geometry file, and its truth
+by textbook formulas alone.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def write_bench(folder: Path, text: str = BENCH) -> Path:
 
 
 def true_places_px(folder: Path, cam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where directions (n, 3) in cam are shown, px, by the geometry file; NaN for those that do not reach the screen."""
+    """Where directions (n, 3) in cam are shown, px, by the geometry file; NaN for those that do
+    not reach the screen.
+    """
     lens = tomllib.loads((folder / "geometry.toml").read_text())
     w, *v = np.array(lens["q_cam_to_mon"]) / np.linalg.norm(lens["q_cam_to_mon"])
     mon = cam + 2 * np.cross(v, np.cross(v, cam) + w * cam)

@@ -1,4 +1,6 @@
-"""A serial port behind a real socket (RFC 2217, by pyserial's own server), that keeps when its line RTS went up and down."""
+"""A serial port behind a real socket (RFC 2217, by pyserial's own server), that keeps when its
+line RTS went up and down.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from tests.support.waiting import PATIENCE_S
 
 
 class KeptLine(LoopSerial):
-    """A port whose RTS is looped to its CTS; `edges` has the host time (ns) and level of each change."""
+    """A port whose RTS is looped to its CTS; `edges` has the host time (ns) and level of each
+    change.
+    """
 
     def __init__(self, port: str | None = "loop://") -> None:
         self.edges: list[tuple[int, bool]] = []
@@ -34,7 +38,9 @@ class KeptLine(LoopSerial):
 
 
 class RtsServer:
-    """One port for one client at a time at `url`; `cut` breaks the connection, and refuses others until `mend`."""
+    """One port for one client at a time at `url`; `cut` breaks the connection, and refuses
+    others until `mend`.
+    """
 
     def __init__(self) -> None:
         self.line = KeptLine()

@@ -21,7 +21,9 @@ def with_checksum(line: str) -> str:
 
 
 def element_set(number: int, angles_deg: tuple[float, float, float, float], eccentricity: float, turns_a_day: float) -> str:
-    """Two lines by inclination, right ascension of the node, argument of perigee, mean anomaly; the station's date."""
+    """Two lines by inclination, right ascension of the node, argument of perigee, mean anomaly;
+    the station's date.
+    """
     inclination, node, perigee, anomaly = angles_deg
     first = f"1 {number:05d}U 98067A   {EPOCH} -.00002182  00000-0 -11606-4 0  292"
     second = (
@@ -32,7 +34,9 @@ def element_set(number: int, angles_deg: tuple[float, float, float, float], ecce
 
 
 def some_orbits(rng: np.random.Generator, count: int) -> str:
-    """A list of satellites in low, middle, eccentric (12 h) and geostationary orbits, by turns, called S0, S1 and so on."""
+    """A list of satellites in low, middle, eccentric (12 h) and geostationary orbits, by turns,
+    called S0, S1 and so on.
+    """
     kinds = ((15.4, 0.001), (14.2, 0.002), (2.0056, 0.01), (2.0056, 0.7), (1.0027, 0.0003))
     sets = []
     for k in range(count):
@@ -43,7 +47,9 @@ def some_orbits(rng: np.random.Generator, count: int) -> str:
 
 
 def satellite_sky(text: str, orbit: Orbit | None = None, table: str = "norad\n", utc: str = STATION_UTC) -> MovingSky:
-    """A sky with a list of satellites alone, by default seen from the station; V = 0 is V0_E_PER_S."""
+    """A sky with a list of satellites alone, by default seen from the station; V = 0 is
+    V0_E_PER_S.
+    """
     orbit = orbit or TleOrbit(STATION_TLE, "station.tle")
     start = utc_ns(utc)
     found = read_satellites(text, "tles.txt", start)

@@ -22,12 +22,15 @@ LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
 
 
 def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:
-    """An attitude as docs and firmware_protocol/protocol.toml lay it out; a rate of None is none."""
+    """An attitude as docs and firmware_protocol/protocol.toml lay it out; a rate of None is
+    none.
+    """
     body = struct.pack("<BBHIq4d3f", 1, 1, rate is not None, sequence, t_ns, *q, *(rate or (0.0, 0.0, 0.0)))
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-# Ports under those that the system gives to whoever asks for any; each process of tests begins elsewhere.
+# Ports under those that the system gives to whoever asks for any; each process of tests begins
+# elsewhere.
 PORTS = range(20_000, 32_000)
 MAX_HELD = 128  # of the newest ports: no test has so many, and a process may open 1024 files
 _next = itertools.count(os.getpid() * 211)
@@ -35,9 +38,11 @@ _held: deque[socket.socket] = deque()
 
 
 def free_port() -> int:
-    """A port of this machine that nobody has, over TCP or UDP, and that no other test is given, of whatever process.
+    """A port of this machine that nobody has, over TCP or UDP, and that no other test is given, of
+    whatever process.
 
-    Between this and the moment it is bound, a name of its own in the kernel (it goes with this process) keeps it from others.
+    Between this and the moment it is bound, a name of its own in the kernel (it goes with this
+    process) keeps it from others.
     """
     for number in _next:
         port = PORTS[number % len(PORTS)]
@@ -51,7 +56,8 @@ def free_port() -> int:
             name.close()
             continue
         _held.append(name)
-        # A socket that is dropped unclosed is a warning, and a warning fails whichever test runs then.
+        # A socket that is dropped unclosed is a warning, and a warning fails whichever test runs
+        # then.
         if len(_held) > MAX_HELD:
             _held.popleft().close()
         return port
@@ -63,7 +69,9 @@ _publishers: dict[int, zmq.Socket] = {}
 
 @contextmanager
 def publisher() -> Iterator[tuple[zmq.Socket, int]]:
-    """A plain publishing socket, bound, which is told of its subscribers (an XPUB is a PUB that says so); and its port."""
+    """A plain publishing socket, bound, which is told of its subscribers (an XPUB is a PUB that
+    says so); and its port.
+    """
     context = zmq.Context()
     sender = publishing(context)
     sender.setsockopt(zmq.LINGER, 1000)
@@ -95,7 +103,9 @@ def await_subscriber(sender: zmq.Socket) -> None:
 
 
 def await_subscriber_of(port: int) -> None:
-    """Wait for a subscription at the publisher that is bound to a port; nothing is waited for where there is none."""
+    """Wait for a subscription at the publisher that is bound to a port; nothing is waited for
+    where there is none.
+    """
     if port in _publishers:
         await_subscriber(_publishers[port])
 

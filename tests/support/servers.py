@@ -26,7 +26,9 @@ STATUS = re.compile(r"(\d+) frames, \d+ missed; (\d+) packets, (\d+) refused")
 
 
 class Run(Started):
-    """A command that shows frames, and what it says of itself to whoever runs it as a service (sd_notify)."""
+    """A command that shows frames, and what it says of itself to whoever runs it as a service
+    (sd_notify).
+    """
 
     def __init__(self, command: list[str]) -> None:
         self._told = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -38,7 +40,9 @@ class Run(Started):
         super().__init__(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | own)
 
     def counts(self) -> tuple[int, int, int]:
-        """How many frames it has shown so far, how many packets it has received, and how many of those it refused."""
+        """How many frames it has shown so far, how many packets it has received, and how many of
+        those it refused.
+        """
         with contextlib.suppress(BlockingIOError):
             while told := self._told.recv(4096):
                 if found := STATUS.search(told.decode()):
@@ -54,7 +58,9 @@ class Run(Started):
         self._await(lambda: self.counts()[0] >= frames, f"{frames} frames")
 
     def has_received(self, packets: int) -> None:
-        """Wait until it has counted so many packets: at its end those that it has not read yet are lost."""
+        """Wait until it has counted so many packets: at its end those that it has not read yet
+        are lost.
+        """
         self._await(lambda: self.counts()[1] >= packets, f"{packets} packets")
 
     def has_refused(self, packets: int) -> None:
@@ -82,7 +88,8 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[Run]:
         try:
             assert process.stderr is not None
             first = process.stderr.readline()
-            while first and first_words not in first:  # a sender that is there already may be met before
+            # a sender that is there already may be met before
+            while first and first_words not in first:
                 first = process.stderr.readline()
             assert first_words in first, first
             yield process
@@ -92,7 +99,9 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[Run]:
 
 @contextmanager
 def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[Run]:
-    """`hilstar serve` of the small bench on a port, once it has subscribed to the publisher there, if there is one."""
+    """`hilstar serve` of the small bench on a port, once it has subscribed to the publisher
+    there, if there is one.
+    """
     bench = tmp_path / "serve.toml"
     text = SMALL_BENCH if "[render]" in attitude else LIVE_BENCH
     bench.write_text(text.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude))

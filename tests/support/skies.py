@@ -23,7 +23,8 @@ YEAR_NS = 31_557_600 * 10**9
 SKYFIELD_NAMES = dict(zip(ALL_BODIES, ("sun", "moon", "mercury", "venus"), strict=False)) | {
     name: f"{name.lower()} barycenter" for name in PLANETS[2:]
 }
-# A satellite at 420 km: the station's elements of 2008-09-20, the example of the TLE format in its English Wikipedia article.
+# A satellite at 420 km: the station's elements of 2008-09-20, the example of the TLE format in its
+# English Wikipedia article.
 STATION_TLE = """\
 ISS (ZARYA)
 1 25544U 98067A   08264.51782528 -.00002182  00000-0 -11606-4 0  2927

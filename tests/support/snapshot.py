@@ -1,4 +1,6 @@
-"""Ask a camera of `plain_camera.on_duty` for an image: snapshot.py PORT SCREEN OUTPUT.png [...]; it starts at once."""
+"""Ask a camera of `plain_camera.on_duty` for an image: snapshot.py PORT SCREEN OUTPUT.png [...];
+it starts at once.
+"""
 
 import socket
 import sys

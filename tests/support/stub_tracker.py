@@ -1,8 +1,10 @@
-"""A simulator and a tracker in one process of their own: attitudes out over ZeroMQ, answers out over a serial line.
+"""A simulator and a tracker in one process of their own: attitudes out over ZeroMQ, answers out
+over a serial line.
 
-`python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`: the keys are those of `Stub`. The tracker reports what was
-commanded in the middle of each exposure, with errors that are planted here, one JSON object a line. Its `mode` is the host's
-clock just before it writes, ns. It ends when its standard input does, and then prints which answers were wild.
+`python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`: the keys are those of `Stub`.
+The tracker reports what was commanded in the middle of each exposure, with errors that are planted
+here, one JSON object a line. Its `mode` is the host's clock just before it writes, ns. It ends when
+its standard input does, and then prints which answers were wild.
 """
 
 from __future__ import annotations

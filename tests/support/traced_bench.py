@@ -1,4 +1,6 @@
-"""What a tracker sees of dots on a bench of traced rays (hilstar.instruments.study.geometry), in any pose, with any loss."""
+"""What a tracker sees of dots on a bench of traced rays (hilstar.instruments.study.geometry), in
+any pose, with any loss.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def observed_dots(
     pose_matrix: FloatArray | None = None,
     pose: int = 0,
 ) -> Observed:
-    """What a tracker, turned by `pose_matrix`, sees of a plan's dots: a share lost, as many false ones, Gaussian noise."""
+    """What a tracker, turned by `pose_matrix`, sees of a plan's dots: a share lost, as many
+    false ones, Gaussian noise.
+    """
     directions = bench.directions(plan.x_px, plan.y_px)
     x, y = tracker.project(directions if pose_matrix is None else directions @ pose_matrix.T)
     seen = dots_seen(plan, x, y, tracker.resolution_px, DotFaults(noise_px, lost, false), rng)

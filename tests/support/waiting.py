@@ -15,8 +15,8 @@ from pathlib import Path
 from hilstar.basics.process.scheduling import FIFO_PRIORITY
 from hilstar.basics.units import NS_PER_S
 
-# Ten times what anything here takes on an idle machine, for one that has ten times the work of its cores to do; what never
-# comes costs a failing test this long.
+# Ten times what anything here takes on an idle machine, for one that has ten times the work of its
+# cores to do; what never comes costs a failing test this long.
 PATIENCE_S = 300
 INSTALLED_WITHIN_S = 1800  # what pip brings, from a registry that may be slow
 CHANCES = 3
@@ -34,20 +34,26 @@ def wait_for(holds: Callable[[], object], what: object = "", poll_s: float = 0.0
 
 
 class TooLate(AssertionError):
-    """What was to be in time was not: because of the program, or because the machine stood still or was busy elsewhere."""
+    """What was to be in time was not: because of the program, or because the machine stood still
+    or was busy elsewhere.
+    """
 
 
 def in_time(holds: object, what: object = "") -> None:
-    """Raise TooLate unless it holds: for what a machine that stands still for half a second breaks."""
+    """Raise TooLate unless it holds: for what a machine that stands still for half a second
+    breaks.
+    """
     if not holds:
         raise TooLate(what)
 
 
 def best_of_three(reason: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A test whose program was TooLate has two more chances, each in a folder of its own: a fault of the program stays.
+    """A test whose program was TooLate has two more chances, each in a folder of its own: a fault
+    of the program stays.
 
-    Only for claims of time that the program makes, and only what is asked through `in_time`; all else fails at once.
-    `reason` says what of this machine, that the test cannot measure, makes it late.
+    Only for claims of time that the program makes, and only what is asked through `in_time`; all
+    else fails at once. `reason` says what of this machine, that the test cannot measure, makes it
+    late.
     """
     assert reason
 
@@ -72,10 +78,12 @@ def best_of_three(reason: str) -> Callable[[Callable[..., None]], Callable[..., 
 
 
 class CoreWaits:
-    """How long a process, what it has begun and this one have waited for a core while this is open: `s`.
+    """How long a process, what it has begun and this one have waited for a core while this is open:
+    `s`.
 
-    Linux counts it for each thread (proc(5), schedstat); a kernel that does not gives 0. Waits of threads at the same time add
-    up, so at most MAX_HELD_UP_S count: what never comes fails on any machine, and what is late on an idle one at once.
+    Linux counts it for each thread (proc(5), schedstat); a kernel that does not gives 0. Waits of
+    threads at the same time add up, so at most MAX_HELD_UP_S count: what never comes fails on any
+    machine, and what is late on an idle one at once.
     """
 
     def __init__(self, pid: int) -> None:
@@ -107,7 +115,8 @@ class CoreWaits:
                     waited_ns = int((task / "schedstat").read_text().split()[1])
                     self._first.setdefault(str(task), waited_ns)
                     self._last[str(task)] = waited_ns
-                    if process != os.getpid():  # what else this one has begun is no part of the claim
+                    # what else this one has begun is no part of the claim
+                    if process != os.getpid():
                         self._look(set(map(int, (task / "children").read_text().split())))
 
     def __enter__(self) -> CoreWaits:
@@ -150,9 +159,11 @@ def repeating(work: Callable[[], object], pause_s: float) -> Iterator[None]:
 
 @contextmanager
 def real_time() -> Iterator[None]:
-    """This thread, and the processes that it starts meanwhile, at real-time priority where that is allowed.
+    """This thread, and the processes that it starts meanwhile, at real-time priority where that is
+    allowed.
 
-    For what stands for hardware (a display, a diode and its line): what else the machine has to do holds up neither.
+    For what stands for hardware (a display, a diode and its line): what else the machine has to do
+    holds up neither.
     """
     policy = os.sched_getscheduler(0), os.sched_getparam(0)
     with contextlib.suppress(OSError):

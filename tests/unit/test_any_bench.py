@@ -1,4 +1,6 @@
-"""The tool that tries benches by chance: what it draws, how it judges, and that it goes on where it was stopped."""
+"""The tool that tries benches by chance: what it draws, how it judges, and that it goes on where
+it was stopped.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,8 @@ def test_the_truth_compared_with_itself_is_off_by_nothing_and_the_bench_file_by_
     assert np.abs(itself.off_mag).max() < EXACT
     assert len(itself.off_px) > 100
     seen = SeenScreen.of(file, truth)
-    assert np.nanmedian(seen.off_px) > 1.0  # mounting, tilt and focal length are other than the file's
+    # mounting, tilt and focal length are other than the file's
+    assert np.nanmedian(seen.off_px) > 1.0
 
 
 @pytest.mark.parametrize("flip_x", [False, True])
@@ -154,7 +157,9 @@ def test_an_outcome_is_the_worst_that_happened_in_its_own_words(results, compare
 
 
 def test_what_has_ended_is_not_run_again(tmp_path, monkeypatch):
-    """Stopped after its session: the next run takes the session from its file, and a finished bench its row."""
+    """Stopped after its session: the next run takes the session from its file, and a finished
+    bench its row.
+    """
     ran = []
 
     def ended(folder, limit_s, commands):

@@ -1,4 +1,6 @@
-"""What a FITS header says of its image, by the standard and by the software of cameras; each case as a small file."""
+"""What a FITS header says of its image, by the standard and by the software of cameras; each
+case as a small file.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ UTC_TOLERANCE_NS = 1000  # Astropy's text has ns; an MJD as float64 has a micros
 
 
 def mosaic(pattern: str) -> np.ndarray:
-    """An image whose levels say the colour of a pattern from its first pixel, and a little noise."""
+    """An image whose levels say the colour of a pattern from its first pixel, and a little
+    noise.
+    """
     cell = np.array([LEVELS[colour] for colour in pattern]).reshape(2, 2)
     noise = np.random.default_rng(1).integers(0, 50, (SIDE_PX, SIDE_PX))
     return (np.tile(cell, (SIDE_PX // 2, SIDE_PX // 2)) + noise).astype(np.uint16)

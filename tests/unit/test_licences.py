@@ -1,4 +1,6 @@
-"""hilstar is under the MIT licence: nothing that `pip install .` pulls is under the GPL, AGPL or LGPL."""
+"""hilstar is under the MIT licence: nothing that `pip install .` pulls is under the GPL, AGPL or
+LGPL.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Temporary folders that a killed process left are deleted by the next one of the same user, and nothing else is."""
+"""Temporary folders that a killed process left are deleted by the next one of the same user, and
+nothing else is.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,19 @@
-"""A sender's clock that jumps or runs slow: samples in, the same samples on a clock without jumps out; no I/O.
+"""A sender's clock that jumps or runs slow: samples in, the same samples on a clock without jumps
+out; no I/O.
 
 Laws:
-1. A jump shows in t_ns itself: its step differs from the usual one. A message that arrives slightly early or late while t_ns
+1. A jump shows in t_ns itself: its step differs from the usual one. A message that arrives slightly
+   early or late while t_ns
    advances as usual had a shorter or longer delay, and is taken as it is.
-2. Samples in doubt wait for the next ones. Three that agree are a jump, and continue where the old clock stood. An early one
-   that the next contradicts is refused. Late ones that do not agree were queued, and are taken as they are.
+2. Samples in doubt wait for the next ones. Three that agree are a jump, and continue where the old
+   clock stood. An early one
+   that the next contradicts is refused. Late ones that do not agree were queued, and are taken as
+   they are.
 3. A message that waited unread may be late by as long as it waited, and teaches nothing.
 4. Until the clock is settled, a message that arrives early shows that those before it were late.
 
-A sender that stamps with hilstar's own clock, or with Unix time, needs none of this (`KnownClockFilter`).
+A sender that stamps with hilstar's own clock, or with Unix time, needs none of this
+(`KnownClockFilter`).
 """
 
 from collections import deque
@@ -25,7 +30,8 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.wrong_sky import CLOCK, ENDS
 
 PACE_SLOTS = 9
-MIN_ODD_PACE = 0.004  # twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast
+# twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast
+MIN_ODD_PACE = 0.004
 STEPS = 31
 MIN_STEPS = 8
 MAX_MISSING = 1000  # a sequence that advances by more does not count packets
@@ -38,23 +44,28 @@ UNSETTLED_NS = 100 * NS_PER_MS
 SETTLED_AFTER = 50  # messages, and
 SETTLED_AFTER_NS = 2 * NS_PER_S
 MAX_DOUBT_NS = 250 * NS_PER_MS
-# How early a message may be against a first guess: one that waited, perhaps for minutes, or one that was read late.
+# How early a message may be against a first guess: one that waited, perhaps for minutes, or one
+# that was read late.
 MAX_GUESSED_LATE_NS = 60 * NS_PER_S
 MAX_FOUND_LATE_NS = NS_PER_S
 WAITED_UNKNOWN_NS = 2**62  # a message that was there before anybody listened
 TRUSTED_WAIT_NS = NS_PER_MS  # a shorter wait is within what the clock's minimum filter removes
-CLEARLY_LATE_FOR_NS = 3 * LATE_FOR_NS  # late by a constant time while t_ns itself shows no jump: a sender that was stopped
+# late by a constant time while t_ns itself shows no jump: a sender that was stopped
+CLEARLY_LATE_FOR_NS = 3 * LATE_FOR_NS
 UNKNOWN_DRIFT = 1e-4  # while nothing arrives, the clocks part by this share of the time
-MAX_FOLLOWED_NS = 60 * NS_PER_S  # what a slow clock may fall behind before it is known to be slow; more is surely a jump
+# what a slow clock may fall behind before it is known to be slow; more is surely a jump
+MAX_FOLLOWED_NS = 60 * NS_PER_S
 USUAL_SHARE = 0.95
 MAX_OFF_NS = NS_PER_S  # a sender may predict, or be late
 MIN_FUTURE_NS = 5 * NS_PER_MS
 PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
 MIN_OFF = 3
-AHEAD_FOR_NS = 3 * NS_PER_S // 10  # no queue makes a packet early; a step of this machine's clock is followed in 0.2 s
+# no queue makes a packet early; a step of this machine's clock is followed in 0.2 s
+AHEAD_FOR_NS = 3 * NS_PER_S // 10
 BEHIND, MIN_BEHIND_NS, BEHIND_EACH_NS = "clock-behind", 50 * NS_PER_MS, 2 * NS_PER_S
 SHARED_FOR_NS = NS_PER_S  # how long a clock must agree before it is believed again
-# By how much other clocks are behind Unix time, s: TAI - UTC is 37 s since 2017 (IERS Bulletin C), GPS is 19 s behind TAI.
+# By how much other clocks are behind Unix time, s: TAI - UTC is 37 s since 2017 (IERS Bulletin C),
+# GPS is 19 s behind TAI.
 OTHER_CLOCKS = {
     "TAI": -37.0,
     "GPS time counted from 1970": -18.0,
@@ -73,7 +84,8 @@ class _TimeSteps:
     def __init__(self) -> None:
         self._last: AttitudeSample | None = None
         self._usual_ns: deque[float] = deque(maxlen=STEPS)
-        self._newest_ns, self._packets = 0, 1  # the newest step of t_ns, and how many packets it spans
+        # the newest step of t_ns, and how many packets it spans
+        self._newest_ns, self._packets = 0, 1
 
     def add(self, sample: AttitudeSample) -> None:
         if self._last is not None:
@@ -94,7 +106,9 @@ class _TimeSteps:
 
 
 class _Pace:
-    """The rate of the sender's clock, from the earliest messages of each slot of the last two seconds."""
+    """The rate of the sender's clock, from the earliest messages of each slot of the last two
+    seconds.
+    """
 
     def __init__(self) -> None:
         self.slowness = 0.0
@@ -129,7 +143,8 @@ class _Doubtful(NamedTuple):
 
 
 class JumpFilter:
-    """Samples with the sender's times in, samples with continuous times out, in the order of arrival.
+    """Samples with the sender's times in, samples with continuous times out, in the order of
+    arrival.
 
     It teaches `clock` what it accepts, on the continuous times.
     """
@@ -157,7 +172,9 @@ class JumpFilter:
 
     @property
     def slowness(self) -> float:
-        """The share by which the sender's clock is slow: 0.5 at half speed, negative where it is fast."""
+        """The share by which the sender's clock is slow: 0.5 at half speed, negative where it is
+        fast.
+        """
         return self._pace.slowness
 
     def forgive(self) -> None:
@@ -168,7 +185,8 @@ class JumpFilter:
         """The samples that this one decides, itself among them unless it is in doubt."""
         self._steps.add(arrival.event)
         late_ns = self._late_ns(arrival)
-        known = self._clock.synchronised  # then packets that get later at their usual steps are queueing on the link
+        # then packets that get later at their usual steps are queueing on the link
+        known = self._clock.synchronised
         if _is_timely(arrival):
             self._pace.add(arrival.host_ns, arrival.host_ns - arrival.event.t_ns)
             if self.slowness > 0 and not known and MIN_LIMIT_NS < late_ns < MAX_FOLLOWED_NS:
@@ -214,9 +232,12 @@ class JumpFilter:
         return self._late_limit_ns(host_ns) if self.settled else MAX_FOUND_LATE_NS
 
     def _agrees(self, arrival: SampleArrival, late_ns: float) -> bool:
-        """True where this one supports the samples in doubt: it is off by the same time, and follows them."""
+        """True where this one supports the samples in doubt: it is off by the same time, and
+        follows them.
+        """
         by_ns = AGREEMENT_NS if self._shows_none else self._agreement_ns
-        if abs(late_ns) > MAX_FOLLOWED_NS:  # by jitter such samples may differ; a queue is never as late
+        # by jitter such samples may differ; a queue is never as late
+        if abs(late_ns) > MAX_FOLLOWED_NS:
             by_ns = UNSETTLED_NS
         follows = arrival.event.t_ns > self._doubtful[-1].arrival.event.t_ns
         return follows and abs(late_ns - self._doubtful[0].late_ns) <= by_ns
@@ -253,7 +274,9 @@ class JumpFilter:
             self._agreement_ns = max(AGREEMENT_NS, usual_max_ns)
 
     def _jumped(self, host_ns: int) -> list[SampleArrival]:
-        """The samples in doubt where they prove a jump, on a clock that is carried across it; else []."""
+        """The samples in doubt where they prove a jump, on a clock that is carried across it;
+        else [].
+        """
         late_ns = [each.late_ns for each in self._doubtful]
         for_ns = host_ns - self._doubtful[0].arrival.host_ns
         if self._shows_none and not self._resumes:
@@ -263,7 +286,8 @@ class JumpFilter:
         if not is_jump or len(late_ns) < MIN_AGREEING:
             return []
         is_new = not self._resumes
-        self.correction_ns += round(min(late_ns))  # the earliest of them is then as late as the earliest ever was
+        # the earliest of them is then as late as the earliest ever was
+        self.correction_ns += round(min(late_ns))
         released = self.release()
         if is_new:
             self.jumps += 1
@@ -277,7 +301,9 @@ def _too_early(each: _Doubtful) -> SampleArrival:
 
 
 def clock_named(late_ns: int) -> str | None:
-    """The clock that is behind Unix time by `late_ns`, as far as one is known by that; None for none."""
+    """The clock that is behind Unix time by `late_ns`, as far as one is known by that; None for
+    none.
+    """
     late_s = late_ns / NS_PER_S
     for name, behind_s in OTHER_CLOCKS.items():
         if abs(late_s - behind_s) < NEAR_S:
@@ -289,7 +315,9 @@ def clock_named(late_ns: int) -> str | None:
 
 
 class KnownClockFilter:
-    """Takes the place of a `JumpFilter`: refuses times far ahead, and says where the clock is another one, and when no more."""
+    """Takes the place of a `JumpFilter`: refuses times far ahead, and says where the clock is
+    another one, and when no more.
+    """
 
     correction_ns = 0
     jumps = 0
@@ -302,10 +330,13 @@ class KnownClockFilter:
         self._off = 0
         self._least_late_ns = 0  # of the packets that are off
         self._told = False
-        self._quickest: tuple[int, int] | None = None  # since when, and by how much the quickest packet since then was late
+        # since when, and by how much the quickest packet since then was late
+        self._quickest: tuple[int, int] | None = None
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
-        """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the clock's."""
+        """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the
+        clock's.
+        """
         t_ns, host_ns = arrival.event.t_ns, arrival.host_ns
         late_ns = round(self._clock.latency_ns(t_ns, host_ns) or 0.0)
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
@@ -314,7 +345,8 @@ class KnownClockFilter:
             self._look_behind(late_ns, host_ns)
             return [arrival]
         self._shared_since_ns = None
-        # A link and a busy machine make packets late, and never early: the least late one is the clock's.
+        # A link and a busy machine make packets late, and never early: the least late one is the
+        # clock's.
         if self._off_since_ns is None:
             self._off_since_ns, self._least_late_ns = host_ns, late_ns
         self._least_late_ns = min(self._least_late_ns, late_ns)
@@ -337,7 +369,9 @@ class KnownClockFilter:
             self._notices.end(CLOCK, ENDS[CLOCK], f"t_ns agrees with {CLOCK_NAMES[self._clock.mode]} of this machine again")
 
     def _look_behind(self, late_ns: int, host_ns: int) -> None:
-        """Say where even the quickest packet of some seconds comes late: times alone do not tell a link from a clock."""
+        """Say where even the quickest packet of some seconds comes late: times alone do not tell
+        a link from a clock.
+        """
         if self._quickest is None or host_ns - self._quickest[0] > 2 * BEHIND_EACH_NS:
             self._quickest = host_ns, late_ns
             return

@@ -1,9 +1,12 @@
-"""What a sender's packets show of it, whatever they say: how many were lost on the way, and the unit of their times; no I/O.
+"""What a sender's packets show of it, whatever they say: how many were lost on the way, and the
+unit of their times; no I/O.
 
 Laws of the count:
-1. A sender counts its packets in `sequence`, by one each or by another constant; what is missing between the first and the
+1. A sender counts its packets in `sequence`, by one each or by another constant; what is missing
+   between the first and the
    newest was lost. One that comes late was not, and one that comes twice counts once.
-2. `sequence` wraps at 2^32. A step back beyond RECENT, or ahead by more than MAX_GAP, is a sender that began anew.
+2. `sequence` wraps at 2^32. A step back beyond RECENT, or ahead by more than MAX_GAP, is a sender
+   that began anew.
 3. A sender whose `sequence` never changes does not count.
 """
 
@@ -33,7 +36,9 @@ OTHERS = 3  # paces in a row that are of no such unit: one may be uneven
 
 
 class LossCount:
-    """Counts packets that never came, from the `sequence` of those that did; `lost` falls where one comes late."""
+    """Counts packets that never came, from the `sequence` of those that did; `lost` falls where
+    one comes late.
+    """
 
     def __init__(self) -> None:
         self._closed = 0  # of senders that have begun anew since
@@ -78,7 +83,9 @@ class LossCount:
 
 
 class TimeUnit:
-    """Names the unit of a sender's times where it is not the nanosecond, by how fast they run against the host's clock."""
+    """Names the unit of a sender's times where it is not the nanosecond, by how fast they run
+    against the host's clock.
+    """
 
     def __init__(self, notices: Notices) -> None:
         self._notices = notices

@@ -1,9 +1,12 @@
-"""What is wrong with rates that are not those of their own attitudes, from stretches of packets; no I/O.
+"""What is wrong with rates that are not those of their own attitudes, from stretches of packets; no
+I/O.
 
-A stretch has the turn of its quaternions and the mean of its rates, each with its own noise. A cause without a free number (a
-unit, a sign, an order of axes) is found in MIN_STRETCHES in a row. One with a free number (a factor, a rotation, a constant)
-needs more. Rates may be right and the quaternions read in the wrong convention: then the rates fit another reading of their
-four numbers. Rates that are late fit and do not fit by turns: they are compared with the turn some time before (`lag_of`).
+A stretch has the turn of its quaternions and the mean of its rates, each with its own noise. A
+cause without a free number (a unit, a sign, an order of axes) is found in MIN_STRETCHES in a row.
+One with a free number (a factor, a rotation, a constant) needs more. Rates may be right and the
+quaternions read in the wrong convention: then the rates fit another reading of their four numbers.
+Rates that are late fit and do not fit by turns: they are compared with the turn some time before
+(`lag_of`).
 """
 
 import itertools
@@ -28,10 +31,12 @@ MAX_STEP_RAD = 1.5  # from packet to packet: half a turn has no direction
 MIN_TURN_RAD_S = math.radians(0.01)
 MIN_OFF_RAD_S, MIN_GROSS_RAD_S = math.radians(0.05), math.radians(1.0)
 OFF_SHARE, FIT_SHARE, AXES_SHARE, GROSS_SHARE = 0.2, 0.1, 0.03, 0.5  # shares of the faster turn
-MAX_HELD_SHARE = 0.2  # maximum share of packets that repeat an attitude: a turn in steps is not the camera's
+# maximum share of packets that repeat an attitude: a turn in steps is not the camera's
+MAX_HELD_SHARE = 0.2
 OFF_SIGMA, FIT_SIGMA, TURN_SIGMA = 6.0, 4.0, 3.0
 MIN_BETTER = 3.0  # a cause leaves at most a third of the error
-WALK = 1.1  # white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
+# white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
+WALK = 1.1
 STEADY_SHARE = 0.2
 SHARP_SHARE = 0.25  # the shares of the turn that noise may hide, for another reading
 MUCH_LESS = 0.5
@@ -48,10 +53,13 @@ HOW_IT_SENDS = "look at what the simulator puts into its quaternion"
 
 @dataclass(frozen=True, slots=True)
 class ReadAs:
-    """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says, then by `q_body_to_cam` (4,).
+    """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says,
+    then by `q_body_to_cam` (4,).
 
-    That is None where they are the camera's own. `has_key` says whether the key states how the source is read; a source
-    with a convention of its own refuses it. `stated_by` is what states it: that key, or a command's option.
+    That is None where they are the camera's own. `has_key` says whether the key states how the
+    source is read; a source
+    with a convention of its own refuses it. `stated_by` is what states it: that key, or a command's
+    option.
     """
 
     scalar: str = "first"
@@ -62,7 +70,9 @@ class ReadAs:
 
     @classmethod
     def of(cls, conventions: Conventions, convention: Convention, mounting: Mounting, stated_by: str = KEY) -> "ReadAs":
-        """How a source of these conventions is read, where `convention` and `mounting` are stated."""
+        """How a source of these conventions is read, where `convention` and `mounting` are
+        stated.
+        """
         q_body_to_cam = mounting.q_body_to_cam if conventions.of_body else None
         if not conventions.of_packets:
             return cls(q_body_to_cam=q_body_to_cam, has_key=False)
@@ -82,7 +92,9 @@ AS_PACKETS = ReadAs()
 
 
 class Reading(NamedTuple):
-    """Another reading of a quaternion's four numbers: what it is, what to write for it, and (n, 4) read by it."""
+    """Another reading of a quaternion's four numbers: what it is, what to write for it, and
+    (n, 4) read by it.
+    """
 
     text: str
     advice: str
@@ -121,11 +133,13 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
 
 @dataclass(slots=True)
 class Stretch:
-    """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s; times ns of the sender's clock.
+    """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s; times ns of
+    the sender's clock.
 
-    `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
-    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`. `error` is how
-    far turn and rate are apart, rad/s, and `is_off` says that this is more than their noise and what rates may be off.
+    `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if
+    they had ICRS components. `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to
+    the times `at_s` (n,) after `from_ns`. `error` is how far turn and rate are apart, rad/s, and
+    `is_off` says that this is more than their noise and what rates may be off.
     """
 
     turn: FloatArray
@@ -161,10 +175,12 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that multiplies their noise by.
+    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that
+    multiplies their noise by.
 
-    They are taken to have ICRS components where `in_icrs`, else the camera's. `constant` (3,), rad/s, is added to them all.
-    Where they fit another `reading` of the quaternions, it is the sky that is wrong.
+    They are taken to have ICRS components where `in_icrs`, else the camera's. `constant` (3,),
+    rad/s, is added to them all. Where they fit another `reading` of the quaternions, it is the sky
+    that is wrong.
     """
 
     text: str
@@ -247,7 +263,9 @@ def _turns_rad(q: FloatArray) -> FloatArray:
 
 
 def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
-    """Turn and mean rate of packets in the order of their times; None where most of them follow a break."""
+    """Turn and mean rate of packets in the order of their times; None where most of them follow
+    a break.
+    """
     t_s = np.array([sample.t_ns - samples[0].t_ns for sample in samples]) / NS_PER_S
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     rate = np.array([sample.rate_cam_rad_s for sample in samples])
@@ -299,10 +317,11 @@ def cause_of(
     history_s: float = math.inf,
     others: Sequence[Cause] = READ_OTHERWISE,
 ) -> Cause | None:
-    """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None where they may be right.
+    """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None
+    where they may be right.
 
-    `length_s` is how long a stretch is meant to be, `history_s` for how long `lag_of` could look already, and `others` are the
-    other readings of the quaternions.
+    `length_s` is how long a stretch is meant to be, `history_s` for how long `lag_of` could look
+    already, and `others` are the other readings of the quaternions.
     """
     if sum(not stretch.is_off for stretch in stretches) > len(stretches) // MORE_STRETCHES:
         return None
@@ -317,7 +336,9 @@ def cause_of(
 
 
 def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
-    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far better than with it."""
+    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far
+    better than with it.
+    """
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [cause.error(stretch) for stretch in stretches]
     fitting = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
@@ -327,12 +348,14 @@ def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
 def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> Cause | None:
     """The simplest of the causes without a free choice that explains the rates.
 
-    `read` is the other reading of the quaternions that does; `sharp` says that noise hides no other turn.
+    `read` is the other reading of the quaternions that does; `sharp` says that noise hides no other
+    turn.
     """
     other = "" if read is None or read.reading is None else f", or {_stated(read.reading)}"
     for cause in CAUSES:
         if _explains(stretches, cause, FIT_SHARE):
-            # Of a turn about an axis that both readings share nothing tells a sign from a conjugate.
+            # Of a turn about an axis that both readings share nothing tells a sign from a
+            # conjugate.
             return replace(cause, text=cause.text + other)
     if read is not None and sharp:
         return read
@@ -348,7 +371,9 @@ def _stated(reading: Reading) -> str:
 
 
 def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float) -> Cause | None:
-    """A cause with a free number that explains the rates, or that nothing does though they are far off."""
+    """A cause with a free number that explains the rates, or that nothing does though they are
+    far off.
+    """
     if len(stretches) < MORE_STRETCHES:
         return None
     turns, rates = (np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate"))
@@ -375,7 +400,9 @@ def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float)
 
 
 def _constant(stretches: Sequence[Stretch], off: FloatArray) -> Cause | None:
-    """A constant that is added to the rates; `off` (n, 3) is by how much they differ from the turns, rad/s."""
+    """A constant that is added to the rates; `off` (n, 3) is by how much they differ from the
+    turns, rad/s.
+    """
     constant = off.mean(axis=0)
     x, y, z = np.degrees(constant).tolist()
     cause = Cause(f"a constant ({x:.3g}, {y:.3g}, {z:.3g}) deg/s is added to them", SAME, constant=constant)
@@ -388,7 +415,9 @@ def off_share(stretch: Stretch) -> float:
 
 
 def fits(stretch: Stretch, was_off: float) -> bool:
-    """Whether a turn shows that its rates are right again, where they were off by a share of the turn: noise hides no half."""
+    """Whether a turn shows that its rates are right again, where they were off by a share of the
+    turn: noise hides no half.
+    """
     limit = _limit(stretch, FIT_SHARE, FIT_SIGMA)
     return stretch.turns and _error(stretch, stretch.rate) <= limit < MUCH_LESS * was_off * _turning(stretch)
 
@@ -416,9 +445,11 @@ def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> 
 
 
 class LagFit(NamedTuple):
-    """Rates against the turn over some seconds, medians, rad/s: how fast it turned, how far off rates are, and their lag.
+    """Rates against the turn over some seconds, medians, rad/s: how fast it turned, how far off
+    rates are, and their lag.
 
-    `lag_s` is by how much rates are late, negative where they are early; 0 where none explains the error.
+    `lag_s` is by how much rates are late, negative where they are early; 0 where none explains the
+    error.
     """
 
     fast_rad_s: float
@@ -427,9 +458,11 @@ class LagFit(NamedTuple):
 
 
 def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
-    """Whether rates are those of the turn some time before; None where successive stretches are too short to say.
+    """Whether rates are those of the turn some time before; None where successive stretches are too
+    short to say.
 
-    Medians: of a single jump a mean would be mended by any lag that moves it out of what is compared.
+    Medians: of a single jump a mean would be mended by any lag that moves it out of what is
+    compared.
     """
     if not stretches or stretches[-1].to_ns - stretches[0].from_ns < MIN_HISTORY_S * NS_PER_S:
         return None
@@ -499,6 +532,8 @@ def _between(t_s: FloatArray, summed: FloatArray, edges_s: FloatArray) -> FloatA
 
 
 def _least(lags_s: FloatArray, off: FloatArray) -> float:
-    """The lag of the smallest error: the shortest of those that are nearly as good, as in a swing a whole period more is."""
+    """The lag of the smallest error: the shortest of those that are nearly as good, as in a
+    swing a whole period more is.
+    """
     good = lags_s[off <= off.min() + LAG_TIE * (off.max() - off.min())]
     return float(good[np.abs(good).argmin()])

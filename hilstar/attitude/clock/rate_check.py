@@ -1,12 +1,18 @@
 """Whether the rates that packets carry are those of their own attitudes, packet by packet; no I/O.
 
 Laws:
-1. Stretches of packets are compared: the turn of their quaternions with the mean of their rates, each with its own noise.
-2. A stretch whose attitude turns by less than its noise says nothing; nor does one that jumps, or stands and steps.
-3. Rates are wrong where all of MIN_STRETCHES in a row (or all but one of MORE_STRETCHES) are off by far more than the noise and
-   either one cause explains them all, or the error is gross. They are right again where all of MIN_STRETCHES fit.
-4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long one a slow turn in noise.
-5. Late rates fit and do not fit by turns: the last HISTORY_S are compared with the turn before, and by the whole of it they are
+1. Stretches of packets are compared: the turn of their quaternions with the mean of their rates,
+   each with its own noise.
+2. A stretch whose attitude turns by less than its noise says nothing; nor does one that jumps, or
+   stands and steps.
+3. Rates are wrong where all of MIN_STRETCHES in a row (or all but one of MORE_STRETCHES) are off by
+   far more than the noise and
+   either one cause explains them all, or the error is gross. They are right again where all of
+   MIN_STRETCHES fit.
+4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long
+   one a slow turn in noise.
+5. Late rates fit and do not fit by turns: the last HISTORY_S are compared with the turn before, and
+   by the whole of it they are
    right again.
 """
 
@@ -50,14 +56,18 @@ WRONG, RIGHT = RATES, ENDS[RATES]
 STRETCHES_S = (0.1, 0.2, LONGEST_S)
 MANY_WITHOUT = 20
 MAX_GAP_NS = NS_PER_S // 2
-RESTART_NS = NS_PER_S  # t_ns goes back by as much where a sender starts anew; by less where packets overtake each other
+# t_ns goes back by as much where a sender starts anew; by less where packets overtake each other
+RESTART_NS = NS_PER_S
 HISTORY_S = 4.0
 LAG_EACH_NS = NS_PER_S // 2
-LATE_NO_MORE = 8  # comparisons in a row by which late rates are right again: a slow swing has times without an error
+# comparisons in a row by which late rates are right again: a slow swing has times without an error
+LATE_NO_MORE = 8
 
 
 def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) -> Cause | None:
-    """The first cause that a log's samples show, all of which have rates; None where they show none."""
+    """The first cause that a log's samples show, all of which have rates; None where they show
+    none.
+    """
     length, others = _Length(0.0), tuple(read_otherwise(readings(read_as)))
     for sample in samples:
         if length.add(sample) and (cause := _first_cause(length, math.inf, others)) is not None:
@@ -98,7 +108,9 @@ class _Length:
 
 
 class _History:
-    """The last HISTORY_S of rates and turns, as stretches that follow each other without a break."""
+    """The last HISTORY_S of rates and turns, as stretches that follow each other without a
+    break.
+    """
 
     def __init__(self) -> None:
         self._stretches: deque[Stretch] = deque()
@@ -135,8 +147,8 @@ class _History:
 class RateCheck:
     """Follows one sender: tells of wrong rates once, and of right ones after that.
 
-    `wrong` says what is done with rates that are: "off" looks at nothing. `used` is False for a run that draws without rates.
-    `read_as` is how quaternions have been read.
+    `wrong` says what is done with rates that are: "off" looks at nothing. `used` is False for a run
+    that draws without rates. `read_as` is how quaternions have been read.
     """
 
     def __init__(
@@ -155,7 +167,8 @@ class RateCheck:
         self._history = _History()
         self._late: LagFit | None = None  # as it was when rates were found to be late
         self._no_more = 0
-        self._was_off = 0.0  # by which share of the turn rates were off when they were found to be wrong
+        # by which share of the turn rates were off when they were found to be wrong
+        self._was_off = 0.0
         self._last_ns: int | None = None
         self._without = 0  # packets in a row without a rate
         self.cause: Cause | None = None
@@ -187,7 +200,9 @@ class RateCheck:
         return replace(sample, rate_cam_rad_s=None, acceleration_cam_rad_s2=None)
 
     def _follows(self, sample: AttitudeSample) -> bool:
-        """False for a packet that others overtook; a gap and a sender that starts anew begin anew."""
+        """False for a packet that others overtook; a gap and a sender that starts anew begin
+        anew.
+        """
         last_ns = self._last_ns
         if last_ns is not None and last_ns - RESTART_NS < sample.t_ns <= last_ns:
             return False

@@ -1,7 +1,8 @@
 """The steps in which a sender rounds its quaternions: three decimals are 0.06 degrees. No I/O.
 
-A sample's quaternion has been scaled to unit length, so that its components are no multiples of the step any more; but times
-one unknown norm, within half a step of 1, they are again. Exact numbers need no such norm, and are not rounded.
+A sample's quaternion has been scaled to unit length, so that its components are no multiples of the
+step any more; but times one unknown norm, within half a step of 1, they are again. Exact numbers
+need no such norm, and are not rounded.
 """
 
 import math
@@ -14,7 +15,8 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 COARSE = "coarse-quaternions"
 LOOKED_AT = 60  # samples; a sender does not change its format later
 MIN_EVIDENCE = 3  # components beyond the one by which each norm is found
-# Decimals, and what fixed-point numbers and half floats have. Finer steps than MIN_ARCSEC are not looked for.
+# Decimals, and what fixed-point numbers and half floats have. Finer steps than MIN_ARCSEC are not
+# looked for.
 STEPS = (*(10.0**-k for k in range(1, 7)), *(2.0**-k for k in range(6, 19)), 1 / 127, 1 / 32767)
 MIN_ARCSEC = 1.0
 FIT = 1e-5  # of a step
@@ -55,14 +57,17 @@ class Resolution:
         if not steps:
             return
         step = max(steps)
-        # Each component is off by step / sqrt(12) rms, and the attitude by twice that about each of three axes.
+        # Each component is off by step / sqrt(12) rms, and the attitude by twice that about each of
+        # three axes.
         arcsec = 2 * math.sqrt(3 / 12) * step * ARCSEC_PER_RAD
         line = f"the quaternions come in steps of {step:.3g}: each attitude is off by {arcsec:.3g} arcsec rms"
         self._say(COARSE, f"{line}; send all their digits")
 
 
 def coarse_lines(samples: Sequence[AttitudeSample]) -> list[tuple[str, str]]:
-    """Kind and line of the notice where a log's quaternions are rounded coarsely; [] where they are not."""
+    """Kind and line of the notice where a log's quaternions are rounded coarsely; [] where they
+    are not.
+    """
     told: list[tuple[str, str]] = []
     resolution = Resolution(lambda kind, line: told.append((kind, line)))
     for sample in samples[:LOOKED_AT]:
@@ -73,7 +78,8 @@ def coarse_lines(samples: Sequence[AttitudeSample]) -> list[tuple[str, str]]:
 
 
 def _evidence(q: list[float], step: float) -> int | None:
-    """How many components show that a unit quaternion was rounded to steps; 0 for an exact one, None where it was not.
+    """How many components show that a unit quaternion was rounded to steps; 0 for an exact one,
+    None where it was not.
 
     Components of one size show as much as one of them, and the largest shows only the norm.
     """

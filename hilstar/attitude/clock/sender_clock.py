@@ -1,13 +1,18 @@
-"""The sender's clock against the host's: offset, drift and their uncertainty, from the messages' times alone; no I/O.
+"""The sender's clock against the host's: offset, drift and their uncertainty, from the messages'
+times alone; no I/O.
 
 An offset is host time minus sender time, ns, as a line over host time. Three modes:
 - "exchange": the sender answers time requests; four timestamps, as in NTP (RFC 5905, section 8).
-- "one-way": arrivals alone. A message is never early, so the line under all (arrival - t_ns) is nearest the true offset (Moon,
-  Skelly and Towsley 1999). It is too large by the minimum transport delay, which a one-way stream cannot measure. A message
-  that waited unread gives only an upper bound, which counts until one arrives that did not wait.
+- "one-way": arrivals alone. A message is never early, so the line under all (arrival - t_ns) is
+  nearest the true offset (Moon,
+  Skelly and Towsley 1999). It is too large by the minimum transport delay, which a one-way stream
+  cannot measure. A message that waited unread gives only an upper bound, which counts until one
+  arrives that did not wait.
 - "shared": the sender stamps with this machine's own clock; nothing is estimated.
-- "unix": the sender stamps with Unix time, which NTP or PTP keeps on both machines; the offset is that of this machine's own
-  clock of Unix time, its uncertainty what the kernel states of that. The error of the sender's clock comes on top.
+- "unix": the sender stamps with Unix time, which NTP or PTP keeps on both machines; the offset is
+  that of this machine's own
+  clock of Unix time, its uncertainty what the kernel states of that. The error of the sender's
+  clock comes on top.
 """
 
 import math
@@ -23,9 +28,12 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 WINDOW_NS = 30 * NS_PER_S
 SLOT_NS = NS_PER_S // 4
-MIN_DRIFT_SPAN_NS = 2 * NS_PER_S  # over a shorter span, 50 us of noise would read as more than 25 ppm
-MAX_DRIFT = 0.002  # ten times the worst crystal's; a steeper slope is a step, or t_ns is not a clock
-RECENT_SLOTS = 4  # the last second: the uncertainty comes from it, and is infinite before it is over
+# over a shorter span, 50 us of noise would read as more than 25 ppm
+MIN_DRIFT_SPAN_NS = 2 * NS_PER_S
+# ten times the worst crystal's; a steeper slope is a step, or t_ns is not a clock
+MAX_DRIFT = 0.002
+# the last second: the uncertainty comes from it, and is infinite before it is over
+RECENT_SLOTS = 4
 NEWEST = 8
 EXCHANGE_LIFE_NS = 5 * NS_PER_S
 MIN_EXCHANGES = 3
@@ -33,12 +41,13 @@ MIN_EXCHANGES = 3
 QUICK_DELAY_RATIO = 1.25
 QUICK_DELAY_NS = 100_000
 RECENT_EXCHANGES = 3
-# A corrected offset is applied gradually: a turn seems at most this much faster or slower. A larger correction is a step.
+# A corrected offset is applied gradually: a turn seems at most this much faster or slower. A larger
+# correction is a step.
 SLEW = 0.01
 MAX_SLEWED_NS = 50 * NS_PER_MS
 SETTLING_NS = 2 * NS_PER_S
-# A one-way stream cannot measure its minimum delay. That of sockets on one machine (0.02 to 0.1 ms) is in the uncertainty, so
-# that it contains the truth there; the delay of a longer link is not.
+# A one-way stream cannot measure its minimum delay. That of sockets on one machine (0.02 to 0.1 ms)
+# is in the uncertainty, so that it contains the truth there; the delay of a longer link is not.
 LOCAL_DELAY_NS = 100_000
 
 ClockMode = Literal["none", "one-way", "exchange", "shared", "unix"]
@@ -69,7 +78,9 @@ class Slots(deque[_Slot]):
     """The smallest offset of each slot, oldest first."""
 
     def lower(self, host_ns: int, offset_ns: int) -> bool:
-        """Take a message into the newest slot; False, and nothing taken, where it begins a new one."""
+        """Take a message into the newest slot; False, and nothing taken, where it begins a new
+        one.
+        """
         if not self or self[-1].host_ns // SLOT_NS != host_ns // SLOT_NS:
             return False
         if offset_ns < self[-1].offset_ns:
@@ -106,7 +117,9 @@ class OneWayFilter:
         return not self._slots
 
     def guess(self, host_ns: int, offset_ns: int) -> None:
-        """Take a message that waited unread: an upper bound, which the first one that did not wait replaces."""
+        """Take a message that waited unread: an upper bound, which the first one that did not
+        wait replaces.
+        """
         if self.guessed and (self.line is None or offset_ns < self.line.at(host_ns)):
             self.line = _OffsetLine(host_ns, offset_ns)
 
@@ -136,8 +149,9 @@ class OneWayFilter:
         above = y - drift * x
         level = float(above.min())
         above -= level
-        # The line may lie below the truth by as much as a slot's smallest offset is above it. The last slots count one by one
-        # and are carried on to the two for which the line is used: a clock may be set by less than a jump, or drift unknown.
+        # The line may lie below the truth by as much as a slot's smallest offset is above it. The
+        # last slots count one by one and are carried on to the two for which the line is used: a
+        # clock may be set by less than a jump, or drift unknown.
         uncertainty_ns, last = math.inf, above[-RECENT_SLOTS:]
         if len(last) == RECENT_SLOTS:
             rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
@@ -146,7 +160,8 @@ class OneWayFilter:
 
 
 def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
-    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x.
+    """The slope of the line under all points with the smallest sum of distances: the lower hull's
+    edge at their mean x.
 
     0 where it is steeper than any clock drifts.
     """
@@ -166,10 +181,12 @@ def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """A request leaves the host at t1 and reaches the sender at t2; the reply leaves it at t3 and arrives at t4.
+    """A request leaves the host at t1 and reaches the sender at t2; the reply leaves it at t3 and
+    arrives at t4.
 
-    t1 and t4 are host times, t2 and t3 sender times, ns. `there_ns` and `back_ns` are how long the wire alone takes for
-    request and reply: a reply longer than its request would otherwise shift the offset by half of the difference.
+    t1 and t4 are host times, t2 and t3 sender times, ns. `there_ns` and `back_ns` are how long the
+    wire alone takes for request and reply: a reply longer than its request would otherwise shift
+    the offset by half of the difference.
     """
 
     t1_ns: int
@@ -190,7 +207,9 @@ class Exchange:
         return self.delay_ns >= 0 and self.t3_ns >= self.t2_ns
 
     def offset_ns(self, base_ns: int) -> float:
-        """Host minus sender time, less `base_ns`, with the difference of the two wire times removed."""
+        """Host minus sender time, less `base_ns`, with the difference of the two wire times
+        removed.
+        """
         known = self.delay_ns >= self.there_ns + self.back_ns  # a pty has a baud rate and no wire
         longer_ns = self.back_ns - self.there_ns if known else 0
         return ((self.t1_ns - self.t2_ns - base_ns) + (self.t4_ns - self.t3_ns - base_ns) - longer_ns) / 2
@@ -216,7 +235,8 @@ class _ExchangeFilter:
         self.count += 1
         if self.line is not None:
             bound_ns = new.delay_ns / 2 + self.line.uncertainty_ns + MAX_DRIFT * (new.host_ns - self.line.host_ns)
-            if abs(new.offset_ns - self.line.at(new.host_ns)) > bound_ns:  # no drift explains it: the clock was set
+            # no drift explains it: the clock was set
+            if abs(new.offset_ns - self.line.at(new.host_ns)) > bound_ns:
                 self._measured.clear()
         self._measured.append(new)
         while new.host_ns - self._measured[0].host_ns > WINDOW_NS:
@@ -234,7 +254,8 @@ class _ExchangeFilter:
             drift = float(np.polyfit(x, y, 1)[0])
             drift = drift if abs(drift) <= MAX_DRIFT else 0.0
         level = float(np.mean(y - drift * x))
-        # The truth lies within half the delay of each exchange's own offset, however the delay divides between the two ways.
+        # The truth lies within half the delay of each exchange's own offset, however the delay
+        # divides between the two ways.
         bounds = np.abs(y - drift * x - level) + 0.5 * np.array([each.delay_ns for each in quick])
         uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
         if not drift and len(y) > 1:
@@ -250,10 +271,12 @@ class _ExchangeFilter:
 
 @dataclass(frozen=True, slots=True)
 class ClockSummary:
-    """Offset (host minus sender), drift (positive: the sender's clock runs fast), uncertainty, exchanges and jumps.
+    """Offset (host minus sender), drift (positive: the sender's clock runs fast), uncertainty,
+    exchanges and jumps.
 
-    The uncertainty bounds the error of the times that frames use; it is None until enough is known. On a one-way stream it
-    excludes the minimum transport delay beyond LOCAL_DELAY_NS, which such a stream cannot measure.
+    The uncertainty bounds the error of the times that frames use; it is None until enough is known.
+    On a one-way stream it excludes the minimum transport delay beyond LOCAL_DELAY_NS, which such a
+    stream cannot measure.
     """
 
     mode: ClockMode
@@ -265,9 +288,11 @@ class ClockSummary:
 
 
 class SenderClock:
-    """The sender's time at any host time; `mode` says where the offset comes from. One thread may observe, another ask.
+    """The sender's time at any host time; `mode` says where the offset comes from. One thread may
+    observe, another ask.
 
-    `known` is the offset of a clock that is not estimated: of the host's own one ("shared"), or of Unix time.
+    `known` is the offset of a clock that is not estimated: of the host's own one ("shared"), or of
+    Unix time.
     """
 
     def __init__(self, known: UnixOffset | None = None, mode: ClockMode = "none") -> None:
@@ -283,7 +308,9 @@ class SenderClock:
         self._used: tuple[int, float] | None = None  # host time and offset of the last frame
 
     def know(self, known: UnixOffset) -> None:
-        """Take the offset of a clock that is not estimated: a step of it is one of the next frame."""
+        """Take the offset of a clock that is not estimated: a step of it is one of the next
+        frame.
+        """
         self._line = _OffsetLine(0, known.offset_ns - self._base(known.offset_ns), uncertainty_ns=known.error_ns)
 
     def observe(self, t_ns: int, host_ns: int) -> None:
@@ -294,7 +321,9 @@ class SenderClock:
             self._choose(host_ns)
 
     def guess(self, t_ns: int, host_ns: int) -> None:
-        """Take one message that waited unread: better than nothing, until one arrives that did not."""
+        """Take one message that waited unread: better than nothing, until one arrives that did
+        not.
+        """
         if not self._known:
             self._one_way.guess(host_ns, host_ns - t_ns - self._base(host_ns - t_ns))
             self._choose(host_ns)
@@ -324,7 +353,8 @@ class SenderClock:
         self._line = exchanged or self._one_way.line
 
     def to_sender_ns(self, host_ns: int) -> int:
-        """The sender's time at a host time, slewed to the newest estimate without a step; host time before any message.
+        """The sender's time at a host time, slewed to the newest estimate without a step; host time
+        before any message.
 
         For one thread, with host times that do not go back.
         """
@@ -342,7 +372,9 @@ class SenderClock:
         return host_ns - base_ns - round(offset_ns)
 
     def latency_ns(self, t_ns: int, host_ns: int) -> float | None:
-        """A message's delay: the whole of it where exchanges run, else its excess over the minimum; None before any."""
+        """A message's delay: the whole of it where exchanges run, else its excess over the
+        minimum; None before any.
+        """
         line, base_ns = self._line, self._base_ns
         return None if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
 

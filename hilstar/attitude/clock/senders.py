@@ -1,15 +1,20 @@
-"""Who sends: a sender that hangs or whose clock has stopped, and a second sender on the same link; no I/O.
+"""Who sends: a sender that hangs or whose clock has stopped, and a second sender on the same link;
+no I/O.
 
-A link does not say who sent a message, so the messages themselves must. A sender is known by its clock (`t_ns` advances as the
-host's does, or by its usual step for each count), its count (`sequence` advances), and its sky (the attitude goes on as it
-turned).
+A link does not say who sent a message, so the messages themselves must. A sender is known by its
+clock (`t_ns` advances as the host's does, or by its usual step for each count), its count
+(`sequence` advances), and its sky (the attitude goes on as it turned).
 
 Laws:
-1. A message that agrees with the sender shown in two of the three is its own: it may restart its count, set its clock, or turn
+1. A message that agrees with the sender shown in two of the three is its own: it may restart its
+   count, set its clock, or turn
    to a new target without saying so, and it may mix packets that count with messages that do not.
-2. Any other message is a stranger's. It waits until the sender shown speaks again, and is then refused: there are two. Where
-   that one stays silent for longer than it usually is, it was the same sender, begun anew, and goes on from there.
-3. A sender that comes back on the course that it had before a stranger took its place was not that stranger.
+2. Any other message is a stranger's. It waits until the sender shown speaks again, and is then
+   refused: there are two. Where
+   that one stays silent for longer than it usually is, it was the same sender, begun anew, and goes
+   on from there.
+3. A sender that comes back on the course that it had before a stranger took its place was not that
+   stranger.
 """
 
 import math
@@ -26,11 +31,14 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 SECOND, FROZEN = "second-sender", "source-frozen"
 MIN_REPEATS = 10  # and
 MIN_REPEATED_NS = NS_PER_S // 4
-MIN_ANOTHERS_RAD = 0.1  # at one time of a clock that stands, an attitude that far away is another sender's
-MIN_STRANGE = 3  # messages of one stranger, before and after the first sender spoke again: they are a second one's
+# at one time of a clock that stands, an attitude that far away is another sender's
+MIN_ANOTHERS_RAD = 0.1
+# messages of one stranger, before and after the first sender spoke again: they are a second one's
+MIN_STRANGE = 3
 ANOTHER_COURSE_WITHIN_NS = 5 * NS_PER_S
 MAX_STRANGERS = 4
-EARLY_NS = 50 * NS_PER_MS  # from message to message t_ns may run ahead of the host's clock, or go back, by this and be one's
+# from message to message t_ns may run ahead of the host's clock, or go back, by this and be one's
+EARLY_NS = 50 * NS_PER_MS
 MIN_FAR_RAD = 5e-5  # 10 arcsec
 FAR_RATIO = 3.0  # times the recent deviation of the attitudes from their course
 PLAUSIBLE_RAD_S = math.radians(60.0)
@@ -46,7 +54,9 @@ Turn = tuple[float, float, float]
 
 
 class Repeats:
-    """Refuses messages that repeat the time of the previous one, and reports a sender that keeps doing so."""
+    """Refuses messages that repeat the time of the previous one, and reports a sender that keeps
+    doing so.
+    """
 
     def __init__(self, notices: Notices) -> None:
         self._notices = notices
@@ -57,7 +67,9 @@ class Repeats:
         self._frozen = False
 
     def judge(self, sample: AttitudeSample, host_ns: int, raw: bytes) -> Refusal | None:
-        """Why this one is refused; None where its time differs from that of the previous one, or it is another sender's."""
+        """Why this one is refused; None where its time differs from that of the previous one, or
+        it is another sender's.
+        """
         last = self._last_sample
         same_time = last is not None and sample.t_ns == last.t_ns
         if last is not None and same_time and raw != self._last:
@@ -90,7 +102,9 @@ def _steps(before: int, sequence: int) -> int:
 
 
 def _turn_rad(a: Sequence[float], b: Sequence[float]) -> Turn:
-    """The turn from attitude `a` to `b` as a rate times a second; plain floats, for every packet passes here."""
+    """The turn from attitude `a` to `b` as a rate times a second; plain floats, for every packet
+    passes here.
+    """
     w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     x = a[0] * b[1] - a[1] * b[0] - a[3] * b[2] + a[2] * b[3]
     y = a[0] * b[2] - a[2] * b[0] - a[1] * b[3] + a[3] * b[1]
@@ -104,7 +118,9 @@ def _turn_rad(a: Sequence[float], b: Sequence[float]) -> Turn:
 
 @dataclass(frozen=True, slots=True)
 class _CourseAgreement:
-    """Where a message agrees with a sender; `far_rad` is the distance of its attitude from the sender's course."""
+    """Where a message agrees with a sender; `far_rad` is the distance of its attitude from the
+    sender's course.
+    """
 
     clock: bool
     count: bool
@@ -148,7 +164,8 @@ class _KnownSender:
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
         step = _steps(self.count, sample.sequence)
         clock = -EARLY_NS <= later_ns <= max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (period_ns or 0.0))
-        if not self.still and period_ns is not None and step:  # time and count may advance together, however late it is
+        # time and count may advance together, however late it is
+        if not self.still and period_ns is not None and step:
             usual_ns = step * period_ns
             off_ns = abs(sample.t_ns - self.count_t_ns - usual_ns)
             clock = clock or off_ns <= 0.5 * period_ns + 0.05 * abs(usual_ns)
@@ -228,14 +245,17 @@ class Senders:
         self._silent_after_ns = silent_after_ns
         self._notices = notices
         self._main: _KnownSender | None = None
-        self._left: _KnownSender | None = None  # the sender shown as it was before it went elsewhere, or another took its place
+        # the sender shown as it was before it went elsewhere, or another took its place
+        self._left: _KnownSender | None = None
         self._strangers: list[_KnownSender] = []
         self._waiting: list[_Waiting] = []
         self._courses = 0  # between which the sender shown went to and fro
         self._two = False
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
-        """The messages that this one decides, in order, those of another sender than the one shown with a refusal."""
+        """The messages that this one decides, in order, those of another sender than the one
+        shown with a refusal.
+        """
         main, host_ns = self._main, arrival.host_ns
         if main is None:
             self._main = _KnownSender.of(arrival)
@@ -255,7 +275,9 @@ class Senders:
         return self._take_strange(main, arrival, rival)
 
     def expire(self, host_ns: int) -> list[SampleArrival]:
-        """Strangers' messages, where the sender shown has been silent for longer than it usually is."""
+        """Strangers' messages, where the sender shown has been silent for longer than it usually
+        is.
+        """
         main = self._main
         if main is None or not self._waiting or host_ns - main.host_ns <= main.patience_ns(self._silent_after_ns):
             return []
@@ -276,7 +298,9 @@ class Senders:
         return best
 
     def _is_its_own(self, main: _KnownSender, sample: AttitudeSample, agreed: _CourseAgreement) -> bool:
-        """Two of three agree; a turn to a new target is said, or could have been made, or comes by the usual step."""
+        """Two of three agree; a turn to a new target is said, or could have been made, or comes
+        by the usual step.
+        """
         if agreed.sky:
             return agreed.clock or agreed.count
         if agreed.count and not agreed.clock:
@@ -286,7 +310,9 @@ class Senders:
         return agreed.clock and (counts and turned)
 
     def _speaks(self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement) -> list[SampleArrival]:
-        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
+        """The sender shown has spoken: what strangers said meanwhile is refused, unless it
+        continues in one count.
+        """
         if not agreed.sky or not agreed.clock:
             self._left = replace(main)
         elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
@@ -305,13 +331,17 @@ class Senders:
         self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
 
     def _is_too_often(self, main: _KnownSender, sample: AttitudeSample) -> bool:
-        """True where one sender would hardly go to and fro like that: it has only begun to count, or it never counts."""
+        """True where one sender would hardly go to and fro like that: it has only begun to
+        count, or it never counts.
+        """
         if sample.sequence:
             return main.heard <= 2
         return main.still and self._courses >= MIN_COURSES and self._courses % 2 == 0
 
     def _comes_back(self, arrival: SampleArrival, agreed: _CourseAgreement) -> bool:
-        """Whether the sender that was left is there again, and goes on as if nothing had been between."""
+        """Whether the sender that was left is there again, and goes on as if nothing had been
+        between.
+        """
         left = self._left
         if left is None or arrival.host_ns - left.host_ns > max(left.patience_ns(self._silent_after_ns), self._silent_after_ns):
             return False
@@ -340,7 +370,8 @@ class Senders:
         else:
             sender.move(arrival, sender.agrees(arrival))
         self._waiting.append(_Waiting(arrival, sender))
-        silent_ns = arrival.host_ns - arrival.waited_ns - main.host_ns  # one that was not read for a while was not silent
+        # one that was not read for a while was not silent
+        silent_ns = arrival.host_ns - arrival.waited_ns - main.host_ns
         patience_ns = main.patience_ns(self._silent_after_ns)
         if silent_ns > max(self._silent_after_ns, 3 * (main.period_ns or 0.0)):
             self._left = None
@@ -352,7 +383,9 @@ class Senders:
         return []
 
     def _known(self, arrival: SampleArrival) -> _KnownSender | None:
-        """The stranger that this message continues in two of three, or that repeats itself in it."""
+        """The stranger that this message continues in two of three, or that repeats itself in
+        it.
+        """
         for each in self._strangers:
             its = each.agrees(arrival)
             if its.score >= 2 or (its.clock and its.plausible) or arrival.event.t_ns == each.sample.t_ns:

@@ -1,11 +1,13 @@
-"""The attitude at any time, from samples: interpolated between them, predicted for a bounded time past the last; no I/O.
+"""The attitude at any time, from samples: interpolated between them, predicted for a bounded time
+past the last; no I/O.
 
 Times are nanoseconds on one continuous clock: the sender's, with its jumps removed (`jumps`).
 
-Prediction damps the jitter of the newest rate (`_Damping`). A rate has a steady part, which a filter follows without lag
-through any constant acceleration, and jitter about it. Over a prediction time x / (2 pi f) a vibration of frequency f keeps
-sin(x) / x of its rate, noise keeps nothing. The share to keep is the regression of what followed on the jitter before it, over
-samples as far apart as frames predict. A constant rate has no jitter and passes unchanged to the last bit.
+Prediction damps the jitter of the newest rate (`_Damping`). A rate has a steady part, which a
+filter follows without lag through any constant acceleration, and jitter about it. Over a prediction
+time x / (2 pi f) a vibration of frequency f keeps sin(x) / x of its rate, noise keeps nothing. The
+share to keep is the regression of what followed on the jitter before it, over samples as far apart
+as frames predict. A constant rate has no jitter and passes unchanged to the last bit.
 """
 
 import math
@@ -30,26 +32,33 @@ AGE_SHARE = 0.1  # weight of each frame in the usual prediction time
 
 Vector = tuple[float, ...]  # three components
 NOTHING: Vector = (0.0, 0.0, 0.0)
-# A live timeline keeps one to two times this many samples, 5 s or more at 200 Hz: far more than a frame looks back.
+# A live timeline keeps one to two times this many samples, 5 s or more at 200 Hz: far more than a
+# frame looks back.
 LIVE_CAPACITY = 1024
-# A stale attitude is fresh again once it is younger than this share of `stale_after`, so that it does not flicker at the limit.
+# A stale attitude is fresh again once it is younger than this share of `stale_after`, so that it
+# does not flicker at the limit.
 FRESH_AGAIN = 0.5
 
-# Between two samples: the first one is held, SLERP takes the shorter way, or both are blended (C2) with their rates.
+# Between two samples: the first one is held, SLERP takes the shorter way, or both are blended (C2)
+# with their rates.
 Join = Literal["hold", "slerp", "blend"]
-# Past the newest: by its rate, or by what of that rate's jitter the last second's samples show to go on.
+# Past the newest: by its rate, or by what of that rate's jitter the last second's samples show to
+# go on.
 Prediction = Literal["rate", "auto"]
 Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
 class _Damped(NamedTuple):
-    """The excess of a sample's rate, rad/s, cam, over what a prediction by `ahead_s` uses; less for a shorter one."""
+    """The excess of a sample's rate, rad/s, cam, over what a prediction by `ahead_s` uses; less
+    for a shorter one.
+    """
 
     excess: Vector
     ahead_s: float
 
     def by(self, seconds: float) -> Vector:
-        share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2  # 1 - sin(x) / x goes with the square
+        # 1 - sin(x) / x goes with the square
+        share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2
         x, y, z = self.excess
         return share * x, share * y, share * z
 
@@ -82,9 +91,11 @@ class _Damping:
         self.usual_s += AGE_SHARE * (seconds - self.usual_s)
 
     def add(self, t_ns: int, rate: Vector, turn: Vector | None) -> _Damped:
-        """Take the next sample, with its turn (rad) since the previous one; returns how to damp its rate.
+        """Take the next sample, with its turn (rad) since the previous one; returns how to damp its
+        rate.
 
-        The steady part and its trend follow by the critically damped filter of second order (Brookner 1998, 1.2).
+        The steady part and its trend follow by the critically damped filter of second order
+        (Brookner 1998, 1.2).
         """
         if turn is None or not self._seen:
             self.restart()
@@ -127,10 +138,12 @@ class _Damping:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """An attitude at one time, with the age, sequence and arrival of the newest sample behind it, and whether it is too old.
+    """An attitude at one time, with the age, sequence and arrival of the newest sample behind it,
+    and whether it is too old.
 
-    `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s` the rate at that time, None
-    where the attitude is held. `velocity_km_s` is that of the sample before it, and `place_km` is carried on from that sample.
+    `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s`
+    the rate at that time, None where the attitude is held. `velocity_km_s` is that of the sample
+    before it, and `place_km` is carried on from that sample.
     """
 
     q_icrs_to_cam: FloatArray
@@ -148,8 +161,9 @@ class Attitude:
 class Policy:
     """How far to predict past the newest sample, how long it counts as fresh, and the maximum rate.
 
-    With `prediction` "auto" a rate's jitter is carried on only as far as the samples show that it goes on. A sample whose rate
-    exceeds `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
+    With `prediction` "auto" a rate's jitter is carried on only as far as the samples show that it
+    goes on. A sample whose rate exceeds `max_rate_rad_s` is refused; two samples farther apart than
+    that are a jump.
     """
 
     max_extrapolation_ns: int
@@ -179,7 +193,9 @@ class Timeline:
         return len(self._samples)
 
     def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
-        """Append a sample, or say why it is refused: its time does not increase, or its rate is too high."""
+        """Append a sample, or say why it is refused: its time does not increase, or its rate is
+        too high.
+        """
         too_fast = rate_refusal(sample, self.policy.max_rate_rad_s)
         if too_fast is not None:
             return too_fast
@@ -197,10 +213,12 @@ class Timeline:
     def at(self, t_ns: int) -> Attitude | None:
         """The attitude at `t_ns`, or None before any sample has come.
 
-        Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else SLERP;
-        before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` the earlier one is held. Past the
-        newest it is predicted with the sample's rate (else that of the last two samples; where the policy says "auto", less
-        what `damping` takes from it), and its acceleration where it has one, for at most `max_extrapolation_ns`, and then held.
+        Before the first sample it is the first. Between two it is the C2 blend of both where both
+        have rates, else SLERP; before a discontinuity, in a log's gap, and for a turn faster than
+        `max_rate_rad_s` the earlier one is held. Past the newest it is predicted with the sample's
+        rate (else that of the last two samples; where the policy says "auto", less what `damping`
+        takes from it), and its acceleration where it has one, for at most `max_extrapolation_ns`,
+        and then held.
         """
         with self._lock:
             if not self._samples:
@@ -215,7 +233,9 @@ class Timeline:
         return replace(found, velocity_km_s=near[place].velocity_km_s, place_km=self._place_km(near, place, t_ns))
 
     def _place_km(self, near: list[AttitudeSample], place: int, t_ns: int) -> FloatArray | None:
-        """Where the observer is: on the cubic through two samples, else straight on for as long as attitudes are predicted."""
+        """Where the observer is: on the cubic through two samples, else straight on for as long
+        as attitudes are predicted.
+        """
         before = near[place]
         if before.place_km is None or before.velocity_km_s is None:
             return None
@@ -255,12 +275,15 @@ class Timeline:
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
         from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
         u = age_ns / gap_ns
-        share = u * u * u * (10.0 + u * (6.0 * u - 15.0))  # first and second derivatives 0 at both ends (Perlin 2002)
+        # first and second derivatives 0 at both ends (Perlin 2002)
+        share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
         turning = (1 - share) * (rate + forward * bend) + share * (rate_after + backward * bend_after)
         return slerp(from_before, from_after, share), turning
 
     def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
-        """At sample `k`, from its neighbours' rates: equal for the intervals on both sides, which makes the blend C2."""
+        """At sample `k`, from its neighbours' rates: equal for the intervals on both sides,
+        which makes the blend C2.
+        """
         earlier = k - 1 if k and self._joined(near[k - 1], near[k]) == "blend" else k
         later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) == "blend" else k
         rate, rate_later = near[earlier].rate_cam_rad_s, near[later].rate_cam_rad_s
@@ -273,19 +296,24 @@ class Timeline:
             return "hold"
         if self._joins is not None:
             return self._joins(before, after)
-        # Rates say little about a long silence: propagated across it from both sides they overshoot; SLERP cannot.
+        # Rates say little about a long silence: propagated across it from both sides they
+        # overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
         return "blend" if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns else "slerp"
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
-        """True where the attitude jumps: the sample says so, or the turn would exceed the maximum rate."""
+        """True where the attitude jumps: the sample says so, or the turn would exceed the
+        maximum rate.
+        """
         if after.discontinuity:
             return True
         seconds = (after.t_ns - before.t_ns) / NS_PER_S
         return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self.policy.max_rate_rad_s * seconds
 
     def _rate_of(self, previous: AttitudeSample | None, newest: AttitudeSample) -> FloatArray | None:
-        """The rate for predicting past a sample: its own, else that of the turn to it; None where neither is known."""
+        """The rate for predicting past a sample: its own, else that of the turn to it; None
+        where neither is known.
+        """
         if newest.rate_cam_rad_s is not None or previous is None or self._jumped(previous, newest):
             return newest.rate_cam_rad_s
         gap_ns = newest.t_ns - previous.t_ns
@@ -294,7 +322,9 @@ class Timeline:
         return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
 
     def _damp(self, sample: AttitudeSample) -> _Damped:
-        """What a prediction takes from the rate of the next sample; nothing from one whose acceleration is known."""
+        """What a prediction takes from the rate of the next sample; nothing from one whose
+        acceleration is known.
+        """
         damping, previous = self._damping, self._samples[-1] if self._samples else None
         if damping is None or (previous is not None and sample.t_ns <= previous.t_ns):
             return UNDAMPED
@@ -311,7 +341,8 @@ class Timeline:
         stale = age_ns > self.policy.stale_after_ns
         if rate is None:
             return _held(newest, age_ns, stale)
-        # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
+        # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17,
+        # holding 144.
         prediction_ns = min(age_ns, self.policy.max_extrapolation_ns)
         seconds, bend = prediction_ns / NS_PER_S, newest.acceleration_cam_rad_s2
         if self._damping is not None:

@@ -1,25 +1,36 @@
-"""CCSDS Attitude Ephemeris Messages: 1.0 (504.0-B-1) and 2.0 (504.0-B-2) are read, as KVN or XML; 1.0 is written.
+"""CCSDS Attitude Ephemeris Messages: 1.0 (504.0-B-1) and 2.0 (504.0-B-2) are read, as KVN or XML;
+1.0 is written.
 
 Reading:
-1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas). The
-   other is a frame of the spacecraft: a camera by its name (STARTRACKER_1, INSTRUMENT_A, CAM, ...), else a body, which the
-   mounting turns into the camera. MOD, TOD, TEME and ITRF are turned to the ICRS at each epoch. Any other is refused.
-2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
-   hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
+1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's
+   differ by 23 mas). The
+   other is a frame of the spacecraft: a camera by its name (STARTRACKER_1, INSTRUMENT_A, CAM, ...),
+   else a body, which the mounting turns into the camera. MOD, TOD, TEME and ITRF are turned to the
+   ICRS at each epoch. Any other is refused.
+2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is
+   the conjugate of
+   hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the
+   scalar is (2.0: last).
 3. A rate is the angular velocity of the second frame with respect to the first.
-4. EULER_ROT_SEQ names the axes of three successive turns of the frame, from the first frame to the second; each turn is about
+4. EULER_ROT_SEQ names the axes of three successive turns of the frame, from the first frame to the
+   second; each turn is about
    an axis of the frame that the previous turns made. The angles come in that order.
-5. A spin axis is +z of the second frame, at right ascension alpha and declination delta of the first. The spin angle is the
-   third of the turns ZXZ by alpha + 90, 90 - delta and that angle (as in Orekit). With nutation, the frame turns at its spin
-   rate about +z and at the nutation rate about the angular momentum. The phase p and nutation angle n place the momentum in
-   the second frame, (sin n cos p, -sin n sin p, cos n); the type with _MOM gives it in the first frame.
-6. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are not counted.
-7. A new block begins with a discontinuity. The TOTAL spans of blocks may overlap: USEABLE_START_TIME and USEABLE_STOP_TIME
-   say where each is meant to be used. Where several blocks have a time, a useable one wins, then the one that begins later
-   (as in Orekit). Interpolation hints are ignored.
+5. A spin axis is +z of the second frame, at right ascension alpha and declination delta of the
+   first. The spin angle is the
+   third of the turns ZXZ by alpha + 90, 90 - delta and that angle (as in Orekit). With nutation,
+   the frame turns at its spin rate about +z and at the nutation rate about the angular momentum.
+   The phase p and nutation angle n place the momentum in the second frame, (sin n cos p, -sin n sin
+   p, cos n); the type with _MOM gives it in the first frame.
+6. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are
+   not counted.
+7. A new block begins with a discontinuity. The TOTAL spans of blocks may overlap:
+   USEABLE_START_TIME and USEABLE_STOP_TIME
+   say where each is meant to be used. Where several blocks have a time, a useable one wins, then
+   the one that begins later (as in Orekit). Interpolation hints are ignored.
 
-Writing: version 1.0, which every AEM reader reads and which states the quaternion's order and direction. Rates are written as
-quaternion derivatives: some readers take QUATERNION/RATE as an angular velocity, others as Euler rates.
+Writing: version 1.0, which every AEM reader reads and which states the quaternion's order and
+direction. Rates are written as quaternion derivatives: some readers take QUATERNION/RATE as an
+angular velocity, others as Euler rates.
 """
 
 import contextlib
@@ -51,9 +62,11 @@ from hilstar.basics.units import NS_PER_S
 
 MAX_OVERLAPPING = 1000
 MAX_BYTES = 50_000_000
-# 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
+# 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to
+# 0.1 mas.
 INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
-# SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
+# SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A),
+# and CAM.
 CAMERA_FRAME = re.compile("(STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA)(_.*|[0-9]+)?")
 BODY_FRAME = re.compile(
     "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|" + CAMERA_FRAME.pattern
@@ -76,13 +89,16 @@ ORDER = ("QC", "Q1", "Q2", "Q3")  # in XML; in KVN the scalar comes last
 
 
 def _turned(angles_rad: FloatArray, axes: tuple[int, int, int]) -> FloatArray:
-    """The rotations (n, 4) of components from the first frame to the second, by angles (n, 3) about axes."""
+    """The rotations (n, 4) of components from the first frame to the second, by angles (n, 3)
+    about axes.
+    """
     first, second, third = (frame_turns(axis, angles_rad[:, k]) for k, axis in enumerate(axes))
     return multiply(third, multiply(second, first))
 
 
 def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
-    """Rotations (n, 4) from first to second, and their rates (n, 3), rad/s in the second's components, for EULER_DERIVATIVE.
+    """Rotations (n, 4) from first to second, and their rates (n, 3), rad/s in the second's
+    components, for EULER_DERIVATIVE.
 
     `values` (n, 3 or 6) are degrees and degrees per second.
     """
@@ -101,8 +117,9 @@ def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatA
 def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 4) from first to second and rates (n, 3), rad/s in the second's components.
 
-    `values` (n, 4 or 7) are alpha, delta, the angle (degrees) and its rate (degrees per second); then, with nutation, the
-    angle of nutation, its period (s) and its phase, or the momentum's alpha and delta and the rate of nutation.
+    `values` (n, 4 or 7) are alpha, delta, the angle (degrees) and its rate (degrees per second);
+    then, with nutation, the angle of nutation, its period (s) and its phase, or the momentum's
+    alpha and delta and the rate of nutation.
     """
     alpha, delta, angle, spin_rate = np.radians(values[:, :4].T)
     q = _turned(np.column_stack((np.pi / 2 + alpha, np.pi / 2 - delta, angle)), (2, 0, 2))
@@ -128,7 +145,9 @@ class _DatedBlock:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every entry is an attitude, in order of time; else reading it ends in a refusal."""
+        """Whether every entry is an attitude, in order of time; else reading it ends in a
+        refusal.
+        """
         return all(isinstance(entry.event, AttitudeSample) for entry in self.entries) and all(
             before < after for before, after in pairwise(self.times)
         )
@@ -142,7 +161,9 @@ class _DatedBlock:
         return timeline
 
     def at(self, t_ns: int) -> LogEntry:
-        """Its attitude at a time within its span, interpolated as in a replay, at the previous sample's place in the file."""
+        """Its attitude at a time within its span, interpolated as in a replay, at the previous
+        sample's place in the file.
+        """
         where, before = self.entries[bisect_right(self.times, t_ns) - 1]
         attitude = self._timeline.at(t_ns)
         if attitude is None or not isinstance(before, AttitudeSample):
@@ -162,7 +183,9 @@ class _DatedBlock:
 
 
 def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[LogEntry]]:
-    """The entries of segments, which come in the order of their first epochs; those that overlap are made one run of pieces."""
+    """The entries of segments, which come in the order of their first epochs; those that overlap
+    are made one run of pieces.
+    """
     groups: list[list[_DatedBlock]] = []
     end_ns = 0
     for segment in segments:
@@ -206,7 +229,9 @@ def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
 
 
 def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
-    """The attitudes of a segment from `start_ns` to `stop_ns`; an end where it has none is interpolated."""
+    """The attitudes of a segment from `start_ns` to `stop_ns`; an end where it has none is
+    interpolated.
+    """
     piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
     own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
     if start_ns not in own:
@@ -217,12 +242,15 @@ def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
 
 
 def read_aem(text: str, of_date: OfDate) -> LogReading:
-    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
+    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first
+    epochs.
 
-    `of_date` has the frames that move: of a frame's name, a time system and times (n,), ns, it gives the rotations (n, 4) from
-    ICRS, the frame's own rate (3,) in its components, and a notice or None.
+    `of_date` has the frames that move: of a frame's name, a time system and times (n,), ns, it
+    gives the rotations (n, 4) from ICRS, the frame's own rate (3,) in its components, and a notice
+    or None.
 
-    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
+    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame
+    and one of those above.
     """
     is_xml = text.lstrip().startswith("<")
     blocks = ccsds.xml_blocks(text) if is_xml else ccsds.kvn_blocks(text)
@@ -230,7 +258,9 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
 
 
 def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
-    """The attitudes of blocks of an AEM, or of another format whose numbers mean what an AEM's do, as `read_aem` gives them."""
+    """The attitudes of blocks of an AEM, or of another format whose numbers mean what an AEM's
+    do, as `read_aem` gives them.
+    """
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
         raise ccsds.AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
     frames = [_frames(block.meta) for block in blocks]
@@ -244,7 +274,8 @@ def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
     for following in _resolved(segments, told):
         first, end = following[0], entries[-1] if entries else None
         if end is not None and isinstance(end.event, AttitudeSample) and isinstance(first.event, AttitudeSample):
-            if end.event.t_ns == first.event.t_ns:  # 504.0-B-1 allows it: the earlier block then ends 1 ns before
+            # 504.0-B-1 allows it: the earlier block then ends 1 ns before
+            if end.event.t_ns == first.event.t_ns:
                 entries[-1] = LogEntry(end.where, replace(end.event, t_ns=end.event.t_ns - 1))
             following[0] = LogEntry(first.where, replace(first.event, discontinuity=True))
         entries += following
@@ -255,7 +286,9 @@ def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
 
 
 def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventions:
-    """What the numbers of a file mean, in the words of its first block; an attitude as that block has it at its first epoch."""
+    """What the numbers of a file mean, in the words of its first block; an attitude as that
+    block has it at its first epoch.
+    """
     meta = block.meta
     (reference, body), scale, to_body = _frames(meta), meta["TIME_SYSTEM"], _second_frame_is_cam(meta)
     scalar_first = meta.get("QUATERNION_TYPE") == "FIRST"
@@ -287,8 +320,9 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
 def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
     q, rate = _attitudes(block)
     if block.meta["ATTITUDE_TYPE"] == ccsds.SPIN:
-        # Only the rate says how often a body spins between attitudes that are more than a quarter turn apart. Below that the
-        # attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is a fifth more than the spin angle turns.
+        # Only the rate says how often a body spins between attitudes that are more than a quarter
+        # turn apart. Below that the attitudes are better: in the standard's own example (ST5)
+        # SPIN_ANGLE_VEL is a fifth more than the spin angle turns.
         steps_s = np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
         if not (np.abs(block.values[:-1, 3]) * steps_s > QUARTER_TURN_DEG).any():
             rate = None
@@ -312,7 +346,9 @@ def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[s
 
 
 def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
-    """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components, rad/s."""
+    """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components,
+    rad/s.
+    """
     meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
@@ -334,7 +370,9 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
 
 
 def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> FloatArray:
-    """The rate (n, 3) of cam in its components, from that of the second frame with respect to the first in either's."""
+    """The rate (n, 3) of cam in its components, from that of the second frame with respect to
+    the first in either's.
+    """
     key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == ccsds.RATE else "ANGVEL_FRAME"
     if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == ccsds.RATE:
         raise ccsds.AemFaultError(
@@ -371,10 +409,11 @@ def _second_frame_is_cam(meta: dict[str, str]) -> bool:
 
 
 def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = None) -> str:
-    """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to STARTRACKER_1, scalar last.
+    """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to
+    STARTRACKER_1, scalar last.
 
-    A block whose samples all have a rate contains quaternion derivatives; other blocks drop their rates. Sequence numbers are
-    dropped.
+    A block whose samples all have a rate contains quaternion derivatives; other blocks drop their
+    rates. Sequence numbers are dropped.
     """
     starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity]
     blocks = [samples[i:j] for i, j in zip(starts, [*starts[1:], len(samples)], strict=True)]

@@ -1,10 +1,13 @@
-"""The text of a CCSDS Attitude Ephemeris Message, 1.0 (504.0-B-1) or 2.0 (504.0-B-2): KVN or XML to blocks of numbers.
+"""The text of a CCSDS Attitude Ephemeris Message, 1.0 (504.0-B-1) or 2.0 (504.0-B-2): KVN or XML to
+blocks of numbers.
 
-An unknown keyword is refused, and so is a keyword of the other version: ignoring QUATERNION_TYP, or QUATERNION_TYPE in a
-version 2.0 file, would show another orientation than the writer meant. A file that is cut off is refused.
+An unknown keyword is refused, and so is a keyword of the other version: ignoring QUATERNION_TYP, or
+QUATERNION_TYPE in a version 2.0 file, would show another orientation than the writer meant. A file
+that is cut off is refused.
 
-XML goes through Python's expat parser, element by element. A DOCTYPE is refused where it begins, so no entity is expanded and
-nothing outside the text is read. Depth and element size are bounded, and of each state only the numbers are kept.
+XML goes through Python's expat parser, element by element. A DOCTYPE is refused where it begins, so
+no entity is expanded and nothing outside the text is read. Depth and element size are bounded, and
+of each state only the numbers are kept.
 """
 
 import difflib
@@ -58,7 +61,8 @@ MAX_DEPTH = 12  # in an <ndm> a number stands nine deep
 MAX_ELEMENTS = 100_000  # besides the states, and in one of them
 LONG_ELEMENT = re.compile("<[^<]{1000000}")
 
-# A state's element in XML, and its numbers by their elements within it: in the order of KVN, the quaternion's scalar first.
+# A state's element in XML, and its numbers by their elements within it: in the order of KVN, the
+# quaternion's scalar first.
 Q = "quaternion/QC quaternion/Q1 quaternion/Q2 quaternion/Q3"
 Q_RATE = " quaternionRate/QC_DOT quaternionRate/Q1_DOT quaternionRate/Q2_DOT quaternionRate/Q3_DOT"
 TURNS = "rotationAngles/rotation1 rotationAngles/rotation2 rotationAngles/rotation3"
@@ -91,7 +95,9 @@ STATES = {
 
 
 class AemFaultError(Exception):
-    """What is wrong in an AEM, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or nowhere in particular."""
+    """What is wrong in an AEM, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or
+    nowhere in particular.
+    """
 
     def __init__(self, where: str, detail: str) -> None:
         super().__init__(detail)
@@ -100,7 +106,9 @@ class AemFaultError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One block of data: its keywords; for each state its place and epoch; and `values` (n, numbers), scalar first."""
+    """One block of data: its keywords; for each state its place and epoch; and `values` (n,
+    numbers), scalar first.
+    """
 
     meta: dict[str, str]
     where: list[str]
@@ -109,7 +117,9 @@ class Block:
 
 
 def _fault_of(key: str, section: str, version: str) -> str | None:
-    """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what to write; None where it may."""
+    """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what
+    to write; None where it may.
+    """
     if key in SECTIONS[section]:
         own, instead = ONLY_IN.get(key, (version, ""))
         if own == version or version not in STATES:
@@ -146,7 +156,9 @@ def _check_metadata(meta: dict[str, str], where: str) -> None:
 
 
 def plain(value: str) -> str:
-    """A text value normalised for comparison: 504.0-B-2 6.8 ignores case, and treats blanks as underscores."""
+    """A text value normalised for comparison: 504.0-B-2 6.8 ignores case, and treats blanks as
+    underscores.
+    """
     return "_".join(value.upper().replace("_", " ").split())
 
 
@@ -160,7 +172,8 @@ def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
 
 
 def epoch_ns(where: str, text: str) -> int:
-    """Nanoseconds from 1970-01-01T00:00:00 to an epoch (calendar or day-of-year form), rounded; every day has 86400 s.
+    """Nanoseconds from 1970-01-01T00:00:00 to an epoch (calendar or day-of-year form), rounded;
+    every day has 86400 s.
 
     A leap second 23:59:60 is the next day's 00:00:00. Raises AemFaultError.
     """
@@ -276,7 +289,9 @@ class _Element:
         return AemFaultError(f":{self.line}", f"is not an AEM in XML ({detail})")
 
     def parts(self, *names: str) -> "list[_Element]":
-        """Its children, where all have one of these names and no text stands between them. Raises AemFaultError."""
+        """Its children, where all have one of these names and no text stands between them.
+        Raises AemFaultError.
+        """
         for child in self.children:
             if child.name not in names:
                 raise child.unlike(f"<{child.name[:40]}> where <{'> or <'.join(names)}> belongs")
@@ -314,12 +329,15 @@ def xml_blocks(text: str) -> list[Block]:
 
 
 class _XmlReading:
-    """Handles elements as the parser meets them; a state that has ended is reduced to its numbers."""
+    """Handles elements as the parser meets them; a state that has ended is reduced to its
+    numbers.
+    """
 
     def __init__(self) -> None:
         self.messages = 0
         self.segments: list[_XmlSegment] = []
-        self.parser = expat.ParserCreate("utf-8", " ")  # names come with their namespace and a blank before them
+        # names come with their namespace and a blank before them
+        self.parser = expat.ParserCreate("utf-8", " ")
         self.parser.buffer_text = True
         self.parser.StartDoctypeDeclHandler = self._doctype
         self.parser.StartElementHandler = self._start
@@ -415,7 +433,9 @@ def _keywords(element: _Element, version: str) -> dict[str, str]:
 
 
 def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
-    """The epoch of an <attitudeState>, and its numbers in the order of KVN. Raises AemFaultError."""
+    """The epoch of an <attitudeState>, and its numbers in the order of KVN. Raises
+    AemFaultError.
+    """
     name, paths = STATES[meta[VERSION_KEY]][meta["ATTITUDE_TYPE"]]
     if [child.name for child in holder.children] != [name]:
         raise AemFaultError(
@@ -467,7 +487,8 @@ def _number(leaf: _Element, key: str) -> float:
     for name, value in leaf.attributes.items():
         if name == "units" and value.lower() != unit:
             raise leaf.unlike(f"<{leaf.name}> in {value[:40]!r}; write {unit or 'no units'}")
-        if name not in {"units", "angle", "rate"} and " " not in name:  # with a blank it is of a namespace
+        # with a blank it is of a namespace
+        if name not in {"units", "angle", "rate"} and " " not in name:
             raise leaf.unlike(f"<{leaf.name}> has no {name[:40]}")
     try:
         return float(leaf.text)

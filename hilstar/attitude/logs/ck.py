@@ -1,11 +1,15 @@
-"""SPICE C-kernels (CK Required Reading, types 1 to 6) as a log of one structure's attitude, evaluated by SPICE itself.
+"""SPICE C-kernels (CK Required Reading, types 1 to 6) as a log of one structure's attitude,
+evaluated by SPICE itself.
 
 Rules:
-1. The C-matrix turns components of a segment's reference frame into the structure's; SPICE turns the reference into J2000,
+1. The C-matrix turns components of a segment's reference frame into the structure's; SPICE turns
+   the reference into J2000,
    its name of the axes of the ICRF.
-2. The angular velocity is the structure's with respect to J2000, in the structure's components. A segment without one gives no
+2. The angular velocity is the structure's with respect to J2000, in the structure's components. A
+   segment without one gives no
    rate (types 1 and 3), or the rate of its own function by difference (types 2, 4, 5 and 6).
-3. `t_ns` is TDB nanoseconds since 1970-01-01T00:00:00 TDB, which the SCLK kernel computes from ticks.
+3. `t_ns` is TDB nanoseconds since 1970-01-01T00:00:00 TDB, which the SCLK kernel computes from
+   ticks.
 4. Where nothing covers a time, or segments disagree, the previous attitude is held.
 
 SPICE runs in a process of its own (`ck_spice`).
@@ -40,7 +44,8 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def _kernels_beside(path: Path) -> list[Path]:
-    """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a later version counts.
+    """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a
+    later version counts.
 
     Versions are numbers: clock_10 comes after clock_9.
     """
@@ -70,9 +75,11 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
 
 
 def read_ck(path: Path, stated: Stated) -> LogReading:
-    """The attitudes of the CK's only structure, or of `stated.body` (an id or a name), with the kernels stated or beside it.
+    """The attitudes of the CK's only structure, or of `stated.body` (an id or a name), with the
+    kernels stated or beside it.
 
-    Raises InputError for a file that is damaged, a kernel that is missing and a choice that is open.
+    Raises InputError for a file that is damaged, a kernel that is missing and a choice that is
+    open.
     """
     kernels, told = list(stated.kernels), []
     if not kernels:

@@ -1,13 +1,18 @@
-"""The process that evaluates a CK with SPICE: a damaged kernel may abort it, and SPICE's kernel pool is global to a process.
+"""The process that evaluates a CK with SPICE: a damaged kernel may abort it, and SPICE's kernel
+pool is global to a process.
 
-A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on stdout: the arrays of
-`_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
+A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on
+stdout: the arrays of `_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times
+are spacecraft clock ticks throughout.
 
-1. SPICE reads the file: its list of segments (`daf...`), what they cover (`ckcov`) and their attitudes (`ckgp`). What SPICE
-   trusts is checked before: a list of segments that never ends, counts, and quaternions that are not unit.
+1. SPICE reads the file: its list of segments (`daf...`), what they cover (`ckcov`) and their
+   attitudes (`ckgp`). What SPICE
+   trusts is checked before: a list of segments that never ends, counts, and quaternions that are
+   not unit.
 2. Of two segments at one time, SPICE takes the later one.
 3. Segments with attitudes at given times (types 1 and 3) are read at those times.
-4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, halved until the interpolation between them is
+4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, halved until the
+   interpolation between them is
    within TARGET_RAD (and the clock's resolution), or until MAX_STEPS.
 5. There is a break between two pieces of coverage, unless they touch and their attitudes agree.
 """
@@ -59,10 +64,13 @@ SMOOTH = frozenset({2, 4, 5, 6})
 TARGET_RAD = math.radians(1e-3 / 3600)  # 1 mas, a hundredth of the best tracker's error
 FIRST_STEPS, MAX_STEPS = 128, 100_000  # for all smooth pieces together: 10 s at 0.1 ms each
 PROBES = 200  # places between samples at which the error is looked at
-PROBED = (math.sqrt(5) - 1) / 2  # share of a step: no symmetry of an interpolation hides its error there
-DIFFERENCE_STEPS = 1 / 16  # a rate by difference, whose error h^2 w''/6 is then 1/256 of that over the step
+# share of a step: no symmetry of an interpolation hides its error there
+PROBED = (math.sqrt(5) - 1) / 2
+# a rate by difference, whose error h^2 w''/6 is then 1/256 of that over the step
+DIFFERENCE_STEPS = 1 / 16
 BESIDE_S = 2e-6  # beside a boundary: twenty times what ephemeris time resolves
-JUMP_RAD = math.radians(1e-2 / 3600)  # a boundary's attitudes agree within this, and three times the turn in BESIDE_S
+# a boundary's attitudes agree within this, and three times the turn in BESIDE_S
+JUMP_RAD = math.radians(1e-2 / 3600)
 ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
 MAX_CK_BYTES = 500_000_000
 MAX_NAMED_BODIES = 12
@@ -70,7 +78,9 @@ CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
 class Segment(NamedTuple):
-    """One segment of a CK by its summary: ticks of the clock, ids, its type, and its first and last word in the file."""
+    """One segment of a CK by its summary: ticks of the clock, ids, its type, and its first and
+    last word in the file.
+    """
 
     number: int
     start: float
@@ -84,7 +94,9 @@ class Segment(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """The intervals (n, 2) that a segment covers, and the times (n,) of its attitudes if it has some, both increasing."""
+    """The intervals (n, 2) that a segment covers, and the times (n,) of its attitudes if it has
+    some, both increasing.
+    """
 
     intervals: FloatArray
     epochs: FloatArray
@@ -94,7 +106,8 @@ class Coverage(NamedTuple):
 def _opened(spice: Any, path: Path) -> Iterator[int]:
     """A DAF as SPICE opens it. Raises InputError for what is no regular file.
 
-    An error leaves it open, for this process then ends; closing what SPICE has closed would hide what it said.
+    An error leaves it open, for this process then ends; closing what SPICE has closed would hide
+    what it said.
     """
     open_regular(path, ADVICE).close()
     handle = spice.dafopr(str(path))
@@ -103,9 +116,11 @@ def _opened(spice: Any, path: Path) -> Iterator[int]:
 
 
 def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray, list[int]]]:
-    """The doubles and integers of each summary of a DAF, in the file's order. Raises InputError for a list without an end.
+    """The doubles and integers of each summary of a DAF, in the file's order. Raises InputError for
+    a list without an end.
 
-    SPICE follows a damaged list for ever, also where it only looks for an attitude. So the list is walked, and
+    SPICE follows a damaged list for ever, also where it only looks for an attitude. So the list is
+    walked, and
     counted, before anything is looked for.
     """
     doubles, integers = spice.dafhsf(handle)
@@ -120,7 +135,9 @@ def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray
 
 
 def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
-    """The segments of a CK in the file's order. Raises InputError for another file and another type of segment."""
+    """The segments of a CK in the file's order. Raises InputError for another file and another
+    type of segment.
+    """
     if tuple(spice.dafhsf(handle)) != (CK_DOUBLES, CK_INTEGERS):
         raise InputError(f"{path}: is another kind of DAF than a CK")
     size_words = path.stat().st_size // WORD_BYTES
@@ -144,9 +161,12 @@ def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
 def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray:
     """The times (n,) at which a segment of type 1 or 3 has attitudes; none for the other types.
 
-    Raises InputError for a quaternion that is not unit: of one that is all zeros SPICE would make an attitude. Types 1,
-    2, 3 and 5 begin with their packets, whose first words are the quaternion; in all but type 2 their times follow.
-    SPICE has no other way to them. Packets of types 4 and 6 are polynomials, which it checks itself.
+    Raises InputError for a quaternion that is not unit: of one that is all zeros SPICE would make
+    an attitude. Types 1,
+    2, 3 and 5 begin with their packets, whose first words are the quaternion; in all but type 2
+    their times follow.
+    SPICE has no other way to them. Packets of types 4 and 6 are polynomials, which it checks
+    itself.
     """
     if segment.kind in {4, 6}:
         return np.empty(0)
@@ -165,7 +185,8 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
     epochs = words[packet_words * count : (packet_words + 1) * count]
     if not np.isfinite(epochs).all() or (np.diff(epochs) <= 0).any():
         raise InputError(f"{where}: its times do not increase; is the file damaged?")
-    # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next (type 1).
+    # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next
+    # (type 1).
     directory = words[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
     hundredth, following = epochs[DIRECTORY - 1 : -1 : DIRECTORY], epochs[DIRECTORY::DIRECTORY]
     if not ((hundredth <= directory) & (directory <= following)).all():
@@ -174,8 +195,11 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
 
 
 def _packets(words: FloatArray, segment: Segment) -> tuple[int, int]:
-    """How many packets a segment of type 1, 2, 3 or 5 has, and the words of each; 0 and 0 where that cannot be told."""
-    if segment.kind == 2:  # it states no count: packets of 8 words, two times each, and a directory of every hundredth
+    """How many packets a segment of type 1, 2, 3 or 5 has, and the words of each; 0 and 0 where
+    that cannot be told.
+    """
+    # it states no count: packets of 8 words, two times each, and a directory of every hundredth
+    if segment.kind == 2:
         return -(-(100 * len(words) + 1) // 1001), TYPE_2_WORDS
     trailer_words = {1: 1, 3: 2, 5: 5}[segment.kind]
     if len(words) < trailer_words or not np.isfinite(words[-trailer_words:]).all():
@@ -193,7 +217,8 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
     intervals = _intervals(spice, path, segments)
     coverages = []
     for segment, own_epochs, own_intervals in zip(segments, epochs, intervals, strict=True):
-        # SPICE counts each instance of type 1 as an interval of its own; hilstar goes on from one to the next.
+        # SPICE counts each instance of type 1 as an interval of its own; hilstar goes on from one
+        # to the next.
         spans = own_epochs[[0, -1]].reshape(1, 2) if segment.kind == 1 else own_intervals
         if not np.isfinite(spans).all() or (np.diff(spans.ravel()) < 0).any():
             raise InputError(f"{path}: segment {segment.number}: its intervals do not increase; is the file damaged?")
@@ -206,7 +231,8 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
 def _intervals(spice: Any, path: Path, segments: Sequence[Segment]) -> list[FloatArray]:
     """The intervals (n, 2) that each segment covers, by SPICE.
 
-    SPICE tells the coverage of a structure, all its segments together, and which of two that overlap has a gap is lost
+    SPICE tells the coverage of a structure, all its segments together, and which of two that
+    overlap has a gap is lost
     in that. So each segment becomes a structure of its own, in a copy of the file.
     """
     if len(segments) == 1:
@@ -232,7 +258,9 @@ def _covered(spice: Any, path: Path, body: int, segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at which it holds attitudes."""
+    """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at
+    which it holds attitudes.
+    """
 
     segment: Segment
     start: float
@@ -240,7 +268,9 @@ class _Piece:
     epochs: FloatArray
 
     def ticks(self, step: float) -> FloatArray:
-        """The ticks at which it is read, both ends among them; a long pause between them is filled, as the file covers it."""
+        """The ticks at which it is read, both ends among them; a long pause between them is
+        filled, as the file covers it.
+        """
         if self.stop <= self.start:
             return np.array([self.start])
         if self.segment.kind in SMOOTH:
@@ -256,12 +286,15 @@ class _Piece:
 
 
 def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
-    """The pieces of the segments of one structure, in order of time; segments come in the file's order."""
+    """The pieces of the segments of one structure, in order of time; segments come in the file's
+    order.
+    """
     owners = [(segment, cover.epochs, *span) for segment, cover in covered for span in cover.intervals.tolist()]
     if not owners:
         return []
     bounds = np.unique(np.array([owner[2:] for owner in owners]))
-    owner_of_cell = np.full(len(bounds), -1)  # the cell k is from bound k to bound k + 1; the last one stays empty
+    # the cell k is from bound k to bound k + 1; the last one stays empty
+    owner_of_cell = np.full(len(bounds), -1)
     owner_of_point = np.full(len(bounds), -1)
     for index, (_, _, start, stop) in enumerate(owners):
         cells = slice(*np.searchsorted(bounds, [start, stop]))
@@ -269,7 +302,8 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
         if start == stop:
             owner_of_point[cells.start] = index
     begins = np.flatnonzero(np.diff(owner_of_cell, prepend=-1))
-    ends = np.append(begins[1:], len(bounds) - 1)[: len(begins)]  # none begins where a CK has instants alone
+    # none begins where a CK has instants alone
+    ends = np.append(begins[1:], len(bounds) - 1)[: len(begins)]
     spans = [(owner_of_cell[k], k, end) for k, end in zip(begins.tolist(), ends.tolist(), strict=True) if owner_of_cell[k] >= 0]
     for k in np.flatnonzero(owner_of_point >= 0).tolist():
         if owner_of_cell[k] < 0 and (k == 0 or owner_of_cell[k - 1] < 0):
@@ -284,7 +318,9 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
 
 @dataclass(frozen=True)
 class _Structure:
-    """A structure whose CK is loaded: `body` its id, `clock` that of its clock; `turning` where all its segments have rates."""
+    """A structure whose CK is loaded: `body` its id, `clock` that of its clock; `turning` where
+    all its segments have rates.
+    """
 
     path: Path
     spice: Any
@@ -299,13 +335,17 @@ class _Structure:
         return float(self.spice.sct2e(self.clock, tick))
 
     def t_ns(self, tick: float) -> int:
-        """TDB nanoseconds since 1970-01-01T00:00:00 TDB; a double of ephemeris time resolves 0.1 us."""
+        """TDB nanoseconds since 1970-01-01T00:00:00 TDB; a double of ephemeris time resolves 0.1
+        us.
+        """
         seconds = self.t_s(tick)
         whole = int(seconds // 1)
         return (whole + J2000_S) * NS_PER_S + round((seconds - whole) * NS_PER_S)
 
     def matrix(self, tick: float) -> FloatArray:
-        """The C-matrix (3, 3), which turns ICRS components into the structure's. Raises InputError where there is none."""
+        """The C-matrix (3, 3), which turns ICRS components into the structure's. Raises
+        InputError where there is none.
+        """
         matrix, _, found = self.spice.ckgp(self.body, tick, 0, FRAME)
         if not found:
             raise InputError(f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its segments cover")
@@ -315,9 +355,11 @@ class _Structure:
         return from_matrix(self.matrix(tick))
 
     def attitude(self, tick: float, with_rate: bool) -> tuple[FloatArray, FloatArray | None]:
-        """The attitude (4,), and the angular velocity (3,), rad/s, in the structure's components, where its segment has one.
+        """The attitude (4,), and the angular velocity (3,), rad/s, in the structure's components,
+        where its segment has one.
 
-        SPICE gives the angular velocity in components of the reference frame, and passes over segments without one.
+        SPICE gives the angular velocity in components of the reference frame, and passes over
+        segments without one.
         """
         if not with_rate:
             return self.q_icrs_to_body(tick), None
@@ -327,7 +369,8 @@ class _Structure:
         return from_matrix(matrix), matrix @ np.asarray(rate, dtype=np.float64)
 
     def rate_by_difference(self, tick: float, step: float, span: tuple[float, float]) -> FloatArray:
-        """The rate (3,) at a tick of a smooth segment, from attitudes `step` ticks away on both sides within `span`.
+        """The rate (3,) at a tick of a smooth segment, from attitudes `step` ticks away on both
+        sides within `span`.
 
         At an end of the span, from two on one side (second order: 2 r(h) - r(2 h)).
         """
@@ -348,9 +391,10 @@ class _Structure:
 class _Sampled:
     """n attitudes of a structure, and how good they are.
 
-    `t_ns` (n,); `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the structure's components, NaN where there is none;
-    `breaks` (n,) where nothing leads from the one before; `tick` (n,). For segments that are functions of time, the step
-    between them, s, and the largest error found between them, rad; the lengths of the gaps of coverage, s.
+    `t_ns` (n,); `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the structure's components,
+    NaN where there is none; `breaks` (n,) where nothing leads from the one before; `tick` (n,). For
+    segments that are functions of time, the step between them, s, and the largest error found
+    between them, rad; the lengths of the gaps of coverage, s.
     """
 
     t_ns: npt.NDArray[np.int64]
@@ -364,7 +408,9 @@ class _Sampled:
 
 
 def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
-    """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of them."""
+    """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of
+    them.
+    """
     smooth = [piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start]
     step = error_rad = 0.0
     if smooth:
@@ -382,7 +428,9 @@ def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
 
 
 def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, float]:
-    """The step of the smooth pieces, ticks, and the largest error between samples that far apart, rad."""
+    """The step of the smooth pieces, ticks, and the largest error between samples that far
+    apart, rad.
+    """
     total = sum(piece.stop - piece.start for piece in smooth)
     steps = FIRST_STEPS
     while True:
@@ -401,9 +449,11 @@ def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, fl
 
 
 def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
-    """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece, rad.
+    """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece,
+    rad.
 
-    And the share of it that no step mends: the turn in the time that a double of ephemeris time does not resolve.
+    And the share of it that no step mends: the turn in the time that a double of ephemeris time
+    does not resolve.
     """
     near = [
         AttitudeSample(t_ns, q, rate)
@@ -421,7 +471,9 @@ def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) 
 
 
 def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates has them by difference."""
+    """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates
+    has them by difference.
+    """
     by_difference = piece.segment.kind in SMOOTH and not piece.segment.has_rate and len(ticks) > 1
     step = float(ticks[1] - ticks[0]) * DIFFERENCE_STEPS if by_difference else 0.0
     t_ns, q = np.empty(len(ticks), dtype=np.int64), np.empty((len(ticks), 4))
@@ -437,10 +489,12 @@ def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple
 
 
 def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
-    """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps, s.
+    """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps,
+    s.
 
-    Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or both beside it. The attitude
-    jumps there where it turns by more than it does in the same time before.
+    Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or
+    both beside it. The attitude jumps there where it turns by more than it does in the same time
+    before.
     """
     broken, gaps_s = [False], []
     for k, (before, after) in enumerate(pairwise(pieces), start=1):
@@ -462,7 +516,9 @@ def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatAr
 
 
 def load(spice: Any, path: Path, kernels: Sequence[Path]) -> None:
-    """Load the kernels and then the CK, which so comes before any other; files are checked first (InputError)."""
+    """Load the kernels and then the CK, which so comes before any other; files are checked first
+    (InputError).
+    """
     for kernel in kernels:
         for file in _checked(spice, kernel):
             spice.furnsh(str(file))
@@ -470,7 +526,9 @@ def load(spice: Any, path: Path, kernels: Sequence[Path]) -> None:
 
 
 def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
-    """The files of a kernel, checked before SPICE opens them: itself, or those that a meta-kernel names."""
+    """The files of a kernel, checked before SPICE opens them: itself, or those that a
+    meta-kernel names.
+    """
     with open_regular(kernel, ADVICE if meta is None else f"{meta} names it") as file:
         head = file.read(HEAD_BYTES)
     if meta is not None and head.startswith(b"KPL/MK"):
@@ -490,7 +548,9 @@ def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
 
 
 def _named(spice: Any, meta: Path) -> list[Path]:
-    """The kernels that a meta-kernel names, its path symbols replaced; from the working directory, as SPICE has it."""
+    """The kernels that a meta-kernel names, its path symbols replaced; from the working
+    directory, as SPICE has it.
+    """
     names = ("KERNELS_TO_LOAD", "PATH_SYMBOLS", "PATH_VALUES")
     spice.ldpool(str(meta))
     files, symbols, values = (_strings(spice, name) for name in names)
@@ -525,7 +585,9 @@ def _in_words(error: Any) -> str:
 
 
 def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sampled, dict[str, Any]]:
-    """The attitudes of the CK's structure, with its name and the frames that its segments refer to. Raises InputError."""
+    """The attitudes of the CK's structure, with its name and the frames that its segments refer
+    to. Raises InputError.
+    """
     import spiceypy
 
     open_regular(path, ADVICE, MAX_CK_BYTES).close()
@@ -547,7 +609,9 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
 
 
 def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -> int:
-    """The id of the structure: the only one, or what the user states by a number, a frame's name or a body's."""
+    """The id of the structure: the only one, or what the user states by a number, a frame's name
+    or a body's.
+    """
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))
     if stated is None:

@@ -1,17 +1,21 @@
-"""Rotations from the ICRS to frames of date, to the turning Earth and to a local level; and the reference frame of a log.
+"""Rotations from the ICRS to frames of date, to the turning Earth and to a local level; and the
+reference frame of a log.
 
     ICRS --C(X, Y, s)--> CIRS --R3(ERA)--> TIRS --W(polar motion)--> ITRS --R2(-latitude - 90 deg) R3(longitude)--> NED
 
-IERS Conventions (2010), chapter 5: precession and nutation of IAU 2006/2000A, the Earth rotation angle of UT1, and UT1-UTC
-and polar motion from the IERS table in Astropy's package: nothing is downloaded. The pole's offsets (0.4 mas), tides shorter
-than a day (0.6 mas) and s' (0.01 mas) are neglected. "Level" is normal to the WGS84 ellipsoid at a geodetic latitude: a plumb
-line differs by the deflection of the vertical, some arcsec in plains and an arcmin beside high mountains.
+IERS Conventions (2010), chapter 5: precession and nutation of IAU 2006/2000A, the Earth rotation
+angle of UT1, and UT1-UTC and polar motion from the IERS table in Astropy's package: nothing is
+downloaded. The pole's offsets (0.4 mas), tides shorter than a day (0.6 mas) and s' (0.01 mas) are
+neglected. "Level" is normal to the WGS84 ellipsoid at a geodetic latitude: a plumb line differs by
+the deflection of the vertical, some arcsec in plains and an arcmin beside high mountains.
 
-MOD and TOD are the mean and the true equator and equinox of date of IAU 2006/2000A; those of 1976/1980 lie within 0.1 arcsec.
-TEME is the true equator of 1980 with the mean equinox: TOD of 1980 turned back by the equation of the equinoxes of 1994
-(Vallado et al. 2006, AIAA 2006-6753). ITRF is the ITRS above; its realisations lie within 1 mas.
+MOD and TOD are the mean and the true equator and equinox of date of IAU 2006/2000A; those of
+1976/1980 lie within 0.1 arcsec. TEME is the true equator of 1980 with the mean equinox: TOD of 1980
+turned back by the equation of the equinoxes of 1994 (Vallado et al. 2006, AIAA 2006-6753). ITRF is
+the ITRS above; its realisations lie within 1 mas.
 
-A reference frame named `icrs` or `gcrf` says what its axes are; `map`, `world` or `odom` does not, and is never guessed.
+A reference frame named `icrs` or `gcrf` says what its axes are; `map`, `world` or `odom` does not,
+and is never guessed.
 """
 
 import warnings
@@ -39,17 +43,21 @@ IntArray = npt.NDArray[np.int64]
 HOUR_NS = 3600 * NS_PER_S
 UNIX_MJD, MJD_ZERO_JD = 40587, 2400000.5
 TT_FROM_TAI_S = 32.184
-EARTH_RATE_RAD_S = 7.292115146706979e-5  # rate of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
+# rate of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
+EARTH_RATE_RAD_S = 7.292115146706979e-5
 UT1_ARCSEC_PER_S = 15.041
 TURNED = "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its UTC is off)"
-UT1_S_A_YEAR = 1.1  # UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms long)
+# UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms
+# long)
+UT1_S_A_YEAR = 1.1
 HALF = float(np.sqrt(0.5))
 Q_NED_TO_ENU = (0.0, HALF, HALF, 0.0)
 UTC_FORM = "write a UTC such as 2026-11-22T10:00:00"
 # Seconds from a scale to TAI; TDB is within 2 ms of TT, in which the Earth turns by 0.03 arcsec.
 TO_TAI_S = {"TAI": 0.0, "GPS": 19.0, "TT": -32.184, "TDB": -32.184}
 Kind = Literal["icrs", "enu", "ned"]
-# EME2000's axes lie within 23 mas of the ICRF's. "eci" and "inertial", which simulators write, are taken too, with a notice.
+# EME2000's axes lie within 23 mas of the ICRF's. "eci" and "inertial", which simulators write, are
+# taken too, with a notice.
 EXACT = frozenset({"icrs", "icrf", "gcrs", "gcrf", "j2000", "eme2000"})
 LOOSE = frozenset({"eci", "inertial", "eci_j2000", "j2000_eci", "inertial_frame"})
 KINDS: dict[str, Kind] = {**dict.fromkeys(EXACT | LOOSE, "icrs"), "enu": "enu", "ned": "ned"}
@@ -58,7 +66,9 @@ BATCH = 4096
 
 
 class _EarthTable(NamedTuple):
-    """Earth orientation by day (n,): MJD of UTC, UT1-TAI in seconds, and the pole's coordinates in radians."""
+    """Earth orientation by day (n,): MJD of UTC, UT1-TAI in seconds, and the pole's coordinates
+    in radians.
+    """
 
     mjd: FloatArray
     ut1_tai_s: FloatArray
@@ -67,7 +77,9 @@ class _EarthTable(NamedTuple):
 
 
 def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
-    """The rotations (n, 4) from ICRS to the Earth's axes (ITRS) at UTCs (n,), ns since 1970 where every day has 86400 s."""
+    """The rotations (n, 4) from ICRS to the Earth's axes (ITRS) at UTCs (n,), ns since 1970
+    where every day has 86400 s.
+    """
     hours, place = np.unique(np.concatenate((utc_ns // HOUR_NS, utc_ns // HOUR_NS + 1)), return_inverse=True)
     before, after = place[: len(utc_ns)], place[len(utc_ns) :]
     share = (utc_ns % HOUR_NS) / HOUR_NS
@@ -78,7 +90,8 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     table, mjd = _table(), UNIX_MJD + hours / 24.0
     tai_utc_s = _tai_minus_utc_s(hours // 24)
     tt_days = (tai_utc_s + TT_FROM_TAI_S) / 86400.0
-    # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5 days.
+    # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5
+    # days.
     x, y, s = (between(values) for values in erfa.xys06a(MJD_ZERO_JD, mjd + tt_days))
     ut1_tai_s, pole_x, pole_y = (
         between(np.interp(mjd, table.mjd, column)) for column in (table.ut1_tai_s, table.x_rad, table.y_rad)
@@ -91,7 +104,9 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
 
 
 def q_icrs_to_ned(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
-    """The rotations (n, 4) from ICRS to north, east, down at UTCs (n,) and geodetic places (n,) or ()."""
+    """The rotations (n, 4) from ICRS to north, east, down at UTCs (n,) and geodetic places (n,)
+    or ().
+    """
     zeros = np.zeros(len(utc_ns))
     to_meridian = frame_turns(2, zeros + np.radians(longitude_deg))
     return _chain(q_icrs_to_itrs(utc_ns), to_meridian, frame_turns(1, zeros - np.radians(latitude_deg) - np.pi / 2))
@@ -103,13 +118,17 @@ def q_icrs_to_enu(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: Flo
 
 
 def earth_rate_ned_rad_s(latitude_deg: float) -> FloatArray:
-    """The Earth's own rate (3,), rad/s, in north, east, down: what a level frame turns by with respect to the ICRS."""
+    """The Earth's own rate (3,), rad/s, in north, east, down: what a level frame turns by with
+    respect to the ICRS.
+    """
     latitude = np.radians(latitude_deg)
     return EARTH_RATE_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
 
 
 def beyond_table(first_ns: int, last_ns: int) -> str | None:
-    """What to tell the user where a span of UTC (ns) leaves the table of the Earth's orientation; None where it does not."""
+    """What to tell the user where a span of UTC (ns) leaves the table of the Earth's
+    orientation; None where it does not.
+    """
     table = _table()
     first, last = (UNIX_MJD + t_ns / (24 * HOUR_NS) for t_ns in (first_ns, last_ns))
     beyond_days = max(table.mjd[0] - first, last - table.mjd[-1])
@@ -124,7 +143,9 @@ def beyond_table(first_ns: int, last_ns: int) -> str | None:
 
 
 def utc_ns_of(text: str, option: str) -> int:
-    """Nanoseconds since 1970 of a UTC, where every day has 86400 s. Raises InputError that names the option."""
+    """Nanoseconds since 1970 of a UTC, where every day has 86400 s. Raises InputError that names
+    the option.
+    """
     try:
         return epoch_ns("", text)
     except AemFaultError as fault:
@@ -133,10 +154,13 @@ def utc_ns_of(text: str, option: str) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> _EarthTable:
-    """The IERS table of Astropy's package (finals2000A) and its year of predictions, in a twentieth of Astropy's own time."""
+    """The IERS table of Astropy's package (finals2000A) and its year of predictions, in a
+    twentieth of Astropy's own time.
+    """
     from astropy_iers_data import IERS_A_FILE
 
-    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))  # UT1, pole
+    # UT1, pole
+    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
         lines = [(line, b_columns if line[154:165].strip() else a_columns) for line in file if line[58:68].strip()]
     rows = [(line[7:15], *(line[begin:end] for begin, end in columns)) for line, columns in lines]
@@ -161,9 +185,11 @@ def _chain(*turns: FloatArray) -> FloatArray:
 
 
 def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, FloatArray, str | None]:
-    """The rotations (n, 4) from ICRS to a frame at times (n,), its own rate (3,), rad/s, in its components, and a notice.
+    """The rotations (n, 4) from ICRS to a frame at times (n,), its own rate (3,), rad/s, in its
+    components, and a notice.
 
-    Times are ns since 1970 in a scale's days of 86400 s. Raises AemFaultError for a scale that does not tell UTC, by
+    Times are ns since 1970 in a scale's days of 86400 s. Raises AemFaultError for a scale that does
+    not tell UTC, by
     which the ITRF turns.
     """
     if frame in {"MOD", "TOD", "TEME"}:
@@ -183,7 +209,9 @@ def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, 
 
 
 def _of_hours(frame: str, t_ns: IntArray) -> FloatArray:
-    """Linear over an hour, which is within 5 microarcsec; a scale's offset from TT, 69 s, is 0.1 mas of precession."""
+    """Linear over an hour, which is within 5 microarcsec; a scale's offset from TT, 69 s, is 0.1
+    mas of precession.
+    """
     hours, place = np.unique(np.concatenate((t_ns // HOUR_NS, t_ns // HOUR_NS + 1)), return_inverse=True)
     q = np.array([from_matrix(_matrix(frame, hour / 24.0)) for hour in hours.tolist()])
     before, after = q[place[: len(t_ns)]], q[place[len(t_ns) :]]
@@ -201,7 +229,9 @@ def _matrix(frame: str, unix_days: float) -> FloatArray:
 
 
 class Reference(NamedTuple):
-    """What attitudes refer to; a level frame has a `place` (latitude, longitude, degrees), and its UTC is `t_ns + utc_ns`."""
+    """What attitudes refer to; a level frame has a `place` (latitude, longitude, degrees), and
+    its UTC is `t_ns + utc_ns`.
+    """
 
     kind: Kind
     place: tuple[float, float] = (0.0, 0.0)
@@ -217,7 +247,9 @@ class Reference(NamedTuple):
 
     @property
     def earth_rate_rad_s(self) -> FloatArray:
-        """What the reference itself turns by with respect to the stars (3,), in its own components."""
+        """What the reference itself turns by with respect to the stars (3,), in its own
+        components.
+        """
         if self.kind == "icrs":
             return np.zeros(3)
         north, east, down = earth_rate_ned_rad_s(self.place[0])
@@ -233,7 +265,8 @@ class Reference(NamedTuple):
 
 
 def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:
-    """The reference of that kind, once all is stated that it needs; `first_ns` is the log's first time.
+    """The reference of that kind, once all is stated that it needs; `first_ns` is the log's first
+    time.
 
     Raises InputError where a level frame has no place, or its times are no dates and their zero is
     not stated, or is twice; and where a place or a zero is stated of the ICRS, which needs none.
@@ -282,7 +315,8 @@ def loosely_icrs(frame: str) -> str:
 
 
 def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[LogEntry]:
-    """Attitudes from the reference to the body become those from ICRS; rates too, unless a gyroscope measured them.
+    """Attitudes from the reference to the body become those from ICRS; rates too, unless a
+    gyroscope measured them.
 
     At their end `told` gets a notice where the dates leave the table of the Earth's orientation.
     """

@@ -1,4 +1,5 @@
-"""The entries of a log: each attitude, or why it was refused, and its place in the file; their order, and how they join.
+"""The entries of a log: each attitude, or why it was refused, and its place in the file; their
+order, and how they join.
 
 Recorders write messages as they arrive, which is not always the order of their stamps (`in_order`):
 1. Attitudes out of order by at most REORDER_NS are sorted, and counted.
@@ -9,7 +10,8 @@ A log's own usual interval says what a gap is, never the stale limit of a live s
 1. Before a discontinuity the attitude is held.
 2. Two samples whose rates fit the turn between them are blended, however long the interval.
 3. Other samples are joined by SLERP, the shorter way.
-4. But an interval of more than GAP_INTERVALS usual ones is a gap: the attitude within it is unknown, and is held.
+4. But an interval of more than GAP_INTERVALS usual ones is a gap: the attitude within it is
+   unknown, and is held.
 """
 
 import heapq
@@ -35,12 +37,14 @@ from hilstar.basics.units import NS_PER_S
 MAX_QUOTED_CHARACTERS = 80
 SORT_ADVICE = "sort the log by time"
 MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
-REORDER_NS = NS_PER_S  # queues between a driver and a recorder hold less; a clock that was set back jumps by more
+# queues between a driver and a recorder hold less; a clock that was set back jumps by more
+REORDER_NS = NS_PER_S
 GAP_INTERVALS = 5  # usual (median) intervals; four packets lost in a row are not a gap
-# Rates fit where their mean turns one attitude into the other within this share of the turn. For a sine the mean is off by
-# (2 pi / samples per period)^2 / 12: seven samples per period still fit.
+# Rates fit where their mean turns one attitude into the other within this share of the turn. For a
+# sine the mean is off by (2 pi / samples per period)^2 / 12: seven samples per period still fit.
 FIT_SHARE, GAP_FIT_SHARE = 0.2, 0.02
-FIT_RAD, GAP_FIT_RAD = 0.5, np.radians(1.0)  # and at most this: after many turns a share of them means nothing
+# and at most this: after many turns a share of them means nothing
+FIT_RAD, GAP_FIT_RAD = 0.5, np.radians(1.0)
 ALIKE_RAD = np.radians(1 / 3600)  # this close, all ways of joining agree
 LOOKED_AT = 2000  # samples, for the cause of rates that do not fit
 NO_GAPS: frozenset[int] = frozenset()
@@ -60,7 +64,9 @@ OPTIONS = {
 
 
 class LogEntry(NamedTuple):
-    """`where` is a line (":12"), an epoch or a count, as it follows the file's name in a message."""
+    """`where` is a line (":12"), an epoch or a count, as it follows the file's name in a
+    message.
+    """
 
     where: str
     event: AttitudeSample | Refusal
@@ -68,10 +74,12 @@ class LogEntry(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """What the user states of a log, where the file itself does not say it; None where nothing is stated.
+    """What the user states of a log, where the file itself does not say it; None where nothing is
+    stated.
 
-    `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the frame that attitudes refer to;
-    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and
+    `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the
+    frame that attitudes refer to; `epoch_utc` is the UTC of the log's time zero; `place` is
+    latitude and longitude in degrees and
     height in metres (WGS84); `convention` is that of the quaternions of CSV, JSON lines and MCAP,
     `convention_by` who states it.
     """
@@ -103,9 +111,11 @@ class Stated:
 
 @dataclass(frozen=True, slots=True)
 class LogReading:
-    """What a reader gives: the entries in the file's order, attitudes of the body where the conventions say so.
+    """What a reader gives: the entries in the file's order, attitudes of the body where the
+    conventions say so.
 
-    `advice` is what to do when times do not increase; `told` are notices for the user, kinds and lines.
+    `advice` is what to do when times do not increase; `told` are notices for the user, kinds and
+    lines.
     """
 
     entries: Iterable[LogEntry]
@@ -116,7 +126,8 @@ class LogReading:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeLog:
-    """A log as read: samples of the camera's attitude in order of time, what the file means by its numbers, and notices.
+    """A log as read: samples of the camera's attitude in order of time, what the file means by its
+    numbers, and notices.
 
     `read_as` is how its quaternions have become the camera's.
     """
@@ -132,7 +143,9 @@ class AttitudeLog:
 
 
 def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
-    """The entries by time, without exact repeats; at their end `told` gets a notice of each kind of change."""
+    """The entries by time, without exact repeats; at their end `told` gets a notice of each kind
+    of change.
+    """
     waiting: list[tuple[int, int, LogEntry]] = []
     newest_ns, late, latest_ns, repeats = None, 0, 0, 0
     last: AttitudeSample | None = None
@@ -140,7 +153,8 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
     for number, entry in enumerate(ended):
         if entry is not None:
             if not isinstance(entry.event, AttitudeSample):
-                # What waits is before it; a refusal ends the reading, or is of before the first attitude.
+                # What waits is before it; a refusal ends the reading, or is of before the first
+                # attitude.
                 yield from (heapq.heappop(waiting)[2] for _ in range(len(waiting)))
                 yield entry
                 continue
@@ -173,7 +187,9 @@ def _repeats(last: AttitudeSample, sample: AttitudeSample) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class LogJoins:
-    """How each sample of a log joins the next, and what the user must know of it; the sets hold the earlier sample's t_ns."""
+    """How each sample of a log joins the next, and what the user must know of it; the sets hold
+    the earlier sample's t_ns.
+    """
 
     blended_ns: frozenset[int] = NO_GAPS
     held_ns: frozenset[int] = NO_GAPS
@@ -223,7 +239,8 @@ def log_joins(
     held = gap & ~fits & ~broken
     misfit = known & ~fits & ~broken & ~gap
     cause: Cause | None = None
-    if misfit.any() and TIMES not in dict(told):  # what is probably wrong from the first rate on that does not fit
+    # what is probably wrong from the first rate on that does not fit
+    if misfit.any() and TIMES not in dict(told):
         first = int(misfit.argmax())
         with_rates = [sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None]
         cause = cause_in(with_rates, read_as)
@@ -240,7 +257,9 @@ def log_joins(
 def _fits(
     samples: Sequence[AttitudeSample], seconds: FloatArray, gap: npt.NDArray[np.bool_]
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Two masks (n,) over intervals: both samples have rates; and those fit the turn between them."""
+    """Two masks (n,) over intervals: both samples have rates; and those fit the turn between
+    them.
+    """
     nothing = np.full(3, np.nan)
     rate = np.array([nothing if s.rate_cam_rad_s is None else s.rate_cam_rad_s for s in samples])
     q = np.array([sample.q_icrs_to_cam for sample in samples])

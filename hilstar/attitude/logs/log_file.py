@@ -43,7 +43,9 @@ UNSET = "zeros or NaN, from before the estimator ran"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
-    """The attitudes of a log that needs nothing stated, in order of time. Raises as `open_log` does."""
+    """The attitudes of a log that needs nothing stated, in order of time. Raises as `open_log`
+    does.
+    """
     return open_log(path).samples
 
 
@@ -115,10 +117,11 @@ def _order_fault(t_ns: int, before_ns: int, advice: str) -> str:
 
 
 def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None = None) -> None:
-    """Write samples, whose times increase, in the format of the name's ending; an old file is replaced whole or not at all.
+    """Write samples, whose times increase, in the format of the name's ending; an old file is
+    replaced whole or not at all.
 
-    CSV, JSON lines and MCAP keep every bit. An AEM states `scale`, and drops sequence numbers, and the rates of a block
-    where any is missing.
+    CSV, JSON lines and MCAP keep every bit. An AEM states `scale`, and drops sequence numbers, and
+    the rates of a block where any is missing.
     Raises InputError for another ending, for no samples, and when the file cannot be written.
     """
     write, ending = writer_of(path)
@@ -129,7 +132,9 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
-    """A timeline of every sample of a log, joined as the log's own samples require (see `entries`)."""
+    """A timeline of every sample of a log, joined as the log's own samples require (see
+    `entries`).
+    """
     policy = replace(policy, prediction="rate")  # nothing is predicted of a log
     timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
     for sample in samples:
@@ -140,7 +145,8 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:
     """The `t_ns` that `text` names, within the span of the log; its first sample's for None.
 
-    A date and time is read on the log's own scale, from 1970-01-01T00:00:00. Raises InputError outside the span.
+    A date and time is read on the log's own scale, from 1970-01-01T00:00:00. Raises InputError
+    outside the span.
     """
     first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
     if text is None:

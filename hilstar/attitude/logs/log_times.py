@@ -116,7 +116,8 @@ def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:
 
 
 def ns_of_seconds(seconds: str) -> int:
-    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
+    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by
+    100 ns.
 
     Raises ValueError or ArithmeticError.
     """

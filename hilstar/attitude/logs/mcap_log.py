@@ -1,14 +1,19 @@
-"""MCAP files: attitudes on `/attitude` (JSON, which Foxglove and PlotJuggler open), the reader, and the writer of run ledgers.
+"""MCAP files: attitudes on `/attitude` (JSON, which Foxglove and PlotJuggler open), the reader, and
+the writer of run ledgers.
 
-Reading is in order and in bounded memory, up to the point where the writer was killed. A chunk states its unpacked size, which
-may be false: it is unpacked to that size and no further, and a whole file to at most MAX_INFLATION times its own size. A
-damaged file is refused in one line.
+Reading is in order and in bounded memory, up to the point where the writer was killed. A chunk
+states its unpacked size, which may be false: it is unpacked to that size and no further, and a
+whole file to at most MAX_INFLATION times its own size. A damaged file is refused in one line.
 
 Writing uses small chunks, for a run that may be killed and a disk that may be full:
-1. A chunk is on the disk whole, with its CRC, or the file ends before it: a failed write leaves the file as it was.
-2. Messages that could not be written are kept for the next attempt, until they are dropped by topic.
-3. Memory does not grow with the file, except for an index of at most MAX_INDEX_BYTES; a longer file has none.
-The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in ten minutes of such chunks.
+1. A chunk is on the disk whole, with its CRC, or the file ends before it: a failed write leaves the
+   file as it was.
+2. Messages that could not be written are kept for the next attempt, until they are dropped by
+   topic.
+3. Memory does not grow with the file, except for an index of at most MAX_INDEX_BYTES; a longer file
+   has none.
+The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in ten minutes of such
+chunks.
 """
 
 import bz2
@@ -63,7 +68,8 @@ MAX_INDEX_BYTES = 16_000_000  # about six hours at five chunks a second
 LEVEL = 3  # zstd compression level
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
-# Plain types only: Foxglove refuses a whole file over ["integer", "null"]. Unknown values are null in the message.
+# Plain types only: Foxglove refuses a whole file over ["integer", "null"]. Unknown values are null
+# in the message.
 ATTITUDE_SCHEMA = msgspec.json.encode(
     {
         "title": ATTITUDE_SCHEMA_NAME,
@@ -97,7 +103,9 @@ def part_path(path: Path, part: int) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The files of a run whose ledger begins at `path`; the file alone where it is not a first part. Raises InputError."""
+    """The files of a run whose ledger begins at `path`; the file alone where it is not a first
+    part. Raises InputError.
+    """
     head = read_metadata(path, RUN_METADATA)
     parts = [path]
     while head.get("part") == "0" and (following := part_path(path, len(parts))).is_file():
@@ -109,10 +117,12 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Messages]]:
-    """Every message of a run's files, in order, up to where its writer was killed: channel and content, a chunk's at once.
+    """Every message of a run's files, in order, up to where its writer was killed: channel and
+    content, a chunk's at once.
 
-    With them come the topics by channel, the same object until one changes. If `tell`, the log gets a line of the first file
-    that lacks its end, once all are read. Raises InputError for damage, and for anything but a regular file.
+    With them come the topics by channel, the same object until one changes. If `tell`, the log gets
+    a line of the first file that lacks its end, once all are read. Raises InputError for damage,
+    and for anything but a regular file.
     """
     for part in parts_of(path):
         topics: dict[int, str] = {}
@@ -131,7 +141,9 @@ def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Mess
 
 
 def unfinished_part(path: Path) -> Path | None:
-    """The first of a run's files that lacks the end which its writer gives it; None where all are whole. Raises InputError."""
+    """The first of a run's files that lacks the end which its writer gives it; None where all
+    are whole. Raises InputError.
+    """
     for part in parts_of(path):
         with open_regular(part, ADVICE) as file:
             if not _is_finished(file):
@@ -173,16 +185,20 @@ def is_mcap(path: Path) -> bool:
 
 
 def holds_ros(path: Path) -> bool:
-    """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for damage before it."""
+    """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for
+    damage before it.
+    """
     channels = (record for record in records_of(path) if isinstance(record, kinds.Channel))
     encodings = (one.message_encoding for one in channels if one.message_encoding != "json" or one.topic in OWN_TOPICS)
     return next((one in ROS_ENCODINGS for one in encodings if one in {*ROS_ENCODINGS, "json"}), False)
 
 
 def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[Any]:
-    """Every record of one file but its indexes, chunks unpacked into their schemas, channels and messages.
+    """Every record of one file but its indexes, chunks unpacked into their schemas, channels and
+    messages.
 
-    A chunk that is messages of known `topics` alone comes as one list. Raises InputError for damage.
+    A chunk that is messages of known `topics` alone comes as one list. Raises InputError for
+    damage.
     """
     with open_regular(path, ADVICE) as file:
         finished = _is_finished(file)
@@ -193,12 +209,14 @@ def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[An
         file.seek(0)
         reader = _Reader(file, size)
         records = reader.all()
-        room, zstd = FREE_BYTES + MAX_INFLATION * size, Zstd()  # making one takes longer than unpacking a chunk
+        # making one takes longer than unpacking a chunk
+        room, zstd = FREE_BYTES + MAX_INFLATION * size, Zstd()
         while True:
             try:
                 record = next(records, None)
                 data = _unpacked(record, room, zstd) if isinstance(record, kinds.Chunk) else None
-            except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
+            except Exception as error:
+                # the reader passes on what struct, zstd, lz4 and UTF-8 raise
                 cut_off = isinstance(error, RecordLengthLimitExceeded) or reader.place == size
                 if cut_off and not finished and not isinstance(error, TooLargeError):
                     return
@@ -217,10 +235,12 @@ def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[An
 
 
 class _Reader(StreamReader):
-    """Takes whole chunks from many of a file's bytes at once, and skips indexes, which nothing here uses.
+    """Takes whole chunks from many of a file's bytes at once, and skips indexes, which nothing here
+    uses.
 
-    The library reads field by field, which takes as long as all else of a report. It still has whatever is not plain. It never
-    asks for more than the file has, whatever length a record states.
+    The library reads field by field, which takes as long as all else of a report. It still has
+    whatever is not plain. It never asks for more than the file has, whatever length a record
+    states.
     """
 
     def __init__(self, file: IO[bytes], size: int) -> None:
@@ -229,7 +249,9 @@ class _Reader(StreamReader):
         self._crcs = (0, 0, 0)  # CRC-32 of the file up to two reads ago, to one, and to here
 
     def read(self, length: int) -> bytes:
-        """At most `length` bytes, for the library. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
+        """At most `length` bytes, for the library. Raises TooLargeError for a record over
+        MAX_RECORD_BYTES.
+        """
         left = self._size - self.place
         if MAX_RECORD_BYTES < length <= left:
             raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
@@ -246,7 +268,9 @@ class _Reader(StreamReader):
                 yield from self._plain_chunks()
 
     def _plain_chunks(self) -> Iterator[kinds.Chunk]:
-        """The chunks from here to the first record that is neither one nor an index, or in which something is odd."""
+        """The chunks from here to the first record that is neither one nor an index, or in which
+        something is odd.
+        """
         at = PIECE_BYTES
         while at:
             begin, at = self.place, 0
@@ -294,7 +318,9 @@ def _refused(path: Path, place: int, error: Exception) -> InputError:
 
 
 def unpacked(data: bytes, compression: str, limit: int, exact: bool = True, zstd: Zstd | None = None) -> bytes:
-    """What was packed: `limit` bytes, or if not `exact` at most so many. Raises DamageError, and what the unpackers raise."""
+    """What was packed: `limit` bytes, or if not `exact` at most so many. Raises DamageError, and
+    what the unpackers raise.
+    """
     if compression == "zstd":
         with (zstd or Zstd()).stream_reader(data) as stream:
             whole = stream.read(limit + 1)
@@ -367,7 +393,9 @@ class _Pending(NamedTuple):
 
 
 class McapWriter:
-    """Writes to a file descriptor that is open for writing and empty; closing it stays the caller's. Raises OSError."""
+    """Writes to a file descriptor that is open for writing and empty; closing it stays the
+    caller's. Raises OSError.
+    """
 
     def __init__(self, fd: int, topics: Mapping[str, JsonTopic], metadata_name: str, metadata: Mapping[str, str]) -> None:
         self.size_bytes = 0
@@ -390,7 +418,8 @@ class McapWriter:
         before = MCAP_MAGIC + _bytes_of(kinds.Header("", "hilstar"))
         whole = _bytes_of(head)
         self._metadata_index = kinds.MetadataIndex(len(before), len(whole), metadata_name)
-        # Outside the first chunk: most readers also look for channels there, and these are never lost with a chunk.
+        # Outside the first chunk: most readers also look for channels there, and these are never
+        # lost with a chunk.
         self._append(before + whole + _bytes_of(*self._schemas, *self._channels))
 
     def add(self, key: str, time_ns: int, data: bytes, sequence: int) -> None:
@@ -410,7 +439,9 @@ class McapWriter:
         other._pending, other.pending_bytes = [], 0
 
     def drop(self, key: str | None = None) -> int:
-        """Forget the messages of a topic (None: of all) that are not written yet; returns their number."""
+        """Forget the messages of a topic (None: of all) that are not written yet; returns their
+        number.
+        """
         kept = [] if key is None else [entry for entry in self._pending if entry.channel != self._ids[key]]
         dropped = len(self._pending) - len(kept)
         self._pending, self.pending_bytes = kept, sum(len(entry.record) for entry in kept)
@@ -425,7 +456,8 @@ class McapWriter:
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
         chunk = _bytes_of(kinds.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
-        entries: dict[int, list[tuple[int, int]]] = {}  # by channel: the times of its messages and where they begin
+        # by channel: the times of its messages and where they begin
+        entries: dict[int, list[tuple[int, int]]] = {}
         offset = 0
         for channel, time_ns, record in self._pending:
             entries.setdefault(channel, []).append((time_ns, offset))
@@ -449,7 +481,9 @@ class McapWriter:
             self._indexed, self._index = False, bytearray()
 
     def finish(self) -> None:
-        """Write what was added, the index and the end. Raises OSError; the file is then as if its writer had been killed."""
+        """Write what was added, the index and the end. Raises OSError; the file is then as if
+        its writer had been killed.
+        """
         self.flush()
         end = _bytes_of(kinds.DataEnd(self.crc))
         start = self.size_bytes + len(end)
@@ -513,7 +547,9 @@ _encoder = msgspec.json.Encoder()
 
 
 def attitude_message(sample: AttitudeSample, receive_ns: int | None = None, raw: bytes | None = None) -> bytes:
-    """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the packet as received."""
+    """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the
+    packet as received.
+    """
     q, rate = tuple(sample.q_icrs_to_cam.tolist()), sample.rate_cam_rad_s
     turning, packet = None if rate is None else tuple(rate.tolist()), None if raw is None else raw.hex()
     return _encoder.encode(_Form(sample.t_ns, sample.sequence, q, turning, sample.discontinuity, receive_ns, raw=packet))
@@ -532,7 +568,9 @@ def register_attitudes(writer: Writer) -> int:
 
 
 def log_time_ns(t_ns: int, receive_ns: int | None = None) -> int:
-    """The unsigned log time of a message: `receive_ns` where known, else `t_ns`, and 0 for negative times."""
+    """The unsigned log time of a message: `receive_ns` where known, else `t_ns`, and 0 for
+    negative times.
+    """
     return max(0, t_ns if receive_ns is None else receive_ns)
 
 
@@ -557,11 +595,11 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
 
 
 def read_events(path: Path) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
-    """Each message's place, and its sample or why it is none, in the order of the file; other channels and packets that were
-    refused when they came are skipped.
+    """Each message's place, and its sample or why it is none, in the order of the file; other
+    channels and packets that were refused when they came are skipped.
 
-    A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage, and for a
-    message that is not an attitude.
+    A file whose writer was killed gives everything before its last, unfinished chunk. Raises
+    InputError for damage, and for a message that is not an attitude.
     """
     for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
         place = f": message {number} of {ATTITUDE_TOPIC}"

@@ -1,18 +1,21 @@
 """Attitudes from a ROS bag: which topic, which frames, and what its times are.
 
-The header's stamp is the time of an attitude: ns since 1970 (UTC without leap seconds), or of a simulated clock. Messages
-without a stamp, or with a stamp that never changes from 0, have the time at which they were recorded.
+The header's stamp is the time of an attitude: ns since 1970 (UTC without leap seconds), or of a
+simulated clock. Messages without a stamp, or with a stamp that never changes from 0, have the time
+at which they were recorded.
 
-In every message type the quaternion (x, y, z, w) turns components of the body (child) frame into those of the frame that it
-refers to (REP 103, REP 105). The header names that frame, except for an Imu: there it names the body, and the reference of
-the orientation has no name (REP 145).
+In every message type the quaternion (x, y, z, w) turns components of the body (child) frame into
+those of the frame that it refers to (REP 103, REP 105). The header names that frame, except for an
+Imu: there it names the body, and the reference of the orientation has no name (REP 145).
 
-`--reference MEANING` says what the axes of the bag's frame are: icrs, or enu or ned at --place. `--reference FRAME=MEANING`
-also names the frame; `--reference FRAME` names one whose name says what its axes are.
+`--reference MEANING` says what the axes of the bag's frame are: icrs, or enu or ned at --place.
+`--reference FRAME=MEANING` also names the frame; `--reference FRAME` names one whose name says what
+its axes are.
 
-tf is a tree of frames; a chain of transforms gives the attitude of one frame in another. A transform whose rotation never
-changes is static, whichever topic it comes on. Where several transforms of a chain move, the attitudes have the times of the
-one with the most samples, and the others are interpolated to those (SLERP, as in tf2), never extrapolated.
+tf is a tree of frames; a chain of transforms gives the attitude of one frame in another. A
+transform whose rotation never changes is static, whichever topic it comes on. Where several
+transforms of a chain move, the attitudes have the times of the one with the most samples, and the
+others are interpolated to those (SLERP, as in tf2), never extrapolated.
 
 A type that has the name of ROS's own and other fields is refused.
 """
@@ -82,9 +85,9 @@ ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back
 class _RosTurn(NamedTuple):
     """One orientation: `q` (w, x, y, z) turns components of the body into those of the reference.
 
-    `stamp_ns` is the header's time, None where it has none; frames are None where the message does not name them. `rate` is in
-    components of the body, rad/s, with respect to the reference, or to the stars where `gyro` says so. `fault` is why it is no
-    orientation.
+    `stamp_ns` is the header's time, None where it has none; frames are None where the message does
+    not name them. `rate` is in components of the body, rad/s, with respect to the reference, or to
+    the stars where `gyro` says so. `fault` is why it is no orientation.
     """
 
     stamp_ns: int | None
@@ -129,7 +132,9 @@ def _vector(vector: Any) -> Numbers:
 
 @dataclass(slots=True)
 class _Edge:
-    """Every transform from one child to one parent: times (header's and recorder's), and (w, x, y, z) from child to parent."""
+    """Every transform from one child to one parent: times (header's and recorder's), and (w, x,
+    y, z) from child to parent.
+    """
 
     parent: str
     child: str
@@ -173,7 +178,9 @@ class _Edge:
 
 
 class _FrameChain(NamedTuple):
-    """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
+    """The transforms from a body up to the frame that its attitude refers to, and the one whose
+    times the attitudes have.
+    """
 
     body: str
     reference: str
@@ -191,7 +198,8 @@ class _FrameChain(NamedTuple):
         for edge in self.edges:
             part = self.timed.q if edge is self.timed else edge.at(t_ns)
             known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
-            with np.errstate(all="ignore"):  # numbers of the timed part that are not finite are refused where they are checked
+            # numbers of the timed part that are not finite are refused where they are checked
+            with np.errstate(all="ignore"):
                 whole = multiply(part, whole)
         others, name = [edge for edge in self.edges if edge.moves and edge is not self.timed], _edge_names([self.timed])
         if others:
@@ -226,7 +234,8 @@ class _Tree:
         return [edge for parents in self._up.values() for edge in parents.values()]
 
     def chain(self, body: str | None, reference: str | None) -> _FrameChain:
-        """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
+        """From `body` up to `reference`, or as far as the tree goes; the body may be left out where
+        one frame moves.
 
         Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
         """
@@ -277,7 +286,8 @@ def _listed(names: list[str], count: int, limit: int) -> str:
 
 
 def named(reference: str | None) -> tuple[str | None, Kind | None]:
-    """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say.
+    """What `--reference` says: the frame of the bag, and what its axes are; None for what it does
+    not say.
 
     Raises InputError for a meaning that is none.
     """
@@ -291,7 +301,8 @@ def named(reference: str | None) -> tuple[str | None, Kind | None]:
 
 
 def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
-    """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not name it.
+    """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not
+    name it.
 
     Raises InputError where neither its name nor the user says, or they differ.
     """
@@ -324,7 +335,9 @@ class _Heard(NamedTuple):
 
 
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
-    """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
+    """The body's attitudes of one topic. Raises InputError where the bag, or what is stated,
+    does not say which they are.
+    """
     topic = _chosen(bag, stated.topic)
     if not bag.has_own_fields(topic):
         where = f"{bag.path}: {topic.name}"
@@ -341,7 +354,8 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     reference = stated_reference(bag.path, kind, stated, first.t_ns(stamped))
     entries = to_icrs(_entries(heard, first.turn, stamped), reference, first.turn.gyro, told)
     body = first.turn.body
-    # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice.
+    # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would
+    # turn it twice.
     if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
         told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
     return LogReading(in_order(entries, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told)
@@ -362,7 +376,8 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None)
     if body is not None:
         wanted = frame(body)
         heard = (each for each in heard if each.turn.body == wanted)
-    # Zeros and NaN from before an estimator ran may lack stamps and frames, too: what follows them counts.
+    # Zeros and NaN from before an estimator ran may lack stamps and frames, too: what follows them
+    # counts.
     unset = []
     for each in heard:
         if not is_unset(each.turn.q):

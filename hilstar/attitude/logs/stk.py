@@ -2,7 +2,8 @@
 
 1. Whatever its form, an attitude turns from CoordinateAxes to the body. A quaternion is the axis
    and half the angle by which the axes are turned, so hilstar's is its conjugate: in AGI's own
-   example of AttitudeTimeQuatAngVels, +6 deg/s about z for 10 s is (0, 0, sin 30, cos 30), scalar last.
+   example of AttitudeTimeQuatAngVels, +6 deg/s about z for 10 s is (0, 0, sin 30, cos 30), scalar
+   last.
 2. Angular velocities are deg/s of the body with respect to those axes, in the body's components.
 3. The three Euler angles (degrees) are successive turns of the axes about the axes of Sequence,
    each about an axis that the turns before it made.

@@ -1,4 +1,6 @@
-"""A tracker's telemetry: CSV with every row that it has, valid or not, or a log of attitudes (AEM, MCAP, JSON lines)."""
+"""A tracker's telemetry: CSV with every row that it has, valid or not, or a log of attitudes
+(AEM, MCAP, JSON lines).
+"""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +28,8 @@ MAX_T_NS = 9 * 10**18
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Times (n,), ns of the tracker's clock, with attitudes (n, 4), unit q_icrs_to_cam, NaN where not `valid` (n,).
+    """Times (n,), ns of the tracker's clock, with attitudes (n, 4), unit q_icrs_to_cam, NaN where
+    not `valid` (n,).
 
     `line` (n,) is each row's line in its file, or its number from 1 where `of_lines` is False.
     """
@@ -40,7 +43,9 @@ class Telemetry:
 
 
 def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
-    """Read telemetry. Raises InputError with the line of what is no attitude and, if `rising`, of a time that does not rise."""
+    """Read telemetry. Raises InputError with the line of what is no attitude and, if `rising`,
+    of a time that does not rise.
+    """
     if format_of(path).name == "CSV":
         telemetry = _read_csv(path, rising)
     else:

@@ -1,11 +1,15 @@
-"""A separate process that reads a link, so that no stamp waits for Python's lock: its owner's end, and the records between.
+"""A separate process that reads a link, so that no stamp waits for Python's lock: its owner's end,
+and the records between.
 
 The contract:
-1. This process gives a `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
+1. This process gives a `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor
+   goes along), or nothing to
    read any more. A new order replaces the last one.
-2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. Records
+2. The other process (`apart_child`) stamps each message and hands it over in a record that carries
+   the order's number. Records
    of an earlier order are dropped here.
-3. It sends a sign of life every 0.1 s. Where it ends or hangs, a notice says so, and it is restarted with the same order,
+3. It sends a sign of life every 0.1 s. Where it ends or hangs, a notice says so, and it is
+   restarted with the same order,
    however seldom or briefly it is looked at from here.
 4. It ends with this process, however this one ends.
 5. It has real-time priority where that is allowed, but never where it runs a user's code.
@@ -41,7 +45,8 @@ STEADY_S = 10 * MAX_BACK_OFF_S
 HUNG_S = 0.4  # a sleeping process without a sign of life for this long hangs
 STALLED_S = 3.0  # a runnable process may wait this long for a core
 LOOPS_S = 1.0  # CPU that a process takes without a sign of life: it had a core, and did not return
-MAX_LOOK_S = 0.1  # between two looks, of what counts as silence: this process may have been stopped itself
+# between two looks, of what counts as silence: this process may have been stopped itself
+MAX_LOOK_S = 0.1
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 STARTS_S = 30.0  # to start, on a machine whose cores are all busy
 READY_WITHIN_S = 5.0
@@ -57,7 +62,9 @@ class RawLink(Protocol):
         """Whether something waits."""
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """The messages so far; waits at most `timeout_ms`. Raises OSError where a device no longer answers."""
+        """The messages so far; waits at most `timeout_ms`. Raises OSError where a device no
+        longer answers.
+        """
 
     def close(self) -> None:
         """Close this process's end of it."""
@@ -67,7 +74,9 @@ OpenStream = Callable[..., RawLink]  # its only argument: notices
 
 
 class ReadOrder(NamedTuple):
-    """What to read from now on: a stream to open; or the device whose descriptor goes along; or nothing."""
+    """What to read from now on: a stream to open; or the device whose descriptor goes along; or
+    nothing.
+    """
 
     number: int
     stream: OpenStream | None = None
@@ -78,8 +87,9 @@ class ReadOrder(NamedTuple):
 class Record(msgspec.Struct, frozen=True, omit_defaults=True):
     """What the other process hands over, of one order. A record without anything is a sign of life.
 
-    `gone` says why the device no longer answers, `counts` what the counts have grown by since the last record that had them,
-    `end` why the process ends. A `lasting` notice is told, another only mentioned.
+    `gone` says why the device no longer answers, `counts` what the counts have grown by since the
+    last record that had them, `end` why the process ends. A `lasting` notice is told, another only
+    mentioned.
     """
 
     order: int = 0
@@ -109,7 +119,9 @@ def pack(record: Record) -> bytes:
 
 
 class RecordStream:
-    """Puts records together again from what a stream brings, in order, however they were cut on their way."""
+    """Puts records together again from what a stream brings, in order, however they were cut on
+    their way.
+    """
 
     def __init__(self) -> None:
         self._kept = bytearray()
@@ -134,7 +146,8 @@ class RecordStream:
 
 
 class ReaderProcess:
-    """Runs the process that reads a link: starts it, gives it its order, and restarts it where it ended or hangs.
+    """Runs the process that reads a link: starts it, gives it its order, and restarts it where it
+    ended or hangs.
 
     `generation` counts its starts.
     """
@@ -187,13 +200,17 @@ class ReaderProcess:
                 socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
 
     def read(self, stream: OpenStream | None = None, device: int | None = None, *, runs_user_code: bool = False) -> None:
-        """Order a stream to be opened, or a device, whose descriptor this process keeps; with neither, the device is let go."""
+        """Order a stream to be opened, or a device, whose descriptor this process keeps; with
+        neither, the device is let go.
+        """
         self._order = ReadOrder(self._order.number + 1, stream, device is not None, runs_user_code)
         self._file = -1 if device is None else device
         self._give()
 
     def wait(self, timeout_ms: float) -> bool:
-        """True once the process has said something that was not taken, or has ended; begins it again where that is due."""
+        """True once the process has said something that was not taken, or has ended; begins it
+        again where that is due.
+        """
         if self._wire is None and self._again.over:
             self._begin()
         if self._wire is None:
@@ -224,7 +241,9 @@ class ReaderProcess:
             self._ended(f"no sign of life for {limit_s:g} s")
 
     def _state(self) -> tuple[str, float]:
-        """What Linux says that the process does ("R" runs or waits for a core), and its CPU time, s."""
+        """What Linux says that the process does ("R" runs or waits for a core), and its CPU
+        time, s.
+        """
         with contextlib.suppress(OSError, IndexError, ValueError):
             if self._process is not None:
                 fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
@@ -233,7 +252,9 @@ class ReaderProcess:
 
     @property
     def _starting(self) -> bool:
-        """Whether it still imports what it needs: its own modules, or a user's, which its order names."""
+        """Whether it still imports what it needs: its own modules, or a user's, which its order
+        names.
+        """
         return not self._ready or (self._order.runs_user_code and self._opened != self._order.number)
 
     @property
@@ -244,7 +265,9 @@ class ReaderProcess:
         return self._trouble
 
     def await_ready(self) -> None:
-        """Wait until the process has imported what it needs; not for long, and not for one that failed."""
+        """Wait until the process has imported what it needs; not for long, and not for one that
+        failed.
+        """
         deadline = self._clock.within(READY_WITHIN_S)
         while not self._ready and self._wire is not None and not deadline.over:
             if self.wait(READY_WITHIN_S * 1000):

@@ -1,4 +1,5 @@
-"""python -m hilstar.attitude.wire.apart_child: the process that reads a link, stamps what comes, and hands it over (`apart`).
+"""python -m hilstar.attitude.wire.apart_child: the process that reads a link, stamps what comes,
+and hands it over (`apart`).
 
 It hears no signals: the process that shows stars does, and ends this one.
 """
@@ -44,7 +45,9 @@ class Wire:
             self.put(Record())
 
     def put(self, record: Record) -> None:
-        """Hand a record over; waits while the other side does not read, so that nothing grows here."""
+        """Hand a record over; waits while the other side does not read, so that nothing grows
+        here.
+        """
         try:
             self._socket.sendall(pack(record))
         except OSError as error:
@@ -127,7 +130,9 @@ class _Reading:
             self.link = _OpenDevice(file, clock)
 
     def hand_over(self, link: RawLink) -> None:
-        """Stamp and hand over what came; a device that does not answer any more is said, and closed."""
+        """Stamp and hand over what came; a device that does not answer any more is said, and
+        closed.
+        """
         asked_ns = self._clock.now_ns()
         try:
             waits = link.wait_for_message(0)
@@ -140,7 +145,8 @@ class _Reading:
             return
         self._notices.count()
         for k, message in enumerate(taken):
-            # The newest of those that arrived while this process slept woke it; the others had to wait.
+            # The newest of those that arrived while this process slept woke it; the others had to
+            # wait.
             timely = not waits and k == len(taken) - 1
             self._wire.put(Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely)))
 
@@ -151,7 +157,9 @@ class _Reading:
 
 
 def main() -> NoReturn:
-    """Read what is ordered until the other side is gone; report there in a line what ends this process early."""
+    """Read what is ordered until the other side is gone; report there in a line what ends this
+    process early.
+    """
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     file, parent = map(int, sys.argv[1:3])
@@ -166,7 +174,8 @@ def main() -> NoReturn:
             ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
             if ordered is not None:
                 reading.close()
-                if ordered[0].runs_user_code:  # which may loop for ever, and is imported as the link is opened
+                # which may loop for ever, and is imported as the link is opened
+                if ordered[0].runs_user_code:
                     priority.give_up()
                 reading = _Reading(wire, *ordered)
                 wire.put(Record(ordered[0].number))  # a user's module may take seconds to import

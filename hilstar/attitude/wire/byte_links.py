@@ -1,6 +1,8 @@
-"""Bytes as they come: serial lines, UDP, TCP, ZeroMQ and growing files, each reopened where it is lost; what asks is sent.
+"""Bytes as they come: serial lines, UDP, TCP, ZeroMQ and growing files, each reopened where it is
+lost; what asks is sent.
 
-For the process that reads a tracker's answers (see `hilstar.server.answers.reader`). What comes is not looked at here.
+For the process that reads a tracker's answers (see `hilstar.server.answers.reader`). What comes is
+not looked at here.
 """
 
 import contextlib
@@ -30,13 +32,16 @@ MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.05, 0.5
 CONNECT_S = 0.5
 FILE_LOOK_S = 0.005
 HELD_S = 3.0  # for so long after its last byte a tracker's connection holds the line
-ACCEPT_EACH_S = 0.02  # between two connections: whoever connects in a loop does not keep a core busy
+# between two connections: whoever connects in a loop does not keep a core busy
+ACCEPT_EACH_S = 0.02
 TOLD_S = 10.0  # for so long after the last one a refused connection stands in the status
 Place = tuple[str, int]
 
 
 class ByteLink(Closing):
-    """A road by which bytes come; `messages` says that each chunk is whole by itself. Losing the other side raises nothing."""
+    """A road by which bytes come; `messages` says that each chunk is whole by itself. Losing the
+    other side raises nothing.
+    """
 
     messages = False
 
@@ -131,7 +136,9 @@ class SerialBytes(ByteLink):
 
 
 class UdpBytes(ByteLink):
-    """UDP: bound to a place, with the senders that are allowed, or connected to a tracker that is asked. Raises InputError."""
+    """UDP: bound to a place, with the senders that are allowed, or connected to a tracker that
+    is asked. Raises InputError.
+    """
 
     messages = True
 
@@ -175,8 +182,9 @@ class UdpBytes(ByteLink):
 class TcpBytes(ByteLink):
     """TCP: connects to a tracker, or listens for the one that connects. Raises InputError.
 
-    Of several that connect the first holds the line while it has sent within HELD_S; others are refused and named meanwhile.
-    Then the next one to connect takes its place: a tracker that rebooted behind a line that never closed.
+    Of several that connect the first holds the line while it has sent within HELD_S; others are
+    refused and named meanwhile. Then the next one to connect takes its place: a tracker that
+    rebooted behind a line that never closed.
     """
 
     def __init__(
@@ -328,7 +336,9 @@ def no_file_kind(mode: int) -> str:
 
 
 def refuse_no_file(path: Path) -> None:
-    """Refuse (InputError) a path that names something other than a regular file; it may name nothing yet."""
+    """Refuse (InputError) a path that names something other than a regular file; it may name
+    nothing yet.
+    """
     try:
         kind = no_file_kind(path.stat().st_mode)
     except OSError:
@@ -338,10 +348,11 @@ def refuse_no_file(path: Path) -> None:
 
 
 class FileBytes(ByteLink):
-    """What is appended to a regular file after the start; one that is made anew or cut is read from its beginning.
+    """What is appended to a regular file after the start; one that is made anew or cut is read from
+    its beginning.
 
-    A path that comes to name something else (a device, a FIFO, a directory) is let go and told: a device may have bytes for
-    ever. It is looked at again until it names a file.
+    A path that comes to name something else (a device, a FIFO, a directory) is let go and told: a
+    device may have bytes for ever. It is looked at again until it names a file.
     """
 
     def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
@@ -382,7 +393,8 @@ class FileBytes(ByteLink):
             with contextlib.suppress(OSError):
                 if self._file >= 0:
                     data = os.read(self._file, MAX_READ_BYTES)
-                # One that has more than a tracker says in a look may never end, while another stands in its place.
+                # One that has more than a tracker says in a look may never end, while another
+                # stands in its place.
                 if not data or len(data) == MAX_READ_BYTES:
                     self._follow()
             if data:

@@ -1,12 +1,15 @@
-"""Addresses that links bind or connect to, and whose datagrams UDP accepts: text in, checked places out, no I/O.
+"""Addresses that links bind or connect to, and whose datagrams UDP accepts: text in, checked places
+out, no I/O.
 
-ZeroMQ: a whitelist of forms, so that libzmq reads exactly what was checked here. libzmq itself also accepts
-tcp://SOURCE;DESTINATION, names of interfaces, octal addresses, ports modulo 65536, and text after the port; and binding
-ipc://FILE deletes that file.
+ZeroMQ: a whitelist of forms, so that libzmq reads exactly what was checked here. libzmq itself also
+accepts tcp://SOURCE;DESTINATION, names of interfaces, octal addresses, ports modulo 65536, and text
+after the port; and binding ipc://FILE deletes that file.
 
-    tcp://HOST:PORT   HOST an IPv4 address, an IPv6 address in brackets, a host name, or * (bind only; every interface);
+    tcp://HOST:PORT   HOST an IPv4 address, an IPv6 address in brackets, a host name, or * (bind
+    only; every interface);
                       PORT 1 to 65535, or * (bind only; a free one, which is reported)
-    ipc:///PATH       a Unix socket, its absolute path; in an existing directory, with nothing there but an unserved socket
+    ipc:///PATH       a Unix socket, its absolute path; in an existing directory, with nothing there
+    but an unserved socket
 
 UDP takes numeric addresses only, so that no name can lead elsewhere.
 """
@@ -26,7 +29,8 @@ from hilstar.basics.errors import InputError, shortened
 ENDPOINT_FORM = "write tcp://HOST:PORT, such as tcp://127.0.0.1:5560"
 PATH_FORM = "write the absolute path of a socket, such as ipc:///run/user/1000/attitude"
 LABEL = "(?!-)[A-Za-z0-9-]{1,63}(?<!-)"
-# The last label of a name is not a number: that would be an address in an older notation (127.1, 0x7f.1).
+# The last label of a name is not a number: that would be an address in an older notation (127.1,
+# 0x7f.1).
 HOST_NAME = re.compile(rf"(?:{LABEL}\.)*(?!0[xX])(?=[A-Za-z0-9-]*[A-Za-z]){LABEL}")
 TCP = re.compile(r"tcp://(\[[0-9A-Fa-f:.%A-Za-z]+\]|[^\[\]:/;@%\s]+):([0-9]{1,5}|\*)")
 MAX_HOST_CHARACTERS = 253
@@ -47,7 +51,9 @@ LOOPBACK: tuple[Network, ...] = (ipaddress.IPv4Network("127.0.0.0/8"), ipaddress
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A checked endpoint: `address` as libzmq gets it, and whether it is reachable only from this machine."""
+    """A checked endpoint: `address` as libzmq gets it, and whether it is reachable only from
+    this machine.
+    """
 
     address: str
     loopback: bool
@@ -57,7 +63,9 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """The endpoint of a text. Raises InputError for any form except those listed in this module's docstring."""
+    """The endpoint of a text. Raises InputError for any form except those listed in this
+    module's docstring.
+    """
     if text.startswith("ipc://"):
         name = text.removeprefix("ipc://")
         if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
@@ -94,7 +102,9 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
 
 
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
-    """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind would delete, as libzmq does."""
+    """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind
+    would delete, as libzmq does.
+    """
     path = endpoint.path
     if path is None:
         if not bind and (endpoint.any_host or endpoint.any_port):
@@ -146,7 +156,9 @@ class UdpPlace:
 
 
 class AllowedSenders:
-    """The addresses and networks whose datagrams are read: this machine alone where none are given."""
+    """The addresses and networks whose datagrams are read: this machine alone where none are
+    given.
+    """
 
     def __init__(self, texts: Iterable[str] = ()) -> None:
         networks: list[Network] = []
@@ -178,7 +190,9 @@ class AllowedSenders:
 
 
 def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) -> UdpPlace:
-    """Where to bind, from three keys that may say the same. Raises InputError where one is wrong, or two disagree."""
+    """Where to bind, from three keys that may say the same. Raises InputError where one is
+    wrong, or two disagree.
+    """
     if bind is False:
         raise InputError(f"bind = false: over UDP hilstar binds and the simulator sends to it; {BIND_FORM}")
     said: dict[str, tuple[str | None, int | None]] = {}

@@ -1,7 +1,7 @@
 """CURVE keys for ZeroMQ: made, read, and required for non-loopback endpoints.
 
-The side that binds is the CURVE server, with an allow-list of its clients' public keys. The side that connects needs the
-server's public key. Key files are pyzmq certificates.
+The side that binds is the CURVE server, with an allow-list of its clients' public keys. The side
+that connects needs the server's public key. Key files are pyzmq certificates.
 """
 
 import contextlib
@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 class CurveKeys:
     """One side's keys: its own secret key file, and the peers that it trusts.
 
-    `server_key` is the public key file of the side that binds, for the side that connects; `allowed_clients` a
+    `server_key` is the public key file of the side that binds, for the side that connects;
+    `allowed_clients` a
     directory of public key files, for the side that binds.
     """
 
@@ -62,10 +63,11 @@ def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -
 
 
 def make_keys(directory: Path) -> list[Path]:
-    """Make two key pairs, `server` for the side that binds and `client` for the other, and the server's allow-list.
+    """Make two key pairs, `server` for the side that binds and `client` for the other, and the
+    server's allow-list.
 
-    Only its owner can read a secret key, from its first byte on. Returns the paths. Raises InputError where a key exists
-    already: a key in use is never overwritten.
+    Only its owner can read a secret key, from its first byte on. Returns the paths. Raises
+    InputError where a key exists already: a key in use is never overwritten.
     """
     allowed = directory / "allowed_clients"
     written = [directory / f"{name}.{kind}" for name in ("server", "client") for kind in ("key", "key_secret")]
@@ -76,7 +78,8 @@ def make_keys(directory: Path) -> list[Path]:
         if there:
             raise InputError(f"{there[0]}: exists already, and may be in use; choose another directory")
         allowed.mkdir(parents=True, exist_ok=True)
-        # All keys are made in a temporary directory, then renamed into place: an incomplete set is useless.
+        # All keys are made in a temporary directory, then renamed into place: an incomplete set is
+        # useless.
         with tempfile.TemporaryDirectory(dir=directory, prefix=".keys") as folder:
             for name in ("server", "client"):
                 zmq.auth.create_certificates(folder, name)
@@ -98,7 +101,9 @@ def load_public(path: Path) -> bytes:
 
 
 def load_secret(path: Path) -> tuple[bytes, bytes]:
-    """The public and the secret key of a secret key file; warns where others may read it. Raises InputError."""
+    """The public and the secret key of a secret key file; warns where others may read it. Raises
+    InputError.
+    """
     public, secret = _load(path)
     if secret is None:
         raise InputError(f"{path}: contains no secret key; name the .key_secret file that `hilstar keys` made")
@@ -123,10 +128,12 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
 
 
 class AllowList:
-    """The clients in a directory of public keys, reread whenever the directory or a file in it has changed.
+    """The clients in a directory of public keys, reread whenever the directory or a file in it has
+    changed.
 
-    pyzmq calls `callback` at each handshake, in one thread. Raises InputError at the start where it contains no key, or a
-    file that is not a key; later such a file causes a warning, and its client is rejected.
+    pyzmq calls `callback` at each handshake, in one thread. Raises InputError at the start where it
+    contains no key, or a file that is not a key; later such a file causes a warning, and its client
+    is rejected.
     """
 
     def __init__(self, directory: Path) -> None:

@@ -1,9 +1,11 @@
-"""What bytes that are no packet look like: text, HTTP, TLS, a packet in another byte order. Every link asks here.
+"""What bytes that are no packet look like: text, HTTP, TLS, a packet in another byte order. Every
+link asks here.
 
-Nothing is accepted by this: a refused message, or bytes that never end, are only named, so that their sender can be mended.
-Laws:
+Nothing is accepted by this: a refused message, or bytes that never end, are only named, so that
+their sender can be mended. Laws:
 1. Any bytes give a `Likeness`; nothing raises, and no more than MAX_LOOKED_AT bytes are looked at.
-2. `instead` says what to change where the bytes show it. It is "" where only the form of what is expected helps.
+2. `instead` says what to change where the bytes show it. It is "" where only the form of what is
+   expected helps.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ CRC_BYTES = 4
 ALL_ONES = 0xFFFFFFFF
 FRAME_BYTES = protocol.ATTITUDE_BYTES + 1  # an attitude's COBS frame, without its 0x00
 HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])
-Q_AT = struct.calcsize("<BBHIq")  # in an attitude: version, kind, flags, sequence and t_ns precede it
+# in an attitude: version, kind, flags, sequence and t_ns precede it
+Q_AT = struct.calcsize("<BBHIq")
 HTTP = re.compile(rb"(?:GET|POST|PUT|HEAD|OPTIONS|DELETE|PATCH|CONNECT|TRACE) \S{1,300} HTTP/|HTTP/\d", re.IGNORECASE)
 NMEA = re.compile(rb"[$!][A-Z]{2,5}[A-Z0-9]{0,8},")
 LEADING_TEXT = re.compile(rb"[\t\r\n\x20-\x7e]+")
@@ -73,7 +76,9 @@ def likeness(data: bytes) -> Likeness:
 
 
 def packet_likeness(message: bytes) -> Likeness | None:
-    """What is wrong with a packet whose CRC-32 does not fit, where that can be known; None where it cannot."""
+    """What is wrong with a packet whose CRC-32 does not fit, where that can be known; None where
+    it cannot.
+    """
     body, given = message[:-CRC_BYTES], message[-CRC_BYTES:]
     crc = zlib.crc32(body)
     if given == crc.to_bytes(CRC_BYTES, "big"):
@@ -90,12 +95,16 @@ def packet_likeness(message: bytes) -> Likeness | None:
 
 
 def numbers_likeness(message: bytes) -> Likeness | None:
-    """What is wrong with an attitude of the right CRC-32 whose numbers are refused; None where that cannot be known."""
+    """What is wrong with an attitude of the right CRC-32 whose numbers are refused; None where
+    that cannot be known.
+    """
     return _big_endian_numbers(message)
 
 
 def _telling(message: bytes) -> Likeness | None:
-    """The likeness of a message that is something else altogether; None for a packet that was damaged on its way."""
+    """The likeness of a message that is something else altogether; None for a packet that was
+    damaged on its way.
+    """
     found = likeness(message)
     return found if found.known and message[: len(HEAD)] != HEAD else None
 
@@ -111,7 +120,9 @@ def _is_unit(attitude: bytes, order: str) -> bool:
 
 
 def _unit_at(data: bytes, at: int, order: str) -> bool:
-    """Whether four float64 at a place have the norm 1; denormal numbers, as other fields look, do not count."""
+    """Whether four float64 at a place have the norm 1; denormal numbers, as other fields look,
+    do not count.
+    """
     norm = math.hypot(*struct.unpack_from(f"{order}4d", data, at))
     return abs(norm - 1.0) <= NORM_TOLERANCE
 
@@ -119,8 +130,9 @@ def _unit_at(data: bytes, at: int, order: str) -> bool:
 def _other_crc(body: bytes, given: int) -> str:
     """The name of another usual CRC with the same polynomial that fits; "" for none.
 
-    Parameters as in the catalogue of parametrised CRC algorithms (reveng.sourceforge.io/crc-catalogue). STM32's unit takes the
-    body as 32-bit words, the most significant bit first.
+    Parameters as in the catalogue of parametrised CRC algorithms
+    (reveng.sourceforge.io/crc-catalogue). STM32's unit takes the body as 32-bit words, the most
+    significant bit first.
     """
     forward = _unreflected(body)
     words = b"".join(body[at : at + CRC_BYTES][::-1] for at in range(0, len(body), CRC_BYTES))
@@ -173,7 +185,9 @@ def _packet_inside(data: bytes) -> Likeness | None:
 
 
 def unframed_packet(data: bytes) -> Likeness | None:
-    """A whole attitude among the bytes of a serial line that is in no COBS frame; None where there is none."""
+    """A whole attitude among the bytes of a serial line that is in no COBS frame; None where
+    there is none.
+    """
     for at in range(len(data) - protocol.ATTITUDE_BYTES + 1):
         message = data[at : at + protocol.ATTITUDE_BYTES]
         if message.startswith(HEAD) and _crc_fits(message):
@@ -183,7 +197,9 @@ def unframed_packet(data: bytes) -> Likeness | None:
 
 
 def frame_likeness(body: bytes) -> Likeness:
-    """What the body of a frame, or bytes without a 0x00, look like where they are no COBS of a packet."""
+    """What the body of a frame, or bytes without a 0x00, look like where they are no COBS of a
+    packet.
+    """
     for at in range(len(body) - FRAME_BYTES + 1):
         if _is_attitude_frame(body[at : at + FRAME_BYTES]):
             return _beside_a_frame(body[:at], body[at + FRAME_BYTES :])

@@ -1,6 +1,8 @@
-"""The contract of every link into hilstar: what it can do, messages with their time of arrival, limits against floods.
+"""The contract of every link into hilstar: what it can do, messages with their time of arrival,
+limits against floods.
 
-A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the `AttitudeSample` in it.
+A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the
+`AttitudeSample` in it.
 """
 
 from __future__ import annotations
@@ -34,9 +36,9 @@ E_co = TypeVar("E_co", bound=Event, covariant=True)
 class LinkCounts:
     """The counts of a link's connections and messages.
 
-    `connections`: made. `rejected`: failed handshakes, and datagrams of senders that are not allowed. `refused`: too many at
-    once. `lost`: ended, on the side that connects. `resets`: of the link, for memory or for messages without end. `flooded`:
-    messages dropped unread.
+    `connections`: made. `rejected`: failed handshakes, and datagrams of senders that are not
+    allowed. `refused`: too many at once. `lost`: ended, on the side that connects. `resets`: of the
+    link, for memory or for messages without end. `flooded`: messages dropped unread.
     """
 
     connections: int = 0
@@ -58,7 +60,9 @@ class LinkCounts:
 
 
 class FloodGate:
-    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once, the newest. The others are passed over: counted and reported."""
+    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once, the newest. The others are passed over:
+    counted and reported.
+    """
 
     def __init__(self, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._counts, self._notices, self._clock = counts, notices, clock
@@ -67,10 +71,11 @@ class FloodGate:
         self._dropped_ns = self._seen_ns - OVER_NS - 1
 
     def newest(self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]) -> list[RawMessage]:
-        """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
+        """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses
+        where others are passed over.
 
-        The newest passed-over message whose last part declares a discontinuity is taken too: no attitude is interpolated across
-        it.
+        The newest passed-over message whose last part declares a discontinuity is taken too: no
+        attitude is interpolated across it.
         """
         now_ns = self._clock.now_ns()
         self._left = min(self._left + (now_ns - self._seen_ns) * MAX_PACKETS_PER_S / NS_PER_S, MAX_BURST)
@@ -93,7 +98,8 @@ class FloodGate:
 
 
 class RawMessage(NamedTuple):
-    """What arrived, before it is decoded: host time in ns, its parts, and who sent it, where a link has several senders.
+    """What arrived, before it is decoded: host time in ns, its parts, and who sent it, where a link
+    has several senders.
 
     `empty_ns` is when nothing waited last. A `timely` message woke its reader and did not wait.
     """
@@ -112,10 +118,11 @@ class RawMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Arrival(Generic[E_co]):
-    """What arrived: host time, what it says, its bytes as received, and how long it may have waited unread.
+    """What arrived: host time, what it says, its bytes as received, and how long it may have waited
+    unread.
 
-    `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this message, where a link has
-    several senders.
+    `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this
+    message, where a link has several senders.
     """
 
     host_ns: int
@@ -145,9 +152,10 @@ Pictures = Callable[[AttitudeSample], bytes]
 class Link(Closing, ABC):
     """A link into hilstar, closed when its `with` ends.
 
-    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions` what its numbers mean.
-    `steps`: its simulation waits for a frame after each attitude (lockstep). `two_way`: packets can go back to the sender.
-    `stamped`: times of arrival are the kernel's, or of a process that only reads; else they are of the thread that reads here.
+    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions`
+    what its numbers mean. `steps`: its simulation waits for a frame after each attitude (lockstep).
+    `two_way`: packets can go back to the sender. `stamped`: times of arrival are the kernel's, or
+    of a process that only reads; else they are of the thread that reads here.
     """
 
     steps: ClassVar[bool]
@@ -169,11 +177,15 @@ class Link(Closing, ABC):
 
     @property
     def trouble(self) -> str:
-        """Why the other side gives no messages, as far as that shows: a line; "" where it does not."""
+        """Why the other side gives no messages, as far as that shows: a line; "" where it does
+        not.
+        """
         return "" if self.link_counts.connections else self._notices.latest(WRONG_PEER)
 
     def await_ready(self) -> None:
-        """Wait until a sender is heard from the first read on: for a process that reads, and not for long."""
+        """Wait until a sender is heard from the first read on: for a process that reads, and not
+        for long.
+        """
 
 
 class StreamLink(Link):
@@ -189,7 +201,9 @@ class StreamLink(Link):
 
     @abstractmethod
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The messages so far, oldest first; waits at most `timeout_ms` for the first. A lost peer raises nothing."""
+        """The messages so far, oldest first; waits at most `timeout_ms` for the first. A lost
+        peer raises nothing.
+        """
 
     @abstractmethod
     def wait_for_message(self, timeout_ms: int) -> bool:

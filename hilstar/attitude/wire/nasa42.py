@@ -1,8 +1,10 @@
-"""NASA's 42: its text protocol (no I/O), and the TCP connection over which it waits for an acknowledgement of each message.
+"""NASA's 42: its text protocol (no I/O), and the TCP connection over which it waits for an
+acknowledgement of each message.
 
-A message is lines of text: `TIME YYYY-DDD-hh:mm:ss.sssssssss` (UTC), then `NAME = [a b c]` for each variable with one of the
-prefixes in Inp_IPC.txt, then `[ENDMSG]`. Until 2025 there were no brackets around the values, and `[EOF]` ended a message; both
-are read. (42's own Source/AutoCode/TxRxIPC.c and, before that, Source/IPC/SimWriteToSocket.c.)
+A message is lines of text: `TIME YYYY-DDD-hh:mm:ss.sssssssss` (UTC), then `NAME = [a b c]` for each
+variable with one of the prefixes in Inp_IPC.txt, then `[ENDMSG]`. Until 2025 there were no brackets
+around the values, and `[EOF]` ended a message; both are read. (42's own Source/AutoCode/TxRxIPC.c
+and, before that, Source/IPC/SimWriteToSocket.c.)
 
 Laws:
 1. However the bytes are cut into chunks, the messages are the same.
@@ -49,7 +51,9 @@ KEEPALIVE = {socket.TCP_KEEPIDLE: 3, socket.TCP_KEEPINTVL: 1, socket.TCP_KEEPCNT
 
 
 def written(q_icrs_to_body: FloatArray) -> str:
-    """A body's attitude as 42 writes it: scalar last, of opposite sign to a Hamilton quaternion that turns N into B."""
+    """A body's attitude as 42 writes it: scalar last, of opposite sign to a Hamilton quaternion
+    that turns N into B.
+    """
     w, x, y, z = q_icrs_to_body
     return f"qn = {components(np.array([-x, -y, -z, w]))}"
 
@@ -74,7 +78,9 @@ def spacecraft_number(name: str | int | None) -> int:
 
 
 class MessageSplitter:
-    """Bytes in, whole messages out, each with the line that ends it; TOO_LONG in the place of one that is."""
+    """Bytes in, whole messages out, each with the line that ends it; TOO_LONG in the place of
+    one that is.
+    """
 
     def __init__(self) -> None:
         self._kept = bytearray()
@@ -104,7 +110,8 @@ class MessageReader:
     def __init__(self, spacecraft: int, mounting: Mounting) -> None:
         self._mounting = mounting
         self._name = f"SC[{spacecraft}].B[0]"
-        # The spacecraft's own qn and wn are those of its body 0; versions until 2025 do not send them.
+        # The spacecraft's own qn and wn are those of its body 0; versions until 2025 do not send
+        # them.
         names = "|".join(re.escape(name) for name in (self._name, f"SC[{spacecraft}]"))
         self._line = re.compile(rf"^(?:{names})\.(qn|wn) *= *\[?([^\]\n]*)\]?\s*$", re.MULTILINE)
         self._sequence = 0
@@ -146,7 +153,9 @@ def _time_ns(text: str) -> int | None:
 
 
 class _Connection(Link):
-    """One connection at a time; a second one is closed at once. Raises InputError where it cannot be bound."""
+    """One connection at a time; a second one is closed at once. Raises InputError where it
+    cannot be bound.
+    """
 
     stamped = True
     conventions = CONVENTIONS
@@ -287,7 +296,8 @@ class Nasa42Link(_Connection, StreamLink):
         """The messages that have arrived, and only the newest of a flood; each is acknowledged."""
         messages = self.messages(timeout_ms)
         self.acknowledge(len(messages))
-        return [self.arrival(message) for message in self._gate.newest(messages, lambda _: False)]  # 42 declares none
+        # 42 declares none
+        return [self.arrival(message) for message in self._gate.newest(messages, lambda _: False)]
 
 
 class Nasa42Lockstep(_Connection, LockstepLink):

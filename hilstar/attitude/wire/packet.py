@@ -1,4 +1,5 @@
-"""The packets of the wire, the attitude's JSON form, and COBS frames on a serial line: bytes in, frozen events out, no I/O.
+"""The packets of the wire, the attitude's JSON form, and COBS frames on a serial line: bytes in,
+frozen events out, no I/O.
 
 Laws of a message:
 1. Every message gives exactly one event: a packet or a `Refusal`. Nothing raises.
@@ -10,9 +11,11 @@ Laws of the byte stream, whose frames are each followed by 0x00:
 1. However the bytes are cut into chunks, the events are the same.
 2. A frame is accepted only if `decode` accepts its content, so never with a wrong CRC-32.
 3. Whatever came before, the next complete frame after a 0x00 is decoded.
-4. At most MAX_KEPT_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal for each stretch
+4. At most MAX_KEPT_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal
+   for each stretch
    of garbage, and no memory.
-5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a complete one, or too many
+5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a
+   complete one, or too many
    for any.
 6. Passing over a frame undecoded loses nothing of the next.
 
@@ -48,26 +51,30 @@ JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
 UNIT = 1e-15  # this close, dividing by the norm would only move the last bit
 
 Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
-# Reasons in the message itself, listed in the summary even where their count is 0; and in the stream, listed where they occur.
+# Reasons in the message itself, listed in the summary even where their count is 0; and in the
+# stream, listed where they occur.
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
 STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + STREAM_REASONS
-MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # distance from the Earth's centre: the limits of an orbit file, too
+# distance from the Earth's centre: the limits of an orbit file, too
+MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 DELIMITER = b"\x00"
 # COBS adds one byte to anything shorter than 254. Only packets are framed: JSON goes over ZeroMQ.
 MAX_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
-MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES  # of bytes without a 0x00: enough to hold a whole frame wherever they begin
+# of bytes without a 0x00: enough to hold a whole frame wherever they begin
+MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 FLAGS_AT = 3  # in an attitude's frame, behind the COBS byte, version and kind, of which none is 0
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSample:
-    """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown.
+    """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when
+    unknown.
 
-    `acceleration_cam_rad_s2` (3,) is that of the rate, for sources without noise; `velocity_km_s` (3,), ICRS, the observer's
-    with respect to the origin of the sender's frame, and `place_km` (3,) its place, about the Earth's centre both where there
-    is one. Each is None where nobody says.
+    `acceleration_cam_rad_s2` (3,) is that of the rate, for sources without noise; `velocity_km_s`
+    (3,), ICRS, the observer's with respect to the origin of the sender's frame, and `place_km` (3,)
+    its place, about the Earth's centre both where there is one. Each is None where nobody says.
     """
 
     t_ns: int
@@ -84,7 +91,8 @@ class AttitudeSample:
 class Refusal:
     """Why a message is not used as an attitude.
 
-    `telling`: the bytes show what was sent in an attitude's place, and `detail` says it with what to send.
+    `telling`: the bytes show what was sent in an attitude's place, and `detail` says it with what
+    to send.
     `unset`: its quaternion is zeros or NaN, as an estimator that has not run yet leaves it.
     """
 
@@ -104,7 +112,9 @@ class TimeRequest:
 
 @dataclass(frozen=True, slots=True)
 class TimeReply:
-    """The answer: `t2_ns` when the request arrived, `t3_ns` when the reply left, both on the answerer's clock."""
+    """The answer: `t2_ns` when the request arrived, `t3_ns` when the reply left, both on the
+    answerer's clock.
+    """
 
     sequence: int
     t1_ns: int
@@ -114,9 +124,11 @@ class TimeReply:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What goes back to the sender: the last frame shown, when its light leaves the screen (sender's clock), and health.
+    """What goes back to the sender: the last frame shown, when its light leaves the screen
+    (sender's clock), and health.
 
-    `health` is the sum of protocol.HEALTH_ bits; `attitude_age_ns` is -1 while there is no attitude.
+    `health` is the sum of protocol.HEALTH_ bits; `attitude_age_ns` is -1 while there is no
+    attitude.
     """
 
     health: int
@@ -130,7 +142,9 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class AnswerPacket:
-    """What a star tracker found, as it is on the wire; `flags` is the sum of protocol.ANSWER_ bits."""
+    """What a star tracker found, as it is on the wire; `flags` is the sum of protocol.ANSWER_
+    bits.
+    """
 
     sequence: int
     flags: int
@@ -241,7 +255,9 @@ def is_unset(q: tuple[float, ...]) -> bool:
 def checked_sample(
     t_ns: int, q: tuple[float, ...], rate: tuple[float, ...] | None, sequence: int = 0, discontinuity: bool = False
 ) -> AttitudeSample | Refusal:
-    """A sample from raw numbers, or why they are not one: every source of attitudes passes through here."""
+    """A sample from raw numbers, or why they are not one: every source of attitudes passes
+    through here.
+    """
     import numpy as np  # 70 ms; a process that only stamps packets never comes here
 
     if not all(map(math.isfinite, (*q, *(rate or ())))):
@@ -307,7 +323,9 @@ class StreamDecoder:
 
     @property
     def unended(self) -> bytes:
-        """The bytes since the last 0x00, which are no frame yet; none where they were refused already."""
+        """The bytes since the last 0x00, which are no frame yet; none where they were refused
+        already.
+        """
         return bytes(self._kept)
 
     def feed(self, chunk: bytes) -> list[tuple[Event, bytes]]:
@@ -315,7 +333,9 @@ class StreamDecoder:
         return [(decode_frame(frame), frame) for frame in self.frames(chunk)]
 
     def frames(self, chunk: bytes) -> list[bytes]:
-        """The frames that `chunk` completes, undecoded, in order; of garbage without a 0x00 its beginning, once."""
+        """The frames that `chunk` completes, undecoded, in order; of garbage without a 0x00 its
+        beginning, once.
+        """
         first, *others = chunk.split(DELIMITER)
         found: list[bytes] = []
         self._keep(first, found)

@@ -1,4 +1,6 @@
-"""Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines of text, and the RTS output."""
+"""Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines
+of text, and the RTS output.
+"""
 
 import contextlib
 import errno
@@ -32,14 +34,18 @@ BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
 READ_S = 0.05
 MAX_LINE_BYTES = 256
-NO_SERVER = re.compile("refused|timed out|unreachable|No route", re.IGNORECASE)  # of a port on the network
+# of a port on the network
+NO_SERVER = re.compile("refused|timed out|unreachable|No route", re.IGNORECASE)
 NOT_THERE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
-# What pyserial raises for a port that is gone: OSError from the system, the others from its own port over a network.
+# What pyserial raises for a port that is gone: OSError from the system, the others from its own
+# port over a network.
 LOST = (OSError, TypeError, ValueError)
 
 
 def serial_target(text: str) -> tuple[str, int] | None:
-    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
+    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises
+    InputError.
+    """
     if not text.startswith("serial:"):
         return None
     match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
@@ -54,7 +60,9 @@ def serial_ports() -> list[str]:
 
 
 def adapters() -> list[str]:
-    """What the serial ports are, without their names and serial numbers: "FT232R USB UART (0403:6001)"."""
+    """What the serial ports are, without their names and serial numbers: "FT232R USB UART
+    (0403:6001)".
+    """
     ports = sorted(list_ports.comports())
     words = [f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})" if port.vid is not None else "UART" for port in ports]
     return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
@@ -63,7 +71,8 @@ def adapters() -> list[str]:
 def open_port(port: str, baud: int) -> serial.Serial:
     """A port of its own, whose bytes come at once. Raises OSError, ValueError or OverflowError."""
     device = serial.Serial(port, baud, timeout=0, exclusive=True)
-    with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
+    # else a USB adapter buffers for 16 ms; a pty has no such mode
+    with contextlib.suppress(OSError, ValueError):
         device.set_low_latency_mode(True)
     return device
 
@@ -71,7 +80,8 @@ def open_port(port: str, baud: int) -> serial.Serial:
 class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
-    Raises InputError where the port cannot be opened at the start, MachineError where it is not there.
+    Raises InputError where the port cannot be opened at the start, MachineError where it is not
+    there.
     """
 
     two_way = True
@@ -114,27 +124,33 @@ class SerialLink(StreamLink):
         return open_port(self._port, self._baud)
 
     def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The frames that have arrived, and only the newest of a flood; waits at most `timeout_ms` for the first byte."""
+        """The frames that have arrived, and only the newest of a flood; waits at most
+        `timeout_ms` for the first byte.
+        """
         device = self._device
         if device is None:
             self._reopen(timeout_ms)
             return []
         try:
             chunks = self._read(device, timeout_ms)
-        except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
+        except (OSError, TypeError) as error:
+            # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
         waiting: list[RawMessage] = []
         for chunk in chunks:
             self._recent = (self._recent + chunk.parts[0])[-MAX_LOOKED_AT:]
             bodies = self._decoder.frames(chunk.parts[0])
-            for k, body in enumerate(bodies, 1):  # frames before the chunk's last were there earlier, and waited for it
+            # frames before the chunk's last were there earlier, and waited for it
+            for k, body in enumerate(bodies, 1):
                 waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
         taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
         return [Arrival(each.host_ns, self._event(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
 
     def _event(self, body: bytes) -> wire.Event:
-        """What a frame says. One that says nothing may be a piece of a packet that was not framed, cut at its zeros."""
+        """What a frame says. One that says nothing may be a piece of a packet that was not
+        framed, cut at its zeros.
+        """
         event = self._decode(body)
         if not isinstance(event, wire.Refusal) or event.reason != "format":
             return event
@@ -162,7 +178,9 @@ class SerialLink(StreamLink):
         self.send_bytes(wire.frame(packet))
 
     def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """Send bytes as they are, waiting at most `patience_s` while the line is full; False where some were lost."""
+        """Send bytes as they are, waiting at most `patience_s` while the line is full; False
+        where some were lost.
+        """
         device = self._device
         if device is None:
             return False
@@ -181,7 +199,9 @@ class SerialLink(StreamLink):
         return not data
 
     def drain(self) -> None:
-        """Wait until the bytes sent have left the machine; drop those that a stalled line does not take."""
+        """Wait until the bytes sent have left the machine; drop those that a stalled line does
+        not take.
+        """
         deadline = self._clock.within(MAX_DRAIN_S)
         with contextlib.suppress(OSError, TypeError, termios.error):
             while self._device is not None and self._device.out_waiting:
@@ -225,9 +245,11 @@ class SerialLink(StreamLink):
 
 
 class SerialApart(SerialLink):
-    """A SerialLink whose bytes a process of its own reads and stamps; it is opened, written to and decoded here.
+    """A SerialLink whose bytes a process of its own reads and stamps; it is opened, written to and
+    decoded here.
 
-    Raises InputError where the port cannot be opened at the start, MachineError where it is not there.
+    Raises InputError where the port cannot be opened at the start, MachineError where it is not
+    there.
     """
 
     stamped = True
@@ -276,7 +298,9 @@ class SerialApart(SerialLink):
 
 
 def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError:
-    """The refusal of a port that could not be opened: a NotThereError where the device is not there, else an InputError."""
+    """The refusal of a port that could not be opened: a NotThereError where the device is not
+    there, else an InputError.
+    """
     if getattr(error, "errno", None) in NOT_THERE:
         if not port.startswith("/") and Path("/dev", port).exists():
             return InputError(f"{where}: no such file; write /dev/{port}")
@@ -302,7 +326,8 @@ def _opening_fault(error: BaseException, port: str) -> str:
 
 
 def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLOCK) -> Iterator[tuple[int, bytes]]:
-    """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within `seconds`.
+    """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within
+    `seconds`.
 
     Raises InputError where the port cannot be opened, or disappears.
     """
@@ -328,10 +353,11 @@ def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLO
 
 
 class RtsLine:
-    """RTS of a port, such as "/dev/ttyUSB0" or a URL of pyserial; at rest it is cleared, or set where `active_high` is false.
+    """RTS of a port, such as "/dev/ttyUSB0" or a URL of pyserial; at rest it is cleared, or set
+    where `active_high` is false.
 
-    Raises InputError where the port cannot be opened, or has no such line. The system itself may set RTS for a moment while it
-    opens a port.
+    Raises InputError where the port cannot be opened, or has no such line. The system itself may
+    set RTS for a moment while it opens a port.
     """
 
     def __init__(self, port: str, active_high: bool) -> None:

@@ -1,15 +1,19 @@
-"""The frames that a display shows, sent to whoever watches: over ZeroMQ, each a message of three parts.
+"""The frames that a display shows, sent to whoever watches: over ZeroMQ, each a message of three
+parts.
 
-1. A JSON object: `frame` (its number), `lit_ns` (when its light begins, `time.monotonic_ns()` of this machine: of a screen
-   when the middle row lights; without one half a refresh period before the moment of `q`, which then stands for the half
-   period before it and the one after it), `q` (q_icrs_to_cam, null for a blank frame), `width`, `height`, `bits`,
+1. A JSON object: `frame` (its number), `lit_ns` (when its light begins, `time.monotonic_ns()` of
+   this machine: of a screen
+   when the middle row lights; without one half a refresh period before the moment of `q`, which
+   then stands for the half period before it and the one after it), `q` (q_icrs_to_cam, null for a
+   blank frame), `width`, `height`, `bits`,
    `channels` (1, or 3 where the primaries are driven apart), `bench_sha256`.
 2. The lit pixels, uint32, little-endian: row * width + column, rising. All others have code 0.
 3. Their codes: uint8, or uint16 little-endian above 8 bits; `channels` of each.
 
-A frame of stars has some thousand lit pixels of two million, so its message has 20 to 100 kB and needs no shared memory.
-A frame is lit until the next one is. The sender keeps few frames for a watcher: one that is slow loses frames, and its gap in
-`frame` says so.
+A frame of stars has some thousand lit pixels of two million, so its message has 20 to 100 kB and
+needs no shared memory.
+A frame is lit until the next one is. The sender keeps few frames for a watcher: one that is slow
+loses frames, and its gap in `frame` says so.
 """
 
 import contextlib
@@ -52,7 +56,9 @@ class FrameHead(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class ShownFrame:
-    """A frame as it was shown: `lit` (n,) are the flat indices of its pixels over code 0, `codes` (n,) or (n, 3) theirs."""
+    """A frame as it was shown: `lit` (n,) are the flat indices of its pixels over code 0,
+    `codes` (n,) or (n, 3) theirs.
+    """
 
     head: FrameHead
     lit: npt.NDArray[np.uint32]
@@ -98,9 +104,10 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
 class FrameSender(ZmqSender):
     """Sends frames to watchers; never waits for one.
 
-    It counts who watches by connection. libzmq also passes an unsubscription on whose connection never subscribed, and one that
-    ends without a word it reports without saying whose it was: so each is taken from its own connection alone, and what a
-    connection has left is forgotten when the connection ends.
+    It counts who watches by connection. libzmq also passes an unsubscription on whose connection
+    never subscribed, and one that ends without a word it reports without saying whose it was: so
+    each is taken from its own connection alone, and what a connection has left is forgotten when
+    the connection ends.
     """
 
     LINGER_MS, STOPPED_LINGER_MS = 0, 0
@@ -108,7 +115,8 @@ class FrameSender(ZmqSender):
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
         made.setsockopt(zmq.SNDHWM, KEPT_FRAMES)
-        made.setsockopt(zmq.XPUB_VERBOSER, 1)  # every connection's, not only the first and the last of a topic
+        # every connection's, not only the first and the last of a topic
+        made.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._topics: dict[int, set[bytes]] = {}  # by the connection's file descriptor
 
     def look(self) -> bool:
@@ -131,7 +139,8 @@ class FrameSender(ZmqSender):
         kind, topic = said[:1], said[1:]
         if not (HEAD_BEGINS.startswith(topic) or topic.startswith(HEAD_BEGINS)):
             return
-        if self._keeper is None or not self._keeper.is_open(file):  # what it sent is read after its end
+        # what it sent is read after its end
+        if self._keeper is None or not self._keeper.is_open(file):
             return
         if kind == bytes([SUBSCRIBES]):
             topics = self._topics.setdefault(file, set())
@@ -151,7 +160,9 @@ class FrameSender(ZmqSender):
 
 
 class FrameWatch(ZmqReceiver):
-    """The watcher's end: connects to where the frames are sent from. `refused` counts messages that are no frames."""
+    """The watcher's end: connects to where the frames are sent from. `refused` counts messages
+    that are no frames.
+    """
 
     def __init__(self, endpoint: str) -> None:
         self.refused = 0

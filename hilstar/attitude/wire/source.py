@@ -15,14 +15,18 @@ from typing import TYPE_CHECKING, Literal
 
 from hilstar.basics.toml_tables import Table
 
-if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no packets
+# NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no
+# packets
+if TYPE_CHECKING:
     from hilstar.attitude.wire.packet import AttitudeSample, Event
     from hilstar.basics.arrays import FloatArray
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
-SCALAR_FROM_LAST, SCALAR_TO_LAST = [3, 0, 1, 2], [1, 2, 3, 0]  # by places: a tenth of what numpy.roll takes
-# Orion's belt at roll 0, which everybody finds: the star is Alnilam (HIP 26311), 15 arcsec from the boresight.
+# by places: a tenth of what numpy.roll takes
+SCALAR_FROM_LAST, SCALAR_TO_LAST = [3, 0, 1, 2], [1, 2, 3, 0]
+# Orion's belt at roll 0, which everybody finds: the star is Alnilam (HIP 26311), 15 arcsec from the
+# boresight.
 CHECK_RADEC_DEG, CHECK_STAR = (84.057, -1.200), "Alnilam"
 UNSTATED = (
     "the source holds the body's attitude, and the tracker's axes are taken as the body's; "
@@ -82,7 +86,8 @@ HILSTARS = Convention()
 
 
 class Mounting:
-    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera components.
+    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera
+    components.
 
     None where nobody has said: the camera's axes are then taken as the body's, and `told` says so.
     `by_option`: the command line says it (`--mounting`), which is refused where the source is not
@@ -101,7 +106,9 @@ class Mounting:
         self.is_identity = q_body_to_cam in {None, IDENTITY}
 
     def sample(self, body: AttitudeSample) -> AttitudeSample:
-        """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body, rate in body components."""
+        """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body,
+        rate in body components.
+        """
         if self.is_identity:
             return body
         from hilstar.basics.rotation import multiply
@@ -127,12 +134,14 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """What a source means by its numbers: `--explain` shows it, and the documentation says the same.
+    """What a source means by its numbers: `--explain` shows it, and the documentation says the
+    same.
 
-    `turns` says from which frame to which; `scalar` the order of the components; `time` the scale and the zero of its times;
-    `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words; `scale` is the
-    time scale (UTC, TAI, TT, TDB, GPS) whose ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others.
-    `of_packets`: a `Convention` says what its quaternions are, and its times are plain numbers (of
+    `turns` says from which frame to which; `scalar` the order of the components; `time` the scale
+    and the zero of its times; `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives
+    an attitude in the source's own words; `scale` is the time scale (UTC, TAI, TT, TDB, GPS) whose
+    ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others. `of_packets`: a
+    `Convention` says what its quaternions are, and its times are plain numbers (of
     `time_unit` in a log).
     """
 

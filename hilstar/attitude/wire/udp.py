@@ -1,12 +1,18 @@
-"""UDP: one packet or JSON object a datagram, from listed addresses only, and answers that never amount to more.
+"""UDP: one packet or JSON object a datagram, from listed addresses only, and answers that never
+amount to more.
 
 Laws:
-1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a flood of them, by a socket
-   filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or a read.
-2. To an address go at most as many bytes of time requests, replies and answers as came from it; statuses besides, at a rate.
-3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what `FloodGate` admits.
+1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a
+   flood of them, by a socket
+   filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or
+   a read.
+2. To an address go at most as many bytes of time requests, replies and answers as came from it;
+   statuses besides, at a rate.
+3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what
+   `FloodGate` admits.
 
-The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does the same for TCP.
+The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does
+the same for TCP.
 """
 
 import contextlib
@@ -37,11 +43,14 @@ LOAD_WORD, AND, JUMP_IF_EQUAL, RETURN = 0x20, 0x54, 0x15, 0x06
 WHOLE, NOTHING = 0xFFFF, 0
 INSTRUCTION = struct.Struct("=HBBI")
 MAX_INSTRUCTIONS = 4096
-SO_TIMESTAMPNS = 35  # Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
+# Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
+SO_TIMESTAMPNS = 35
 TIMESPEC = struct.Struct("@ll")
 ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
-MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1  # the rest of a longer one is cut off, and `packet.decode` refuses what is left
-WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows; a small datagram takes some 800 bytes of it
+# the rest of a longer one is cut off, and `packet.decode` refuses what is left
+MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1
+# the kernel gives what it allows; a small datagram takes some 800 bytes of it
+WANTED_BUFFER_BYTES = 1 << 20
 SO_MEMINFO = 55  # Linux's number, which Python does not name (asm-generic/socket.h)
 MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROPS
 
@@ -52,19 +61,23 @@ TROUBLE = {
 }
 SocketAddress = tuple[Any, ...]
 MAX_TAKEN = 1000  # in one go
-MAX_STRANGERS = 1000  # datagrams a second of senders that are not allowed, before the kernel is asked
+# datagrams a second of senders that are not allowed, before the kernel is asked
+MAX_STRANGERS = 1000
 LOOK_NS = NS_PER_S
 MAX_CREDIT_BYTES = 4096
 MAX_PEERS = 64  # whose credit is kept
 
 
 def filter_program(networks: Sequence[Network], version: int) -> bytes:
-    """The program that keeps what comes from these networks, all of that IP version, and drops the rest."""
+    """The program that keeps what comes from these networks, all of that IP version, and drops
+    the rest.
+    """
     code = []
     for network in networks:
         address, mask = network.network_address.packed, network.netmask.packed
         words = range(0, len(address), WORD_BYTES) if network.version == version else ()
-        for k, at in enumerate(words):  # each word of the source address must be the network's, else go on after this network
+        # each word of the source address must be the network's, else go on after this network
+        for k, at in enumerate(words):
             wanted, bits = (int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask))
             code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
             code.append(INSTRUCTION.pack(AND, 0, 0, bits))
@@ -76,8 +89,8 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
 class KernelStamps:
     """Has the kernel stamp arrivals at `receiving`; where it cannot, the time of reading counts.
 
-    `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a TCP stream the stamp is that
-    of the last byte read.
+    `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a
+    TCP stream the stamp is that of the last byte read.
     """
 
     def __init__(self, receiving: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
@@ -102,7 +115,9 @@ class KernelStamps:
 
 
 class Datagrams:
-    """A socket, bound to a place of this machine or connected to a peer, that never waits but in `wait`."""
+    """A socket, bound to a place of this machine or connected to a peer, that never waits but in
+    `wait`.
+    """
 
     def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
         self._socket, self._clock = made, clock
@@ -129,7 +144,9 @@ class Datagrams:
 
     @classmethod
     def connected(cls, host: str, port: int) -> "Datagrams":
-        """Connected to a peer: only its datagrams arrive. Raises OSError where the host is unknown."""
+        """Connected to a peer: only its datagrams arrive. Raises OSError where the host is
+        unknown.
+        """
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         made = socket.socket(found[0][0], socket.SOCK_DGRAM)
         try:
@@ -171,7 +188,8 @@ class Datagrams:
 
     def put(self, data: bytes, to: SocketAddress | None = None) -> bool:
         """Send without waiting; False where it did not leave."""
-        for _ in range(2):  # a connected socket's send may report what became of an earlier datagram, and sends nothing
+        # a connected socket's send may report what became of an earlier datagram, and sends nothing
+        for _ in range(2):
             try:
                 sent = self._socket.send(data) if to is None else self._socket.sendto(data, to)
             except ConnectionRefusedError:
@@ -182,7 +200,9 @@ class Datagrams:
         return False
 
     def keep_only(self, networks: Sequence[Network]) -> bool:
-        """Have the kernel drop datagrams from other addresses; False where it does not take the filter."""
+        """Have the kernel drop datagrams from other addresses; False where it does not take the
+        filter.
+        """
         code = filter_program(networks, 6 if self._socket.family == socket.AF_INET6 else 4)
         count = len(code) // INSTRUCTION.size
         if count > MAX_INSTRUCTIONS:
@@ -230,7 +250,8 @@ class Credit:
 class UdpLink(StreamLink):
     """A bound socket. Raises InputError where it cannot be bound.
 
-    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to send to.
+    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to
+    send to.
     """
 
     two_way = stamped = True
@@ -254,7 +275,9 @@ class UdpLink(StreamLink):
         self.endpoint = str(UdpPlace(place.host, self._datagrams.port))
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The waiting datagrams of allowed senders, oldest first, and only the newest of a flood."""
+        """The waiting datagrams of allowed senders, oldest first, and only the newest of a
+        flood.
+        """
         if not self._datagrams.wait(timeout_ms):
             return []
         taken = self._datagrams.take(MAX_TAKEN)

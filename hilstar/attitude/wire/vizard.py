@@ -1,12 +1,15 @@
-"""Basilisk's Vizard stream as a source of attitudes: live (Basilisk waits for each frame) or broadcast (it waits for nobody).
+"""Basilisk's Vizard stream as a source of attitudes: live (Basilisk waits for each frame) or
+broadcast (it waits for nobody).
 
-Basilisk's sigma_BN = e tan(Phi/4) stands for the matrix [BN], which turns components of its inertial frame N into those of
-the body B (Schaub and Junkins, Analytical Mechanics of Space Systems, section 3.5). N is taken as ICRS.
+Basilisk's sigma_BN = e tan(Phi/4) stands for the matrix [BN], which turns components of its
+inertial frame N into those of the body B (Schaub and Junkins, Analytical Mechanics of Space
+Systems, section 3.5). N is taken as ICRS.
 
-Live: Basilisk's REQ socket connects, and hilstar's REP socket takes Vizard's place. Basilisk asks and waits: PING until
-somebody answers, then for each step SIM_UPDATE (four parts: the word, two empty ones, a VizMessage), REQUEST_INPUT where it
-shows a display, and REQUEST_IMAGE_<id> for each camera whose time has come. Every request has exactly one answer, and Basilisk
-stops where a SIM_UPDATE is not answered with OK.
+Live: Basilisk's REQ socket connects, and hilstar's REP socket takes Vizard's place. Basilisk asks
+and waits: PING until somebody answers, then for each step SIM_UPDATE (four parts: the word, two
+empty ones, a VizMessage), REQUEST_INPUT where it shows a display, and REQUEST_IMAGE_<id> for each
+camera whose time has come. Every request has exactly one answer, and Basilisk stops where a
+SIM_UPDATE is not answered with OK.
 
 Broadcast: Basilisk's PUB socket binds, and hilstar's SUB socket connects.
 """
@@ -35,16 +38,20 @@ from hilstar.basics.rotation import angle_between_rad, conjugate, multiply, rate
 from hilstar.basics.units import ARCSEC_PER_RAD, MAX_SPEED_KM_S, NS_PER_S
 
 SIM_UPDATE = b"SIM_UPDATE"
-MAX_UPDATE_BYTES = 1 << 22  # settings, models and maps of a large scenario go along with its spacecraft
+# settings, models and maps of a large scenario go along with its spacecraft
+MAX_UPDATE_BYTES = 1 << 22
 MAX_NAMES = 8  # spacecraft named in a refusal
-# Basilisk turns its camera (+z boresight, x right, y down, as `cam`) into Unity's before it sends it: sigma_CuC.
+# Basilisk turns its camera (+z boresight, x right, y down, as `cam`) into Unity's before it sends
+# it: sigma_CuC.
 SIGMA_CAM_TO_UNITY = (1 / 3, 1 / 3, -1 / 3)
 MAX_TURN_ARCSEC = 1.0
-MAX_FIELD_SHARE = 0.01  # relative difference of the fields of view: Basilisk's camera has no distortion
+# relative difference of the fields of view: Basilisk's camera has no distortion
+MAX_FIELD_SHARE = 0.01
 M_PER_KM = 1000.0
 EARTHS = ("earth", "earth_planet_data")  # as gravBodyFactory and its SPICE messages name it
 REQUEST_IMAGE, MAX_DIGITS = b"REQUEST_IMAGE_", 20
-# What is the same at every request: a pulse, and what a person has typed into Vizard (an empty VizInput: nothing).
+# What is the same at every request: a pulse, and what a person has typed into Vizard (an empty
+# VizInput: nothing).
 PLAIN_ANSWERS = {b"PING": [b"PONG"], b"REQUEST_INPUT": [b"VIZARD_INPUT", b""]}
 OK, ERROR = b"OK", b"ERROR"
 HELD = 2
@@ -52,7 +59,9 @@ MAX_HELD_NS = NS_PER_S // 4
 
 
 def update_of(parts: list[bytes]) -> bytes | None:
-    """The VizMessage of a SIM_UPDATE: its last part, with nothing but empty ones between; None where it is not that."""
+    """The VizMessage of a SIM_UPDATE: its last part, with nothing but empty ones between; None
+    where it is not that.
+    """
     whole = len(parts) > 1 and parts[0] == SIM_UPDATE and not any(parts[1:-1])
     return parts[-1] if whole else None
 
@@ -71,7 +80,9 @@ def check_loopback(endpoint: str) -> None:
 
 
 def quaternion_of_mrp(sigma: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """The quaternion (w, x, y, z) that turns N's components into the body's; an MRP and its shadow give q and -q."""
+    """The quaternion (w, x, y, z) that turns N's components into the body's; an MRP and its
+    shadow give q and -q.
+    """
     x, y, z = sigma
     square = x * x + y * y + z * z
     share = -2.0 / (1.0 + square)  # 0 where the square overflows: then the shadow is 0
@@ -88,7 +99,8 @@ def _written(q: FloatArray) -> str:
 TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
 VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
 PLACE = "its place and velocity about the Earth (at N's origin, where the message has none) are those of the observer"
-StateUse = Literal["attitude", "velocity", "state"]  # what is used of a message, besides the attitude
+# what is used of a message, besides the attitude
+StateUse = Literal["attitude", "velocity", "state"]
 TOLD: dict[StateUse, tuple[str, ...]] = {"attitude": (), "velocity": (VELOCITY,), "state": (PLACE,)}
 
 CONVENTIONS = Conventions(
@@ -104,10 +116,11 @@ CONVENTIONS = Conventions(
 class DifferenceRates:
     """The rate and the acceleration at each sample from the attitudes of the last three.
 
-    The mean rates of the last two intervals, carried on linearly to the newest sample: for steps h and a rate whose second
-    derivative is j, the rate is short of the true one by j h^2 / 3 and the acceleration by j h. (The mean of the last interval
-    alone would lag by half a step's change.) None for the first two of a row; a row ends where time goes back or stands, where
-    a step is longer than `max_step_ns`, and where the turn exceeds `max_rate_rad_s`, which is a jump.
+    The mean rates of the last two intervals, carried on linearly to the newest sample: for steps h
+    and a rate whose second derivative is j, the rate is short of the true one by j h^2 / 3 and the
+    acceleration by j h. (The mean of the last interval alone would lag by half a step's change.)
+    None for the first two of a row; a row ends where time goes back or stands, where a step is
+    longer than `max_step_ns`, and where the turn exceeds `max_rate_rad_s`, which is a jump.
     """
 
     def __init__(self, max_step_ns: int, max_rate_rad_s: float) -> None:
@@ -116,7 +129,9 @@ class DifferenceRates:
         self._mean: tuple[FloatArray, float] | None = None
 
     def moving(self, sample: wire.AttitudeSample) -> wire.AttitudeSample:
-        """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the components of its own frame."""
+        """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the
+        components of its own frame.
+        """
         before, self._last = self._last, sample
         earlier, self._mean = self._mean, None
         if before is None or not 0 < sample.t_ns - before.t_ns <= self._max_step_ns:
@@ -137,10 +152,11 @@ class DifferenceRates:
 
 
 class Follower:
-    """The attitudes of one spacecraft from messages: the one with the `name`, or the only one there is.
+    """The attitudes of one spacecraft from messages: the one with the `name`, or the only one there
+    is.
 
-    With `taken` "velocity" each has the spacecraft's velocity against N's origin, with "state" its place and velocity about the
-    Earth.
+    With `taken` "velocity" each has the spacecraft's velocity against N's origin, with "state" its
+    place and velocity about the Earth.
     """
 
     def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, taken: StateUse = "attitude") -> None:
@@ -149,7 +165,9 @@ class Follower:
         self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
 
     def take(self, message: bytes) -> tuple[wire.AttitudeSample | wire.Refusal, SimUpdate | None]:
-        """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""
+        """The camera's attitude in a VizMessage, or why there is none; and the message itself
+        where it is one.
+        """
         try:
             update = decode_update(message)
         except WireFormatError as error:
@@ -172,7 +190,8 @@ class Follower:
     def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | wire.Refusal:
         """Place (3,), km, and velocity (3,), km/s, as far as they are taken, or why they are not.
 
-        A "state" is about the Earth's centre: where the message has it, else at N's origin. A "velocity" is against N's origin.
+        A "state" is about the Earth's centre: where the message has it, else at N's origin. A
+        "velocity" is against N's origin.
         """
         if self._taken == "attitude":
             return None, None
@@ -195,7 +214,9 @@ class Follower:
         return wire.Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
     def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | wire.Refusal:
-        """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
+        """The spacecraft that is followed; parts of others (a parent is named) are taken only by
+        their own name.
+        """
         if self._name is None:
             found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
         else:
@@ -210,7 +231,9 @@ class Follower:
 
 
 def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
-    """How Basilisk has mounted a camera: its sigma_CB as a quaternion from body to camera; None where it is not said."""
+    """How Basilisk has mounted a camera: its sigma_CB as a quaternion from body to camera; None
+    where it is not said.
+    """
     if len(camera.sigma) != 3 or not all(map(math.isfinite, camera.sigma)):
         return None
     cam_to_unity, body_to_unity = (np.array(quaternion_of_mrp(s)) for s in (SIGMA_CAM_TO_UNITY, camera.sigma))
@@ -218,7 +241,9 @@ def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
 
 
 def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
-    """A line about where Basilisk's camera is not the bench's tracker; None where they are the same."""
+    """A line about where Basilisk's camera is not the bench's tracker; None where they are the
+    same.
+    """
     differences = []
     mounted = q_body_to_cam(camera)
     if mounted is not None:
@@ -246,7 +271,9 @@ def _against(own: Components, other: Components) -> Components:
 
 
 class VizardLive(ZmqSocket, LockstepLink):
-    """A REP socket in Vizard's place; it binds, or connects with `bind=False`. Pictures of cameras are answered here."""
+    """A REP socket in Vizard's place; it binds, or connects with `bind=False`. Pictures of
+    cameras are answered here.
+    """
 
     asks_for_pictures = True
 
@@ -263,7 +290,9 @@ class VizardLive(ZmqSocket, LockstepLink):
         self._compared: set[int] = set()
 
     def show_camera(self, tracker: TrackerCamera, pictures: Pictures | None) -> None:
-        """What to answer for the pictures of Basilisk's cameras: those of the tracker at the last step, or none."""
+        """What to answer for the pictures of Basilisk's cameras: those of the tracker at the
+        last step, or none.
+        """
         self._tracker, self._pictures = tracker, pictures
 
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
@@ -276,7 +305,8 @@ class VizardLive(ZmqSocket, LockstepLink):
             return self._step(host_ns, parts)
         if word.startswith(REQUEST_IMAGE) and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit():
             image = self._picture(int(number))
-            self._answer([len(image).to_bytes(4, "big"), image])  # the length goes ahead, big-endian; 0 where there is none
+            # the length goes ahead, big-endian; 0 where there is none
+            self._answer([len(image).to_bytes(4, "big"), image])
             return None
         if word not in PLAIN_ANSWERS:
             self._notices.tell("unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests")
@@ -294,7 +324,9 @@ class VizardLive(ZmqSocket, LockstepLink):
         return Arrival(host_ns, event, message)
 
     def _picture(self, camera: int) -> bytes:
-        """The tracker's picture at the last step, for a camera's number; empty where there is none."""
+        """The tracker's picture at the last step, for a camera's number; empty where there is
+        none.
+        """
         if camera in self._described and camera not in self._compared and self._tracker is not None:
             self._compared.add(camera)
             trouble = disagreement(self._described[camera], self._tracker)
@@ -313,9 +345,11 @@ class VizardLive(ZmqSocket, LockstepLink):
 
 
 class Opening:
-    """Holds the very first two attitudes back until a third says how they turn: shown alone they would stand still.
+    """Holds the very first two attitudes back until a third says how they turn: shown alone they
+    would stand still.
 
-    For MAX_HELD_NS at most. Where another simulation begins later, `clock.jumps` is in doubt about its first ones anyway.
+    For MAX_HELD_NS at most. Where another simulation begins later, `clock.jumps` is in doubt about
+    its first ones anyway.
     """
 
     def __init__(self) -> None:
@@ -365,7 +399,9 @@ class BroadcastDecoder(PacketDecoder):
 
 
 def vizard_broadcast(endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None) -> ZmqReceiver:
-    """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It connects, or binds with `bind`."""
+    """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It
+    connects, or binds with `bind`.
+    """
     check_loopback(endpoint)
     decoder = BroadcastDecoder(follower)
     return ZmqReceiver(endpoint, bind=bind, notices=notices, topic=SIM_UPDATE, max_part_bytes=MAX_UPDATE_BYTES, decoder=decoder)

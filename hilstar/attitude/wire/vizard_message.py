@@ -1,7 +1,9 @@
-"""Basilisk's VizMessage, as much of it as hilstar needs: protobuf bytes in, a checked `SimUpdate` out, no I/O.
+"""Basilisk's VizMessage, as much of it as hilstar needs: protobuf bytes in, a checked `SimUpdate`
+out, no I/O.
 
-Every message gives a `SimUpdate` or one `WireFormatError`. Field numbers are those of Basilisk's vizMessage.proto (package
-vizProtobufferMessage); other fields are skipped, and one that is absent is 0 or empty.
+Every message gives a `SimUpdate` or one `WireFormatError`. Field numbers are those of Basilisk's
+vizMessage.proto (package vizProtobufferMessage); other fields are skipped, and one that is absent
+is 0 or empty.
 """
 
 import math
@@ -12,7 +14,8 @@ from hilstar.attitude.wire.packet import INT64
 
 MAX_PARTS = 1000  # spacecraft, celestial bodies and cameras, of each
 MAX_COMPONENTS = 4  # kept of a vector: one more than it may have
-DOUBLE, INTEGER, MESSAGE, BYTES = 1, 3, 11, 12  # types of descriptor.proto; a text is read as bytes, for it may not be UTF-8
+# types of descriptor.proto; a text is read as bytes, for it may not be UTF-8
+DOUBLE, INTEGER, MESSAGE, BYTES = 1, 3, 11, 12
 ONE, SEVERAL = 1, 3  # its labels
 Components = tuple[float, ...]
 
@@ -22,10 +25,11 @@ class WireFormatError(ValueError):
 
 
 class VizBody(NamedTuple):
-    """A spacecraft or planet: position (m), velocity (m/s) and `sigma_bn` (MRP) in and from Basilisk's inertial frame N.
+    """A spacecraft or planet: position (m), velocity (m/s) and `sigma_bn` (MRP) in and from
+    Basilisk's inertial frame N.
 
-    Each has three components, or as many as the message has, up to MAX_COMPONENTS; a planet has no `sigma_bn`. A part of
-    another spacecraft names it as its `parent`.
+    Each has three components, or as many as the message has, up to MAX_COMPONENTS; a planet has no
+    `sigma_bn`. A part of another spacecraft names it as its `parent`.
     """
 
     name: str = ""
@@ -36,7 +40,9 @@ class VizBody(NamedTuple):
 
 
 class VizCamera(NamedTuple):
-    """A camera as Basilisk describes it to Vizard: degrees along its y axis, px, and `sigma` (MRP) from its body to Unity's."""
+    """A camera as Basilisk describes it to Vizard: degrees along its y axis, px, and `sigma`
+    (MRP) from its body to Unity's.
+    """
 
     identity: int = 0
     field_of_view_deg: float = 0.0

@@ -1,4 +1,6 @@
-"""Links over ZeroMQ: a free-running stream (SUB in, XPUB out), lockstep (REP), and the feed from one source to its heads."""
+"""Links over ZeroMQ: a free-running stream (SUB in, XPUB out), lockstep (REP), and the feed from
+one source to its heads.
+"""
 
 import contextlib
 import math
@@ -30,7 +32,9 @@ STAMP = struct.Struct("<q")  # host time of arrival, ns: one clock for all proce
 
 
 class PacketDecoder:
-    """Says what the messages of a free stream mean: packets or JSON, of which only the last part counts."""
+    """Says what the messages of a free stream mean: packets or JSON, of which only the last part
+    counts.
+    """
 
     stamped = False  # whether messages carry their own times of arrival
 
@@ -50,7 +54,9 @@ PACKET_DECODER = PacketDecoder()
 
 
 class ZmqReceiver(ZmqSocket, StreamLink):
-    """A SUB socket that takes every message that begins with `topic`; it connects, or binds with `bind`."""
+    """A SUB socket that takes every message that begins with `topic`; it connects, or binds with
+    `bind`.
+    """
 
     def __init__(
         self, endpoint: str, *, topic: bytes = b"", decoder: PacketDecoder = PACKET_DECODER, **options: Unpack[SocketOptions]
@@ -73,7 +79,9 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         made.setsockopt(zmq.SUBSCRIBE, self.topic)
 
     def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The waiting messages, oldest first, and only the newest of a flood; waits at most `timeout_ms` for the first."""
+        """The waiting messages, oldest first, and only the newest of a flood; waits at most
+        `timeout_ms` for the first.
+        """
         return self.decoder.arrivals(self.taken(timeout_ms))
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
@@ -92,7 +100,9 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         return self._waits(timeout_ms)
 
     def _tend(self) -> None:
-        """Connect anew where the peer is lost: libzmq does so, but not after a part over MAXMSGSIZE or a rejection."""
+        """Connect anew where the peer is lost: libzmq does so, but not after a part over
+        MAXMSGSIZE or a rejection.
+        """
         super()._tend()
         keeper = self._keeper
         if self._bind or keeper is None or self._socket is None or not keeper.lost:
@@ -107,8 +117,8 @@ class ZmqReceiver(ZmqSocket, StreamLink):
 class ZmqApart(StreamLink):
     """A ZeroMQ stream whose socket is read by a separate process.
 
-    `link` was opened to see that it can be; it is closed here, and the other process opens the same socket at the first read,
-    so that no old messages collect in it.
+    `link` was opened to see that it can be; it is closed here, and the other process opens the same
+    socket at the first read, so that no old messages collect in it.
     """
 
     stamped = True
@@ -128,7 +138,9 @@ class ZmqApart(StreamLink):
         self._reader.await_ready()
 
     def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The messages that came, oldest first, with their stamps; waits at most `timeout_ms` for the first."""
+        """The messages that came, oldest first, with their stamps; waits at most `timeout_ms`
+        for the first.
+        """
         self.wait_for_message(timeout_ms)
         waiting, self._waiting = self._waiting, []
         return self._decoder.arrivals(waiting)
@@ -196,7 +208,9 @@ class ZmqSender(ZmqSocket):
 
 
 class ZmqLockstep(ZmqSocket, LockstepLink):
-    """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
+    """A REP socket: one request is one attitude and gets one reply; it binds, or connects with
+    `bind=False`.
+    """
 
     _json = False  # whether the last request was
 
@@ -208,7 +222,8 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next request for a frame, or None; it must be answered before the next can arrive.
 
-        Time requests are answered here. libzmq announces a request without its delimiter, then drops it: none is waited for.
+        Time requests are answered here. libzmq announces a request without its delimiter, then
+        drops it: none is waited for.
         """
         message = self._take() if self._waits(timeout_ms) else None
         if message is None:
@@ -236,7 +251,9 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
 
 
 class Feed(Closing):
-    """A PUB socket that hands on what a source brings; a head that is slow or gone delays no other."""
+    """A PUB socket that hands on what a source brings; a head that is slow or gone delays no
+    other.
+    """
 
     def __init__(self, endpoint: str) -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -246,7 +263,9 @@ class Feed(Closing):
         self._socket.bind(endpoint)
 
     def give(self, arrival: Arrival[wire.Event]) -> None:
-        """Hand on a message: its bytes, or where those are the source's own words a packet of the same attitude."""
+        """Hand on a message: its bytes, or where those are the source's own words a packet of
+        the same attitude.
+        """
         raw = arrival.raw
         if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(wire.decode(raw), wire.AttitudeSample):
             raw = wire.encode(arrival.event)
@@ -260,7 +279,9 @@ class Feed(Closing):
 
 
 class FedDecoder(PacketDecoder):
-    """What a Feed hands on: the body's attitudes become a head's camera's, with the time at which they reached the feed."""
+    """What a Feed hands on: the body's attitudes become a head's camera's, with the time at
+    which they reached the feed.
+    """
 
     stamped = True
 

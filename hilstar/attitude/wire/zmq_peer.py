@@ -1,7 +1,9 @@
-"""What answers at a ZeroMQ endpoint that does not become a partner: another socket type, other keys, or no ZeroMQ at all.
+"""What answers at a ZeroMQ endpoint that does not become a partner: another socket type, other
+keys, or no ZeroMQ at all.
 
-libzmq says only that a connection ended. So the place is called once more, with the greeting of ZMTP 3.0
-(rfc.zeromq.org/spec/23), and what it answers is read: its mechanism, and without keys the type of its socket.
+libzmq says only that a connection ended. So the place is called once more, with the greeting of
+ZMTP 3.0 (rfc.zeromq.org/spec/23), and what it answers is read: its mechanism, and without keys the
+type of its socket.
 """
 
 import contextlib
@@ -14,7 +16,8 @@ from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 
 GREETING_BYTES = 64
 SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
-# libzmq sends its own mechanism once it has our version, and leaves at a mechanism that it does not want: ours comes last.
+# libzmq sends its own mechanism once it has our version, and leaves at a mechanism that it does not
+# want: ours comes last.
 FIRST = SIGNATURE + b"\x03\x00"
 SECOND = b"NULL".ljust(GREETING_BYTES - len(FIRST), b"\0")
 MECHANISM = slice(12, 32)  # of a greeting
@@ -29,9 +32,11 @@ KEYS = "curve_secret_key and curve_server_key"
 
 
 def peer_trouble(address: str, answer: bytes | None, kind: str, keys: bool) -> str:
-    """Why what answered at `address` is no partner of a socket of this kind ("SUB"), with `keys` or without.
+    """Why what answered at `address` is no partner of a socket of this kind ("SUB"), with `keys` or
+    without.
 
-    `answer` is what it sent, None where nobody is there. "" where it seems to be a partner after all.
+    `answer` is what it sent, None where nobody is there. "" where it seems to be a partner after
+    all.
     """
     wanted = PARTNERS[kind][0]
     if answer is None:
@@ -118,7 +123,9 @@ class PeerLook:
         self._found = peer_trouble(self._address, answer_of(self._address), self._kind, self._keys)
 
     def take(self) -> str:
-        """What was found, once, where it is new: a line for a person; "" for nothing, and for a peer that seems right."""
+        """What was found, once, where it is new: a line for a person; "" for nothing, and for a
+        peer that seems right.
+        """
         found, self._found = self._found, None
         if not found or found == self._told:
             return ""

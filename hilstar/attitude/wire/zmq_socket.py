@@ -1,9 +1,10 @@
-"""The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and how it is reopened.
+"""The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and
+how it is reopened.
 
-libzmq reports connections on a monitor socket and limits nothing: it accepts until the process has no file descriptors left.
-`_Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first: the established ones stay. libzmq itself
-closes a peer that does not finish its handshake within HANDSHAKE_MS. `_MemoryWatch` bounds what libzmq keeps of a message
-that never ends.
+libzmq reports connections on a monitor socket and limits nothing: it accepts until the process has
+no file descriptors left. `_Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest
+first: the established ones stay. libzmq itself closes a peer that does not finish its handshake
+within HANDSHAKE_MS. `_MemoryWatch` bounds what libzmq keeps of a message that never ends.
 """
 
 import contextlib
@@ -39,7 +40,8 @@ WANTED_FILES = 65_536
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
-EVENT = struct.Struct("=Hi")  # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
+# zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
+EVENT = struct.Struct("=Hi")
 HANDSHAKE_MS = 2000
 LEFT_EARLY = (
     "it left before its handshake, as another type of ZeroMQ socket does,"
@@ -52,10 +54,10 @@ FAILED = {
 }
 HANDSHAKE_NS = HANDSHAKE_MS * NS_PER_MS
 EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
-# At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
-# its connection, which is then made anew. Of a message of more than MAX_PARTS the rest is passed over, for other senders' wait
-# behind it; one of more than MAX_PASSED_OVER drops every connection. A message that never ends is limited only by
-# MemoryWatch.
+# At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part
+# over MAX_PART_BYTES drops its connection, which is then made anew. Of a message of more than
+# MAX_PARTS the rest is passed over, for other senders' wait behind it; one of more than
+# MAX_PASSED_OVER drops every connection. A message that never ends is limited only by MemoryWatch.
 QUEUE_MESSAGES = 1000
 MAX_PART_BYTES = 1 << 18
 MAX_PARTS, MAX_PASSED_OVER = 64, 10_000
@@ -70,13 +72,14 @@ BIND_RETRY_S = 0.002
 class _MemoryWatch:
     """Whether this process has grown by more than MAX_GROWTH_BYTES since `begin`.
 
-    libzmq keeps a message until its last part arrives, with no limit on parts, and does not report what it keeps: only the
-    memory of the process shows it. Without /proc nothing is watched.
+    libzmq keeps a message until its last part arrives, with no limit on parts, and does not report
+    what it keeps: only the memory of the process shows it. Without /proc nothing is watched.
     """
 
     def __init__(self, clock: HostClock = HOST_CLOCK) -> None:
         self._clock, self._file = clock, -1
-        with contextlib.suppress(OSError):  # kept open: a process out of descriptors must still see its memory
+        # kept open: a process out of descriptors must still see its memory
+        with contextlib.suppress(OSError):
             self._file = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
         self._base_bytes = self._used_bytes()
         self._next_look = clock.within(0.0)
@@ -92,14 +95,17 @@ class _MemoryWatch:
         return self._used_bytes() - self._base_bytes
 
     def await_release(self) -> None:
-        """Wait a moment for freed memory to be returned; what remains was not the link's, and becomes the new baseline."""
+        """Wait a moment for freed memory to be returned; what remains was not the link's, and
+        becomes the new baseline.
+        """
         deadline = self._clock.within(FREED_WITHIN_S)
         while (used_bytes := self._used_bytes()) > self._base_bytes + MAX_GROWTH_BYTES / 2:
             if deadline.over:
                 self._base_bytes = used_bytes
                 return
             self._clock.sleep(LOOK_S)
-            with contextlib.suppress(AttributeError, OSError):  # else glibc keeps freed memory, which would count as growth
+            # else glibc keeps freed memory, which would count as growth
+            with contextlib.suppress(AttributeError, OSError):
                 ctypes.CDLL(None).malloc_trim(0)
 
     def _used_bytes(self) -> int:
@@ -116,7 +122,9 @@ class _MemoryWatch:
 
 
 def _raise_file_limit() -> None:
-    """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do ledger and display."""
+    """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do
+    ledger and display.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -127,9 +135,10 @@ def _raise_file_limit() -> None:
 class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
-    `lost` says that a connection has ended, and `left` has its file, unless another connection has that number by now; the
-    code that acts on them resets them. `place` is the port or path that was bound. A connection that ends before its
-    handshake was with no partner: `look` finds out what is there, None where we bind.
+    `lost` says that a connection has ended, and `left` has its file, unless another connection has
+    that number by now; the code that acts on them resets them. `place` is the port or path that was
+    bound. A connection that ends before its handshake was with no partner: `look` finds out what is
+    there, None where we bind.
     """
 
     def __init__(
@@ -148,7 +157,8 @@ class _Doorkeeper:
         self._bound = look is None
         self._greeted = False  # whether the connection that we made had its handshake
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
-        # Those whose handshake is not known to have ended. libzmq names no peer of one that succeeded: the oldest is taken.
+        # Those whose handshake is not known to have ended. libzmq names no peer of one that
+        # succeeded: the oldest is taken.
         self._ungreeted: dict[int, int] = {}  # file descriptor: when it was accepted, host ns
         self._shut: set[int] = set()
         self._failure = ""
@@ -239,7 +249,8 @@ class _Doorkeeper:
             self._shut.add(file)
             with _connection(file) as connection:
                 if connection is not None:
-                    name = connection.getsockname()  # the descriptor may have been reused for another file
+                    # the descriptor may have been reused for another file
+                    name = connection.getsockname()
                     if (name[1] if isinstance(name, tuple) else name) == self.place:
                         connection.shutdown(socket.SHUT_RDWR)
 
@@ -253,7 +264,9 @@ class _Doorkeeper:
 
 @contextlib.contextmanager
 def _connection(file: int) -> Iterator[socket.socket | None]:
-    """libzmq's own connection for a moment, through a duplicate of its descriptor; None where it is gone."""
+    """libzmq's own connection for a moment, through a duplicate of its descriptor; None where it
+    is gone.
+    """
     try:
         connection = socket.socket(fileno=os.dup(file))
     except OSError:
@@ -269,7 +282,9 @@ def zmq_version() -> str:
 
 
 class SocketOptions(TypedDict, total=False):
-    """How a socket is opened: whether it binds, whose keys it has, who hears of it, its largest part, and the clock."""
+    """How a socket is opened: whether it binds, whose keys it has, who hears of it, its largest
+    part, and the clock.
+    """
 
     bind: bool
     keys: CurveKeys
@@ -281,9 +296,10 @@ class SocketOptions(TypedDict, total=False):
 class ZmqSocket(Link):
     """A socket and its context, bound or connected; reopened after a flood.
 
-    A socket that binds is opened at once, to check that it can be. One that receives a stream is then closed until its first
-    read, so that no old messages and no flood collect in it while the display is prepared. One that answers stays open: a
-    request that is lost with the first socket would leave its sender waiting for ever.
+    A socket that binds is opened at once, to check that it can be. One that receives a stream is
+    then closed until its first read, so that no old messages and no flood collect in it while the
+    display is prepared. One that answers stays open: a request that is lost with the first socket
+    would leave its sender waiting for ever.
     """
 
     def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
@@ -407,7 +423,9 @@ class ZmqSocket(Link):
         return None if parts is None else parts[-1]
 
     def _take_parts(self) -> list[bytes] | None:
-        """The parts of the next message; None where none is complete, or it had more than MAX_PARTS."""
+        """The parts of the next message; None where none is complete, or it had more than
+        MAX_PARTS.
+        """
         taken = self._ready()
         try:
             parts = [taken.recv(zmq.NOBLOCK)]
@@ -415,7 +433,8 @@ class ZmqSocket(Link):
                 if not taken.getsockopt(zmq.RCVMORE):
                     return parts
                 parts.append(taken.recv(zmq.NOBLOCK))
-            passed_over = 0 if self._kind == zmq.REP else MAX_PASSED_OVER  # a REP socket that was asked has to answer
+            # a REP socket that was asked has to answer
+            passed_over = 0 if self._kind == zmq.REP else MAX_PASSED_OVER
             for _ in range(passed_over):
                 if not taken.getsockopt(zmq.RCVMORE):
                     self._notices.tell(

@@ -1,11 +1,14 @@
 """How this process ends: signals, the end of its parent, and the last lines on stderr.
 
-The first signal ends a command in order, and whatever the command is doing, the process has ended within a second. Python's own
-handlers run in the main thread, between two steps of the interpreter: a long draw or a call that waits in C delays them. So
-the number of a signal also goes to a socket, from within C, and two watchers look at it: a thread, which ends the process with
-the usual exit code, and a process, which does it where a call in C keeps Python's lock (as OpenGL's do) and no thread can run.
+The first signal ends a command in order, and whatever the command is doing, the process has ended
+within a second. Python's own handlers run in the main thread, between two steps of the interpreter:
+a long draw or a call that waits in C delays them. So the number of a signal also goes to a socket,
+from within C, and two watchers look at it: a thread, which ends the process with the usual exit
+code, and a process, which does it where a call in C keeps Python's lock (as OpenGL's do) and no
+thread can run.
 
-Writing to stderr never waits: if nobody reads it, neither a frame nor the end of the process is delayed.
+Writing to stderr never waits: if nobody reads it, neither a frame nor the end of the process is
+delayed.
 """
 
 import _thread
@@ -28,7 +31,9 @@ from typing import Any, NoReturn
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 THREAD_WAITS_S = 0.75  # for an end in order
 GUARD_WAITS_S = 0.9
-ECHO_S = 0.1  # a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second one
+# a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second
+# one
+ECHO_S = 0.1
 POLL_S = 0.02
 PR_SET_PDEATHSIG = 1  # prctl(2)
 SIGNALLED = 128  # and the signal's number: the exit code of a process that a signal ended
@@ -39,7 +44,9 @@ LAST_WORDS_S = 1.0  # for a traceback at the very end
 
 
 class _Ending:
-    """The state of this process's end: the signal, the events to set, the guard's number, and holds."""
+    """The state of this process's end: the signal, the events to set, the guard's number, and
+    holds.
+    """
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -52,19 +59,22 @@ _ending = _Ending()
 
 
 def install() -> None:
-    """Let SIGINT, SIGTERM and SIGHUP end this process. Call it in the main thread, before there are others; twice does nothing.
+    """Let SIGINT, SIGTERM and SIGHUP end this process. Call it in the main thread, before there are
+    others; twice does nothing.
 
-    SIGHUP stays ignored where it was (nohup); SIGINT does not, for a shell ignores it for whatever it runs with `&`.
+    SIGHUP stays ignored where it was (nohup); SIGINT does not, for a shell ignores it for whatever
+    it runs with `&`.
     """
     if _ending.guard is not None:
         return
-    # Open the standard streams that the parent process closed, so that no socket takes their numbers. Python has None for one
-    # that was closed, and prints what is for None on stdout.
+    # Open the standard streams that the parent process closed, so that no socket takes their
+    # numbers. Python has None for one that was closed, and prints what is for None on stdout.
     for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(descriptor)
         except OSError:
-            # The lowest number that is free; what a program of this one's writes has to go somewhere, too.
+            # The lowest number that is free; what a program of this one's writes has to go
+            # somewhere, too.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
@@ -90,12 +100,14 @@ def _handle(number: int, frame: FrameType | None) -> None:
         return
     if not _ending.stops:
         if _ending.guard and frame is not None and frame.f_code.co_filename.startswith("<frozen importlib"):
-            # Python's import calls itself back where an exception is lost, and so far nothing is there to be put in order.
+            # Python's import calls itself back where an exception is lost, and so far nothing is
+            # there to be put in order.
             _say_if_read("hilstar: stopped\n")
             _let_guard_go()
             os._exit(SIGNALLED + number)
         raise KeyboardInterrupt
-    # The main thread may be in the middle of a wait for it and hold the event's lock, which a handler in it cannot take.
+    # The main thread may be in the middle of a wait for it and hold the event's lock, which a
+    # handler in it cannot take.
     with contextlib.suppress(RuntimeError):  # no thread to be had: the watchers end it
         _thread.start_new_thread(lambda *stops: [stop.set() for stop in stops], (*_ending.stops,))
 
@@ -138,7 +150,8 @@ def stop_on_signal(stop: threading.Event) -> Iterator[None]:
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """A signal's KeyboardInterrupt comes when this is left (main thread; where hilstar's handlers are installed).
+    """A signal's KeyboardInterrupt comes when this is left (main thread; where hilstar's handlers
+    are installed).
 
     It is for extensions in C that call Python back and do not look whether an exception came of it.
     """
@@ -155,10 +168,11 @@ def held() -> Iterator[None]:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process without asking Python's own end, which takes every module apart (20 ms) and waits for threads.
+    """End the process without asking Python's own end, which takes every module apart (20 ms) and
+    waits for threads.
 
-    After a signal, or where a thread still waits for something, nothing else is asked either: a thread may be in the middle of
-    writing. A profiler gets Python's own end.
+    After a signal, or where a thread still waits for something, nothing else is asked either: a
+    thread may be in the middle of writing. A profiler gets Python's own end.
     """
     for number in ENDING:
         with contextlib.suppress(ValueError):  # not the main thread
@@ -183,7 +197,9 @@ def _let_guard_go() -> None:
 
 
 def _signals_in(watched: socket.socket) -> bytes:
-    """The numbers of the signals so far; both watchers look at the same ones, and none takes them away."""
+    """The numbers of the signals so far; both watchers look at the same ones, and none takes
+    them away.
+    """
     with contextlib.suppress(BlockingIOError):
         return watched.recv(64, socket.MSG_PEEK | socket.MSG_DONTWAIT)
     return b""
@@ -260,8 +276,9 @@ def _guard(parent: int, watched: socket.socket) -> NoReturn:
 def end_with_parent(parent: int | None = None) -> None:
     """End this process when the process that began it ends, however that ends.
 
-    With `parent`, the number of the process that began this one directly, the kernel kills this process, even where it hangs.
-    Without, in a process of a pool, a thread waits for the pool's owner, which may not be the direct parent (forkserver).
+    With `parent`, the number of the process that began this one directly, the kernel kills this
+    process, even where it hangs. Without, in a process of a pool, a thread waits for the pool's
+    owner, which may not be the direct parent (forkserver).
     """
     if parent is not None:
         import ctypes  # 3 ms, and every command imports this module
@@ -329,7 +346,8 @@ class _QueuedStderr(io.RawIOBase):
                 while data:
                     try:
                         data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
-                    except BlockingIOError:  # another process that shares it has made it non-blocking
+                    except BlockingIOError:
+                        # another process that shares it has made it non-blocking
                         time.sleep(0.01)
             with self._changed:
                 self._waiting_bytes -= len(piece)

@@ -1,4 +1,5 @@
-"""A pool of worker processes: each works on one task at a time, answers over a pipe, and may die at any moment.
+"""A pool of worker processes: each works on one task at a time, answers over a pipe, and may die at
+any moment.
 
 The owner decides how many workers there are, what each does next, and what follows from a death.
 """
@@ -28,7 +29,9 @@ Work = Callable[..., Any]
 
 @dataclass(slots=True, eq=False)
 class WorkerProcess:
-    """A worker, and the task that it has, as the owner names it. `ready` from the first message on."""
+    """A worker, and the task that it has, as the owner names it. `ready` from the first message
+    on.
+    """
 
     process: "ForkServerProcess"
     link: Connection
@@ -43,7 +46,9 @@ class WorkerProcess:
 
 
 class News(NamedTuple):
-    """A worker's greeting ("ready"), its answer, an exception of it, or its death with the exit code."""
+    """A worker's greeting ("ready"), its answer, an exception of it, or its death with the exit
+    code.
+    """
 
     worker: WorkerProcess
     kind: Literal["ready", "answer", "error", "died"]
@@ -51,10 +56,11 @@ class News(NamedTuple):
 
 
 class ProcessPool(Closing):
-    """Workers that call `start(*arguments)` once for a greeting and their work, and then the work for each task.
+    """Workers that call `start(*arguments)` once for a greeting and their work, and then the work
+    for each task.
 
-    A worker's exception of the types `told` comes back as an "error"; any other ends the worker. Use the pool as a context
-    manager: its end kills the workers.
+    A worker's exception of the types `told` comes back as an "error"; any other ends the worker.
+    Use the pool as a context manager: its end kills the workers.
     """
 
     def __init__(
@@ -67,7 +73,8 @@ class ProcessPool(Closing):
         """Start one more worker."""
         here, there = multiprocessing.Pipe()
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([self._serve[0].__module__])  # imported once: 0.6 s of CPU for each worker but the first
+        # imported once: 0.6 s of CPU for each worker but the first
+        context.set_forkserver_preload([self._serve[0].__module__])
         process = context.Process(target=_serve, args=(there, *self._serve), daemon=True)
         with _for_children():
             process.start()
@@ -117,10 +124,13 @@ class ProcessPool(Closing):
 
 @contextmanager
 def _for_children() -> Iterator[None]:
-    """Start children with one thread per library, and without a terminal's Ctrl-C: the owner ends them."""
+    """Start children with one thread per library, and without a terminal's Ctrl-C: the owner
+    ends them.
+    """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    resource_tracker.ensure_running()  # which the first child would start, and which unblocks Ctrl-C
+    # which the first child would start, and which unblocks Ctrl-C
+    resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

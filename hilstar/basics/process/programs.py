@@ -1,8 +1,10 @@
-"""Programs around this process: another program that it runs, and systemd, which runs it (sd_notify).
+"""Programs around this process: another program that it runs, and systemd, which runs it
+(sd_notify).
 
-`Child` runs a command in a group of its own and reads its output as it comes, up to a bound. `Service` tells systemd in
-datagrams that the service is ready and alive, and its status in a line. The watchdog's datagrams are sent only while `alive`
-says that the service does its work, so that a service whose work hangs is restarted, whatever its other threads do.
+`Child` runs a command in a group of its own and reads its output as it comes, up to a bound.
+`Service` tells systemd in datagrams that the service is ready and alive, and its status in a line.
+The watchdog's datagrams are sent only while `alive` says that the service does its work, so that a
+service whose work hangs is restarted, whatever its other threads do.
 """
 
 import contextlib
@@ -27,9 +29,11 @@ US_PER_S = 1_000_000
 
 
 class Child(Closing):
-    """A running command without a shell; one that prints more than MAX_OUTPUT_BYTES is killed, and its children with it.
+    """A running command without a shell; one that prints more than MAX_OUTPUT_BYTES is killed, and
+    its children with it.
 
-    Use it as a context manager: what is left of its group ends with it. Raises OSError where it cannot be started.
+    Use it as a context manager: what is left of its group ends with it. Raises OSError where it
+    cannot be started.
     """
 
     def __init__(self, words: list[str], folder: Path | None = None, *, keeps_stdout: bool = True) -> None:
@@ -93,7 +97,8 @@ class Child(Closing):
         self.kill()
         self._process.wait()
         for reader in self._readers:
-            reader.join(ENDED_WAIT_S)  # a grandchild in another process group may still hold the pipe
+            # a grandchild in another process group may still hold the pipe
+            reader.join(ENDED_WAIT_S)
         for stream, reader in zip((self._process.stderr, self._process.stdout), reversed(self._readers), strict=False):
             if stream is not None and not reader.is_alive():
                 stream.close()
@@ -102,7 +107,8 @@ class Child(Closing):
 class Service(Closing):
     """This process as a service of systemd's; without one (no NOTIFY_SOCKET) it does nothing.
 
-    `ready` tells when it does its work, `alive` whether it still does, and `status` what a person may read of it.
+    `ready` tells when it does its work, `alive` whether it still does, and `status` what a person
+    may read of it.
     """
 
     def __init__(
@@ -115,7 +121,8 @@ class Service(Closing):
         self._ready, self._alive, self._status = ready, alive, status
         self._address = environment.get("NOTIFY_SOCKET", "")
         self._each_s = EACH_S
-        with contextlib.suppress(ValueError, KeyError):  # where systemd watches it, half of what it waits
+        # where systemd watches it, half of what it waits
+        with contextlib.suppress(ValueError, KeyError):
             if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
                 self._each_s = min(int(environment["WATCHDOG_USEC"]) / US_PER_S / 2, EACH_S)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)

@@ -1,11 +1,13 @@
-"""When and where the kernel runs what must not wait: the frame loop, a process that stamps arrivals, llvmpipe's threads.
+"""When and where the kernel runs what must not wait: the frame loop, a process that stamps
+arrivals, llvmpipe's threads.
 
 `HostClock` waits for a moment of the host's clock.
 
-Mesa's llvmpipe begins as many threads as there are cores, once to rasterise and once to compute. They wait for work that takes
-a tenth of a millisecond, and Linux then often wakes two of them on one core. Frames of 1000 stars took 1.6 ms in place of 1.1
-ms, of 10 000 stars 9 ms in place of 6.5 (two cores, nothing else running); beside a busy process on each core they take the
-same time. So each thread is kept on a core of its own.
+Mesa's llvmpipe begins as many threads as there are cores, once to rasterise and once to compute.
+They wait for work that takes a tenth of a millisecond, and Linux then often wakes two of them on
+one core. Frames of 1000 stars took 1.6 ms in place of 1.1 ms, of 10 000 stars 9 ms in place of 6.5
+(two cores, nothing else running); beside a busy process on each core they take the same time. So
+each thread is kept on a core of its own.
 """
 
 import contextlib
@@ -24,28 +26,33 @@ from pathlib import Path
 from typing import NamedTuple
 
 FIFO_PRIORITY = 10
-# How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a frame.
+# How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a
+# frame.
 SWITCH_INTERVAL_S = 0.0005
 PROMPT_PRIORITY = FIFO_PRIORITY + 1
 HEAVY = 0.3
 LOOK_S = 0.25
 SHORT_SLICE_NS = 100_000  # the shortest that the kernel gives
-SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # Linux's numbers of a call that the C library does not have
+# Linux's numbers of a call that the C library does not have
+SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 # sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period
 SCHED_ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 TASKS = Path("/proc/self/task")
 RASTERISERS = "llvmpipe-"
 NAMING_LOOK_S = 1e-3
-# A thread names itself, a little after it has begun: on a busy machine, when it is first given a core.
+# A thread names itself, a little after it has begun: on a busy machine, when it is first given a
+# core.
 NAMING_S, BUSY_NAMING_S = 0.02, 0.5
 
 MAX_WAIT_S = 3600.0  # the platform's own limit is some centuries; a longer wait is done in parts
-# An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait is slept without either.
+# An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait
+# is slept without either.
 COARSE_NS = 700_000
 NS_PER_S = 1_000_000_000
 
 CLOCK_TRIES, NEAR_NS = 3, 20_000
-UNDISCIPLINED_NS = 16 * NS_PER_S  # NTP_PHASE_LIMIT of linux/timex.h: what the kernel states where nothing disciplines its clock
+# NTP_PHASE_LIMIT of linux/timex.h: what the kernel states where nothing disciplines its clock
+UNDISCIPLINED_NS = 16 * NS_PER_S
 
 Clock = Callable[[], float]
 
@@ -61,7 +68,9 @@ class Timex(ctypes.Structure):
 
 
 class UnixOffset(NamedTuple):
-    """CLOCK_MONOTONIC minus CLOCK_REALTIME, ns, and the largest error of CLOCK_REALTIME that the kernel states, ns."""
+    """CLOCK_MONOTONIC minus CLOCK_REALTIME, ns, and the largest error of CLOCK_REALTIME that the
+    kernel states, ns.
+    """
 
     offset_ns: int
     error_ns: int
@@ -75,7 +84,9 @@ class HostClock:
         return time.monotonic_ns()
 
     def asleep_ns(self) -> int:
-        """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still meanwhile."""
+        """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still
+        meanwhile.
+        """
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
     def realtime_ns(self) -> int:
@@ -83,7 +94,9 @@ class HostClock:
         return time.time_ns()
 
     def monotonic_minus_realtime_ns(self) -> int:
-        """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
+        """The offset between the two clocks of this machine, both read within a few microseconds
+        where that succeeds.
+        """
         best_ns, offset_ns = None, 0
         for _ in range(CLOCK_TRIES):
             before_ns, realtime_ns, after_ns = self.now_ns(), self.realtime_ns(), self.now_ns()
@@ -95,7 +108,9 @@ class HostClock:
         return offset_ns
 
     def unix_offset(self) -> UnixOffset:
-        """The offset to Unix time, and how wrong that may be: what NTP or PTP told the kernel (adjtimex, `maxerror`)."""
+        """The offset to Unix time, and how wrong that may be: what NTP or PTP told the kernel
+        (adjtimex, `maxerror`).
+        """
         told = Timex()  # modes = 0: nothing is set
         answered = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) >= 0
         return UnixOffset(self.monotonic_minus_realtime_ns(), told.maxerror * 1000 if answered else UNDISCIPLINED_NS)
@@ -137,7 +152,9 @@ class Deadline:
 
 
 class BackOff(Deadline):
-    """The moment of the next try: at once, then `min_s` after a failure, and twice as long after each further one."""
+    """The moment of the next try: at once, then `min_s` after a failure, and twice as long after
+    each further one.
+    """
 
     def __init__(self, min_s: float, max_s: float, clock: HostClock) -> None:
         super().__init__(clock, clock.now_ns())
@@ -155,10 +172,11 @@ HOST_CLOCK = HostClock()
 
 @contextmanager
 def steady_loop() -> Iterator[str]:
-    """Run this thread at real-time priority where that is allowed; yields the scheduling that it got.
+    """Run this thread at real-time priority where that is allowed; yields the scheduling that it
+    got.
 
-    Python's garbage collector is off meanwhile: the frame path makes no cycles (tests/screen/test_screen_run.py measures
-    it), and a full collection would take a frame's time.
+    Python's garbage collector is off meanwhile: the frame path makes no cycles
+    (tests/screen/test_screen_run.py measures it), and a full collection would take a frame's time.
     """
     interval_s = sys.getswitchinterval()
     policy = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -176,14 +194,16 @@ def steady_loop() -> Iterator[str]:
         if scheduling.startswith("SCHED_FIFO"):
             try:
                 os.sched_setscheduler(0, *policy)
-            except PermissionError:  # the kernel lets nobody but an administrator take that flag back
+            except PermissionError:
+                # the kernel lets nobody but an administrator take that flag back
                 os.sched_setscheduler(0, policy[0] | os.SCHED_RESET_ON_FORK, policy[1])
 
 
 def raise_priority() -> str:
     """Give this thread real-time priority where that is allowed; the scheduling that it got.
 
-    What it starts has the normal one: a process that runs a user's code would else keep a core from everything.
+    What it starts has the normal one: a process that runs a user's code would else keep a core from
+    everything.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY))
@@ -193,11 +213,13 @@ def raise_priority() -> str:
 
 
 class PromptWhileLight:
-    """A process that only wakes, stamps and sleeps again is woken before all others; one that works for long is not.
+    """A process that only wakes, stamps and sleeps again is woken before all others; one that works
+    for long is not.
 
-    Real-time priority above the frame loop's where that is allowed; else the shortest slice of the normal scheduler, which
-    Linux 6.12 and later gives anybody (a task that asks for less runs sooner). While the process takes more than HEAVY of a
-    core, as in a flood, its priority is the normal one, so that it takes no frame's time.
+    Real-time priority above the frame loop's where that is allowed; else the shortest slice of the
+    normal scheduler, which Linux 6.12 and later gives anybody (a task that asks for less runs
+    sooner). While the process takes more than HEAVY of a core, as in a flood, its priority is the
+    normal one, so that it takes no frame's time.
     """
 
     def __init__(self, wall_s: Clock = time.monotonic, cpu_s: Clock = time.process_time) -> None:
@@ -212,7 +234,9 @@ class PromptWhileLight:
         self._looked_s, self._used_s = wall_s(), cpu_s()
 
     def give_up(self) -> None:
-        """Run this process as any other from now on, and whatever it starts: it is about to run a user's code."""
+        """Run this process as any other from now on, and whatever it starts: it is about to run
+        a user's code.
+        """
         _set_all_threads(os.SCHED_OTHER, 0)
         self._allowed = self._prompt = False
         with contextlib.suppress(OSError, ValueError):
@@ -245,14 +269,17 @@ def _set_all_threads(policy: int, priority: int) -> bool:
 
 @contextmanager
 def drawing_threads_apart() -> Iterator[None]:
-    """Pin each thread that llvmpipe starts in this context to its own core, where it starts one per core."""
+    """Pin each thread that llvmpipe starts in this context to its own core, where it starts one
+    per core.
+    """
     before = _threads()
     yield
     begun_s = time.monotonic()
     while True:
         begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
         rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
-        # Those that compute have the process's own name; others of the driver's have one with a colon.
+        # Those that compute have the process's own name; others of the driver's have one with a
+        # colon.
         computing = [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
         if len(rasterisers) == len(computing):
             break

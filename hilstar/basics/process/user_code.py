@@ -1,8 +1,10 @@
-"""A user's Python functions, named as "python:MODULE:FUNCTION": where they may come from, and how they are loaded.
+"""A user's Python functions, named as "python:MODULE:FUNCTION": where they may come from, and how
+they are loaded.
 
-A bench file comes from other people, too. One that could name any module would run a shell: `python:os:system` does. So the
-module is a file beside the one that names it, which whoever took the folder could read, or belongs to a package that the bench
-file trusts by name. docs/what-runs.md says what that means.
+A bench file comes from other people, too. One that could name any module would run a shell:
+`python:os:system` does. So the module is a file beside the one that names it, which whoever took
+the folder could read, or belongs to a package that the bench file trusts by name. docs/what-runs.md
+says what that means.
 """
 
 import importlib
@@ -22,7 +24,9 @@ class UserCodeError(Exception):
 
 
 def user_function(name: str, folder: Path, trust: Collection[str] = ()) -> Callable[..., Any]:
-    """The function of a module in `folder`, or of one of the installed packages in `trust`. Raises UserCodeError."""
+    """The function of a module in `folder`, or of one of the installed packages in `trust`.
+    Raises UserCodeError.
+    """
     module_name, _, function_name = name.removeprefix(PREFIX).partition(":")
     if not module_name or not function_name:
         raise UserCodeError("names no function")
@@ -64,7 +68,9 @@ def _is_same(one: ModuleSpec | None, other: ModuleSpec) -> bool:
 
 
 def _look_here_last(folder: str) -> None:
-    """What the module imports later is found beside it, but nothing there stands in the way of what is installed."""
+    """What the module imports later is found beside it, but nothing there stands in the way of
+    what is installed.
+    """
     while folder in sys.path:
         sys.path.remove(folder)
     sys.path.append(folder)

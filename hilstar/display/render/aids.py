@@ -20,7 +20,9 @@ def level_of_code(response: Response, code: int) -> int:
 
 
 def lay_over(levels: Levels | Codes, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
-    """Change levels (height, width), or codes (height, width, 3), in place; `cross_px` is the crosshair's pixel."""
+    """Change levels (height, width), or codes (height, width, 3), in place; `cross_px` is the
+    crosshair's pixel.
+    """
     blank = bool(overlay & BLANK)
     on_patch = bool(overlay & PATCH) and not blank
     if blank or on_patch:
@@ -40,14 +42,18 @@ def _on_line(offset_px: int, overlay: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class AidLevels:
-    """The levels of aids on a monitor with codes of `bits` bits; the crosshair goes through pixel `cross_px`."""
+    """The levels of aids on a monitor with codes of `bits` bits; the crosshair goes through
+    pixel `cross_px`.
+    """
 
     response: Response
     bits: int
     cross_px: tuple[int, int]
 
     def laid_over(self, levels: Levels, overlay: int, patch_share: float) -> Levels:
-        """Levels with what is on over them, a patch of so much of white: the same array where nothing is, else a copy."""
+        """Levels with what is on over them, a patch of so much of white: the same array where
+        nothing is, else a copy.
+        """
         if not overlay:
             return levels
         levels, white = levels.copy(), 2**self.bits - 1

@@ -1,6 +1,8 @@
-"""`Backend`, which draws frames of a `Target`: by OpenGL (`renderer`) or by NumPy (`numpy_backend`).
+"""`Backend`, which draws frames of a `Target`: by OpenGL (`renderer`) or by NumPy
+(`numpy_backend`).
 
-Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on a machine without OpenGL.
+Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on a machine without
+OpenGL.
 """
 
 from abc import ABC, abstractmethod
@@ -46,7 +48,9 @@ SpriteSides = tuple[SpriteSide, ...]
 
 
 class Turn(NamedTuple):
-    """One of a target's panels: for how much of what stars left in each, in its steps, they make up here; choices kept."""
+    """One of a target's panels: for how much of what stars left in each, in its steps, they make
+    up here; choices kept.
+    """
 
     plane: int
     makes_up: list[float]
@@ -55,12 +59,15 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes are wanted.
+    """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes
+    are wanted.
 
-    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
-    of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
-    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its panel, and its light lies at its
-    place of `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons over the channels.
+    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1
+    everywhere). `sides` are those of fainter stars' sprites, by falling rates, of the same parity
+    as the footprint. `seen` is how the tracker sees the monitor, for `exact` and `temporal`. Where
+    the `primaries` are driven apart, each has its panel, and its light lies at its place of
+    `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons
+    over the channels.
     """
 
     resolution_px: tuple[int, int]
@@ -76,9 +83,11 @@ class Target:
     together: FloatArray = field(default_factory=lambda: np.eye(1))
 
     def in_turn(self) -> list[Turn]:
-        """The order in which `exact` chooses the primaries' levels: by falling electrons a step, for the last leave least.
+        """The order in which `exact` chooses the primaries' levels: by falling electrons a step,
+        for the last leave least.
 
-        Each makes up for those before it, by the light of the channels; in `temporal` for its own light alone.
+        Each makes up for those before it, by the light of the channels; in `temporal` for its own
+        light alone.
         """
         panels = self.primaries
         if not panels:
@@ -86,7 +95,8 @@ class Target:
         step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
         order, alone = np.argsort(-step, kind="stable").tolist(), getattr(QUANTISERS[self.quantisation], "remembers", False)
         share = self.together / self.together.diagonal() * step[:, None] / step
-        # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by what each leaves.
+        # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by
+        # what each leaves.
         own, found = np.zeros_like(share), []
         for k in order:
             makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
@@ -96,7 +106,9 @@ class Target:
         return found
 
     def quantisers(self) -> dict[int, Quantiser]:
-        """NumPy's quantiser of each panel, in the order in which they choose; none without a response."""
+        """NumPy's quantiser of each panel, in the order in which they choose; none without a
+        response.
+        """
         panel, made = self.panel(), QUANTISERS[self.quantisation]
         panels = self.primaries or (() if panel is None else (panel,))
         found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, *_ in self.in_turn() if panels}
@@ -106,7 +118,9 @@ class Target:
         return found
 
     def by_plane(self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]) -> Levels:
-        """The levels of a frame by those of each primary, if primaries are driven apart, chosen in their order."""
+        """The levels of a frame by those of each primary, if primaries are driven apart, chosen
+        in their order.
+        """
         if not self.primaries or sprites is None:
             found = {k: levels(k, sprites) for k, *_ in self.in_turn()}
         else:
@@ -126,10 +140,11 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class ScreenView:
-    """The picture on a screen: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
+    """The picture on a screen: an image of `resolution_px`, on a screen of `screen_px`, codes of
+    `bits` bits.
 
-    `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
-    is code k in all channels.
+    `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each
+    level, None where level k is code k in all channels.
     """
 
     resolution_px: tuple[int, int]
@@ -143,8 +158,9 @@ class ScreenView:
 class Backend(ABC):
     """Draws the frames of one Target, and presents them on a screen. Free it with `close`.
 
-    `gl_renderer` and `gl_version` are the driver's names, or "NumPy" and its version; `path` is what draws the levels of frames
-    without extended light. `context` is the GL context, for another backend beside this one; None where NumPy draws.
+    `gl_renderer` and `gl_version` are the driver's names, or "NumPy" and its version; `path` is
+    what draws the levels of frames without extended light. `context` is the GL context, for another
+    backend beside this one; None where NumPy draws.
     """
 
     target: Target
@@ -155,27 +171,34 @@ class Backend(ABC):
 
     @abstractmethod
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
-        """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear` and `levels`.
+        """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear`
+        and `levels`.
 
-        A target of `primaries` takes `sprites.primaries` and `sprites.lights`, and has no linear image then.
+        A target of `primaries` takes `sprites.primaries` and `sprites.lights`, and has no linear
+        image then.
 
-        `frame` counts the frames shown, for `temporal` alone: a number not above the last one's begins a new sequence.
+        `frame` counts the frames shown, for `temporal` alone: a number not above the last one's
+        begins a new sequence.
         """
 
     @abstractmethod
     def draw_linear(self, sprites: Sprites) -> None:
-        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `levels` are undefined.
+        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next
+        `levels` are undefined.
 
         What `temporal` carries from frame to frame stays as it is.
         """
 
     @abstractmethod
     def linear(self) -> Float32Array:
-        """The linear image of the last draw, electrons per second, float32 (height, width); the next draw overwrites it."""
+        """The linear image of the last draw, electrons per second, float32 (height, width); the
+        next draw overwrites it.
+        """
 
     @abstractmethod
     def levels(self) -> Levels:
-        """The levels of the last draw (height, width), uint8 up to 256 levels, else uint16; the next draw overwrites them.
+        """The levels of the last draw (height, width), uint8 up to 256 levels, else uint16; the
+        next draw overwrites them.
 
         Of a target of `primaries` they are (height, width, 3).
 
@@ -184,14 +207,16 @@ class Backend(ABC):
 
     @abstractmethod
     def show_on(self, view: ScreenView) -> None:
-        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in."""
+        """Present frames on this screen from now on: by OpenGL that of the window whose context
+        it draws in.
+        """
 
     @abstractmethod
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """Draw the last levels on the screen's back buffer, turned and mirrored, as codes.
 
-        Over them lie the bits of `overlay` (see `aids`), with a patch of `patch_code`, and in the lower left corner the
-        photodiode's square: `marker` is its side, px, and code.
+        Over them lie the bits of `overlay` (see `aids`), with a patch of `patch_code`, and in the
+        lower left corner the photodiode's square: `marker` is its side, px, and code.
         """
 
     @abstractmethod
@@ -199,11 +224,15 @@ class Backend(ABC):
         """Wait until the last swap is done, so that the next frame can be presented."""
 
     def changed_codes(self) -> str:
-        """Which codes the screen's back buffer has otherwise than they are drawn, "" for none; it overwrites the buffer."""
+        """Which codes the screen's back buffer has otherwise than they are drawn, "" for none;
+        it overwrites the buffer.
+        """
         return ""
 
     def fault(self) -> str:
-        """A reset or an error of the GPU since the last call; "" where all is well. It takes some microseconds."""
+        """A reset or an error of the GPU since the last call; "" where all is well. It takes
+        some microseconds.
+        """
         return ""
 
     @abstractmethod
@@ -215,12 +244,16 @@ class Backend(ABC):
         return 0
 
     def forget_images(self) -> None:
-        """Draw the next frame on black, with nothing kept from those before it: the GPU's memory may have been lost."""
+        """Draw the next frame on black, with nothing kept from those before it: the GPU's memory
+        may have been lost.
+        """
         self.begin_anew()
 
     @abstractmethod
     def begin_anew(self) -> None:
-        """Forget what `temporal` carries from frame to frame: the next frame is the first of a sequence."""
+        """Forget what `temporal` carries from frame to frame: the next frame is the first of a
+        sequence.
+        """
 
     @abstractmethod
     def finish(self) -> None:
@@ -232,7 +265,9 @@ class Backend(ABC):
 
 
 def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
-    """Sprites whose PSF changes over the field as one map of their light, which NumPy adds up; all others as they are."""
+    """Sprites whose PSF changes over the field as one map of their light, which NumPy adds up;
+    all others as they are.
+    """
     psf = target.psf
     if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
         return sprites
@@ -245,10 +280,11 @@ def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
 
 
 def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False) -> Float32Array:
-    """The linear image of sprites by channel: float32 (channels, height, width), electrons per second, in memory of its own.
+    """The linear image of sprites by channel: float32 (channels, height, width), electrons per
+    second, in memory of its own.
 
-    `stars` are those among which `sprites.star` has its places (see `by_channel`). One channel that is `drawn` already, whole,
-    is only read.
+    `stars` are those among which `sprites.star` has its places (see `by_channel`). One channel that
+    is `drawn` already, whole, is only read.
     """
     channels = by_channel(sprites, stars)
     images = np.empty((len(channels), *backend.target.resolution_px[::-1]), np.float32)
@@ -262,6 +298,7 @@ def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool =
 def level_cost(quantiser: type[Quantiser], psf: Psf, context: "Context | None" = None) -> LevelCost:
     """The tabulated cost of a quantiser by the OpenGL of a context.
 
-    Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for a usual GL.
+    Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for
+    a usual GL.
     """
     return quantiser.cost(psf, COMPUTE_VERSION if context is None else context.version_code)

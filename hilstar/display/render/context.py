@@ -21,16 +21,20 @@ from hilstar.display.render.backend import EGL_LIBRARY
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 Context = moderngl.Context
 SOFTWARE = ("llvmpipe", "softpipe")
-# llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
+# llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535
+# end them without a word).
 MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
 MAX_GPUS = 32
 PINNED_MEMORY = "GL_AMD_pinned_memory"
-EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # constants of that extension and of OpenGL
+# constants of that extension and of OpenGL
+EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA
 
 
 @dataclass(frozen=True, slots=True)
 class Gpu:
-    """A device of EGL's list: its index, and its GL_RENDERER ("" where no context can be made on it)."""
+    """A device of EGL's list: its index, and its GL_RENDERER ("" where no context can be made on
+    it).
+    """
 
     index: int
     renderer: str
@@ -67,10 +71,12 @@ def _device_count() -> int:
 
 
 def create_context(gpu: int | str | None = None) -> moderngl.Context:
-    """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
+    """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to
+    install.
 
-    `gpu` is an index of EGL's list or a part of a GL_RENDERER (NotThereError where there is no such one), by default EGL's
-    first. Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
+    `gpu` is an index of EGL's list or a part of a GL_RENDERER (NotThereError where there is no such
+    one), by default EGL's first. Every GL function comes through libEGL's own loader: a bare
+    machine has no libGL.so.
     """
     if gpu is None or (isinstance(gpu, int) and gpu < _device_count()):
         return _context_on(gpu)
@@ -101,7 +107,9 @@ def _context_on(index: int | None) -> moderngl.Context:
 
 
 def described() -> str:
-    """The headless OpenGL of this machine for a person: who draws, and how. Raises MachineError with what to install."""
+    """The headless OpenGL of this machine for a person: who draws, and how. Raises MachineError
+    with what to install.
+    """
     ctx = create_context()
     try:
         info = ctx.info
@@ -113,7 +121,9 @@ def described() -> str:
 
 
 def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
-    """Raise InputError where this GL cannot draw such an image, or points as large as its sprites; those are by `sigma`."""
+    """Raise InputError where this GL cannot draw such an image, or points as large as its
+    sprites; those are by `sigma`.
+    """
     largest = int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
     if max(resolution_px) > largest:
         raise InputError(f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px")
@@ -123,7 +133,9 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
 
 
 def computes_in_software(ctx: moderngl.Context) -> bool:
-    """Whether this GL is a processor's, with compute shaders in the process's own memory; cards rasterise in their stride."""
+    """Whether this GL is a processor's, with compute shaders in the process's own memory; cards
+    rasterise in their stride.
+    """
     return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx) and PINNED_MEMORY in ctx.extensions
 
 
@@ -133,8 +145,11 @@ def is_software(ctx: moderngl.Context) -> bool:
 
 
 def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) -> tuple[npt.NDArray[Any], moderngl.Buffer]:
-    """A black array in whole pages, which it keeps for as long as somebody holds it, and a buffer of the same memory."""
-    count, size = math.prod(shape), -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4  # whole words, too
+    """A black array in whole pages, which it keeps for as long as somebody holds it, and a
+    buffer of the same memory.
+    """
+    # whole words, too
+    count, size = math.prod(shape), -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4
     pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     values = np.frombuffer(pages, dtype, count).reshape(shape)
     find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
@@ -149,6 +164,8 @@ def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) 
 
 
 def leave_contexts() -> None:
-    """Let this thread's headless context go: it stays current after its release, and a window's GLX then ends the process."""
+    """Let this thread's headless context go: it stays current after its release, and a window's
+    GLX then ends the process.
+    """
     with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
         ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()

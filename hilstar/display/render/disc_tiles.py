@@ -1,11 +1,13 @@
 """A large disc as tiles of its image, whose light is known at their corners.
 
-Far from limb and terminator a Lambert or lunar face changes little over a tile: its light is computed at the corners and
-interpolated linearly, within SMOOTH. Of air it is the rays and the light of ground that they touch. Nearer to the limb pixels
-have a ray each, and tiles at the edges, which are divided anew, all that is spread to them.
+Far from limb and terminator a Lambert or lunar face changes little over a tile: its light is
+computed at the corners and interpolated linearly, within SMOOTH. Of air it is the rays and the
+light of ground that they touch. Nearer to the limb pixels have a ray each, and tiles at the edges,
+which are divided anew, all that is spread to them.
 
-Where a disc is all extended light that a frame has, its levels need no linear image but about sprites and edges: other tiles
-are drawn as levels, tiles over white as one level, and tiles under the first level not at all (`Sure`).
+Where a disc is all extended light that a frame has, its levels need no linear image but about
+sprites and edges: other tiles are drawn as levels, tiles over white as one level, and tiles under
+the first level not at all (`Sure`).
 """
 
 from dataclasses import dataclass
@@ -19,10 +21,14 @@ from hilstar.sky.bodies.disc import AIR_TOP
 TILE_PX, FINE_PX = 32, 8  # tiles, and the parts of those at edges
 MIN_TILED_PX = 40_000  # a rectangle of fewer pixels is drawn whole
 SMOOTH = 5e-4  # share of the light: a level of 12 bits
-SPREAD = 1e-3  # share that the Gaussian changes air's light by more than tile.glsl says: thinner air is drawn ray by ray
+# share that the Gaussian changes air's light by more than tile.glsl says: thinner air is drawn ray
+# by ray
+SPREAD = 1e-3
 REACH_SIGMAS = 5.0
-LARGE_PX = 200.0  # a radius: from here one ray is within 4e-5 of the spread light of a face, as in disc.frag
-WIDER = 1.5  # factor on the angle across a tile: allows for a lens, a field's corner and a flattened body
+# a radius: from here one ray is within 4e-5 of the spread light of a face, as in disc.frag
+LARGE_PX = 200.0
+# factor on the angle across a tile: allows for a lens, a field's corner and a flattened body
+WIDER = 1.5
 # Light between the corners of a tile is over and under theirs by less; a limb spreads half of it.
 SMOOTH_TIMES, SURE_TIMES = 1.5, 4.0
 CORNERS = ((0, 0), (0, 1), (1, 0), (0, 1), (1, 1), (1, 0))  # rows and columns of two triangles
@@ -31,9 +37,11 @@ NOTHING = np.empty((0, 6), dtype=np.float32)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sure:
-    """A frame's levels: light of `dark_e_per_s` and less has level 0, and of `white_e_per_s` and more white.
+    """A frame's levels: light of `dark_e_per_s` and less has level 0, and of `white_e_per_s` and
+    more white.
 
-    Sprites (n,) whose light lies up to `reach_px` from their pixels `sprites_px` (n, 2) are added to the disc's.
+    Sprites (n,) whose light lies up to `reach_px` from their pixels `sprites_px` (n, 2) are added
+    to the disc's.
     """
 
     dark_e_per_s: float
@@ -42,7 +50,9 @@ class Sure:
     reach_px: int
 
     def levels(self, e_per_s: FloatArray, smooth: BoolArray) -> tuple[BoolArray, BoolArray]:
-        """Which tiles of lattices (..., rows, columns) of light are white and which black; `smooth` ones have no limb."""
+        """Which tiles of lattices (..., rows, columns) of light are white and which black;
+        `smooth` ones have no limb.
+        """
         times = np.where(smooth, SMOOTH_TIMES, SURE_TIMES)
         rows, columns = smooth.shape[-2:]
         corners = [e_per_s[..., row : row + rows, column : column + columns] for row, column in set(CORNERS)]
@@ -56,17 +66,20 @@ class Sure:
             for down in range(-reach, reach + TILE_PX, TILE_PX):
                 away = min(across, reach) - left, min(down, reach) - top
                 column, row = np.clip((self.sprites_px + away) // TILE_PX, -1, (columns, rows)).T
-                apart[row, column] = False  # those off the tiles in a row or column that is not used
+                # those off the tiles in a row or column that is not used
+                apart[row, column] = False
         return apart[:-1, :-1]
 
 
 @dataclass(frozen=True, slots=True)
 class Tiles:
-    """Tiles in `region`: corners (n, 6) of two triangles each: x and y from the image's edge (px), light (e-/s), three values.
+    """Tiles in `region`: corners (n, 6) of two triangles each: x and y from the image's edge (px),
+    light (e-/s), three values.
 
-    Light on a `face` is its own, with its cover first; that of `air` is what a ray has that is stopped, with the ray in the
-    sphere's axes. `inside` and `edges` are drawn ray by ray, and `white` is white: their values are not used. `face_levels` and
-    `air_levels` are as `face` and `air`, but are drawn as levels alone. `of_air` is the uniform `air` of tile.glsl.
+    Light on a `face` is its own, with its cover first; that of `air` is what a ray has that is
+    stopped, with the ray in the sphere's axes. `inside` and `edges` are drawn ray by ray, and
+    `white` is white: their values are not used. `face_levels` and `air_levels` are as `face` and
+    `air`, but are drawn as levels alone. `of_air` is the uniform `air` of tile.glsl.
     """
 
     region: Rectangle
@@ -82,7 +95,9 @@ class Tiles:
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
-    """Corners (..., rows, columns, 6) as in Tiles and their light; masks of the tiles, one less along rows and columns."""
+    """Corners (..., rows, columns, 6) as in Tiles and their light; masks of the tiles, one less
+    along rows and columns.
+    """
 
     face: FloatArray
     air: FloatArray
@@ -95,7 +110,9 @@ class _Lattice:
 
 
 def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) -> Tiles | None:
-    """The tiles of a disc in a rectangle of its image; None where the rectangle has fewer than MIN_TILED_PX pixels."""
+    """The tiles of a disc in a rectangle of its image; None where the rectangle has fewer than
+    MIN_TILED_PX pixels.
+    """
     left, top, width, height = region
     if width * height < MIN_TILED_PX:
         return None
@@ -107,7 +124,8 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
         smooth = whole.is_inside | whole.is_air
         white, dark = sure.levels(whole.e_per_s, smooth)
         apart = sure.apart(left, top, *white.shape)
-        # A limb may bulge into a tile between its corners, but not without a corner of a tile beside it.
+        # A limb may bulge into a tile between its corners, but not without a corner of a tile
+        # beside it.
         around = _all(_all(np.pad(dark, 1, constant_values=True)))
         drawn &= ~(apart & dark & (smooth | around))
     some, of_air = np.argwhere(drawn), (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
@@ -116,7 +134,8 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     (first_y, first_x), (last_y, last_x) = some.min(axis=0) * TILE_PX, (some.max(axis=0) + 1) * TILE_PX
     inner = left + first_x, top + first_y, min(width, last_x) - first_x, min(height, last_y) - first_y
     drawn &= ~white
-    # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile by tile.
+    # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile
+    # by tile.
     steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
     edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_inside & ~whole.is_air]
     fine = _lattice(light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX)
@@ -137,7 +156,9 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
 
 
 def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
-    """The light at lattices of places (..., rows, columns, 2), `size_px` apart, and between them, but for the outer ones."""
+    """The light at lattices of places (..., rows, columns, 2), `size_px` apart, and between
+    them, but for the outer ones.
+    """
     disc, px_per_rad, sigma_px = light.disc, light.camera.scales_px_rad()[0], max(light.psf.variance_px2) ** 0.5
     shape, distance = places.shape[:-1], disc.distance_radii
     seen, sr = _rays(light, places.reshape(-1, 2))
@@ -149,11 +170,13 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2]).reshape(shape)
     rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / distance))
     beside = _all(angle > rim + WIDER * (size_px * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad)
-    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's height over the plane of its
-    # limb goes as the root of 1 - impact^2, whose second derivative is its power -3/2.
+    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's
+    # height over the plane of its limb goes as the root of 1 - impact^2, whose second derivative is
+    # its power -3/2.
     inside, lit = np.minimum(impact, 1.0), face > 0  # NaN stays
     radii_per_px = np.sqrt(np.maximum(distance**2 - inside**2, 0.0)) / px_per_rad
-    margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)  # the Gaussian's reach, radii
+    # the Gaussian's reach, radii
+    margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
     most = (size_px * radii_per_px) ** 2 / 8 * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
     is_inside = _all((impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)) & ~beside
     is_inside[..., 1:-1, 1:-1] &= _even(lit)
@@ -162,7 +185,8 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     if disc.air is not None and distance > 1:
         touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
         hidden = -np.expm1(-disc.slant_depth * np.exp(-np.maximum(impact - 1, 0.0) / disc.air_radii))
-        # The variances of the Gaussian in scale heights: half of their mean by tile.glsl, and what it leaves out.
+        # The variances of the Gaussian in scale heights: half of their mean by tile.glsl, and what
+        # it leaves out.
         along_x, along_y = np.array(light.psf.variance_px2) * (distance**2 - 1) / (disc.air_radii * px_per_rad) ** 2
         spread = (along_x + along_y) / 4
         if abs(along_x - along_y) / 4 + max(along_x, along_y) ** 2 / 8 < SPREAD:
@@ -176,7 +200,9 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
 
 
 def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions (n, 3), image axes, of places (n, 2) in pixels' edges while they are lit, and steradians to a pixel there."""
+    """Directions (n, 3), image axes, of places (n, 2) in pixels' edges while they are lit, and
+    steradians to a pixel there.
+    """
     x_px, y_px = places.T - 0.5
     u, v = light.camera.tangents(x_px, y_px)
     seen = np.stack([u, v, np.ones_like(u)], axis=1)
@@ -192,12 +218,16 @@ def _all(nodes: BoolArray) -> BoolArray:
 
 
 def _even(nodes: BoolArray) -> BoolArray:
-    """Which tiles but the outer ones are alike, true or not, at all corners and those of the tiles beside them."""
+    """Which tiles but the outer ones are alike, true or not, at all corners and those of the
+    tiles beside them.
+    """
     return np.logical_or(*(_all(_all(_all(alike))) for alike in (nodes, ~nodes)))
 
 
 def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
-    """The corners (n, 6) of two triangles for each of `tiles`, from lattices (..., rows, columns, 6)."""
+    """The corners (n, 6) of two triangles for each of `tiles`, from lattices (..., rows,
+    columns, 6).
+    """
     if not tiles.any():
         return NOTHING
     size = nodes.shape[-3] - 1, nodes.shape[-2] - 1
@@ -206,7 +236,9 @@ def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
 
 
 def _runs(x: IntArray, y: IntArray, tiles: BoolArray) -> Float32Array:
-    """The corners of tiles (rows, columns) between `x` and `y`, as one that follow each other in a row, or equal rows."""
+    """The corners of tiles (rows, columns) between `x` and `y`, as one that follow each other in
+    a row, or equal rows.
+    """
     row, begin = np.nonzero(np.diff(tiles, axis=1, prepend=False) & tiles)
     end = np.nonzero(np.diff(tiles, axis=1, append=False) & tiles)[1] + 1
     order = np.lexsort((row, end, begin))

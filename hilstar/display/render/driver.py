@@ -1,7 +1,8 @@
-"""Calls to the GL driver that moderngl lacks, through ctypes: waiting with Python's lock free, and whether the GPU is well.
+"""Calls to the GL driver that moderngl lacks, through ctypes: waiting with Python's lock free, and
+whether the GPU is well.
 
-moderngl keeps Python's lock in every call. That is right for calls that only queue work; where a call waits for the GPU or
-for a back buffer, every other thread of the process would wait too.
+moderngl keeps Python's lock in every call. That is right for calls that only queue work; where a
+call waits for the GPU or for a back buffer, every other thread of the process would wait too.
 """
 
 import ctypes
@@ -14,8 +15,8 @@ import moderngl
 from hilstar.basics.errors import GpuError
 from hilstar.basics.units import NS_PER_S
 
-# NVIDIA's driver yields in a loop while it waits, which at real-time priority keeps a core busy ("OpenGL Environment
-# Variable Settings" of its README). Who has set it otherwise keeps that.
+# NVIDIA's driver yields in a loop while it waits, which at real-time priority keeps a core busy
+# ("OpenGL Environment Variable Settings" of its README). Who has set it otherwise keeps that.
 YIELDING, SLEEPING = "__GL_YIELD", "USLEEP"
 GL_SYNC_GPU_COMMANDS_COMPLETE, GL_SYNC_FLUSH_COMMANDS_BIT = 0x9117, 0x0001
 GL_TIMEOUT_EXPIRED, GL_WAIT_FAILED = 0x911B, 0x911D
@@ -47,7 +48,9 @@ def sleep_in_waits() -> None:
 
 
 class Driver:
-    """The driver of a moderngl context, which is current in every call. moderngl keeps the functions' addresses to itself."""
+    """The driver of a moderngl context, which is current in every call. moderngl keeps the
+    functions' addresses to itself.
+    """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         load: Callable[[str], int] = ctx.mglo._context.load_opengl_function
@@ -69,7 +72,9 @@ class Driver:
         self._reset: Any = ctypes.PYFUNCTYPE(ctypes.c_uint)(address) if address else None
 
     def wait(self) -> None:
-        """Wait until the GPU has done all that was asked of it. Raises GpuError where it does not within 10 s."""
+        """Wait until the GPU has done all that was asked of it. Raises GpuError where it does
+        not within 10 s.
+        """
         fence = self._fence(GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
         try:
             result = self._ask(fence, GL_SYNC_FLUSH_COMMANDS_BIT, 0)
@@ -87,7 +92,9 @@ class Driver:
             raise GpuError("the GPU's driver cannot wait for it; see dmesg")
 
     def take_back_buffer(self) -> None:
-        """Wait for a back buffer of the window that is bound, by clearing a pixel: no clear by moderngl frees the lock."""
+        """Wait for a back buffer of the window that is bound, by clearing a pixel: no clear by
+        moderngl frees the lock.
+        """
         self._scissor(0, 0, 1, 1)
         self._enable(GL_SCISSOR_TEST)
         self._clear(GL_COLOR, 0, self._black)

@@ -1,6 +1,8 @@
-"""Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by counting thresholds.
+"""Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by
+counting thresholds.
 
-Primaries that are driven apart are planes of one image, whose pixels and sprites have the light of each (`Planes`).
+Primaries that are driven apart are planes of one image, whose pixels and sprites have the light of
+each (`Planes`).
 """
 
 import math
@@ -41,8 +43,11 @@ def build_program(
     include: Sequence[str] = (),
     last: Sequence[str] = (),
 ) -> moderngl.Program:
-    """A program from two files of shaders/; the fragment shader stands between the files `include` and `last`."""
-    with held():  # moderngl makes a program's members by Python, and an exception there ends the process
+    """A program from two files of shaders/; the fragment shader stands between the files
+    `include` and `last`.
+    """
+    # moderngl makes a program's members by Python, and an exception there ends the process
+    with held():
         return ctx.program(_source(vertex, defines), fragment_shader=_source(fragment, defines, include, last))
 
 
@@ -72,8 +77,8 @@ def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: Map
 class Planes:
     """The planes of an image: one, or one for each of the primaries that a target drives apart.
 
-    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the side of sprites that hold the
-    light of all: it lies up to `margin_px` from the star.
+    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the
+    side of sprites that hold the light of all: it lies up to `margin_px` from the star.
     """
 
     panels: tuple[Panel, ...]
@@ -117,7 +122,9 @@ class Planes:
         return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
 
     def packed(self, sprites: Sprites) -> Sprites:
-        """Sprites with `dtype`; their rate is then that of the white that they need for the primary that needs most."""
+        """Sprites with `dtype`; their rate is then that of the white that they need for the
+        primary that needs most.
+        """
         if not self.apart or sprites.primaries is None:
             return sprites
         data = np.empty(len(sprites), dtype=APART_DTYPE)
@@ -128,7 +135,9 @@ class Planes:
         return replace(sprites, data=data)
 
     def set(self, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]) -> None:
-        """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop what it does not need."""
+        """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop
+        what it does not need.
+        """
         for name, each in (values | {"places_px": self.places_px}).items():
             if name in program:  # an array ends with its last element that is used
                 length = getattr(program[name], "array_length", 1)
@@ -137,7 +146,9 @@ class Planes:
 
 
 class Shares:
-    """The defines, uniforms and table of a PSF for programs with shares.glsl. It lives in its renderer's context."""
+    """The defines, uniforms and table of a PSF for programs with shares.glsl. It lives in its
+    renderer's context.
+    """
 
     def __init__(self, ctx: moderngl.Context, psf: Psf, footprint_px: int | None = None) -> None:
         self.footprint_px = footprint_px or psf.footprint_px
@@ -152,7 +163,9 @@ class Shares:
         set_uniforms(program, {**self._uniforms, "share_table": TABLE_UNIT})
 
     def bind(self) -> None:
-        """Bind the table, if there is one, for the next passes: another renderer of the context may have bound its own."""
+        """Bind the table, if there is one, for the next passes: another renderer of the context
+        may have bound its own.
+        """
         if self._table is not None:
             self._table.use(TABLE_UNIT)
 
@@ -160,7 +173,9 @@ class Shares:
 def splat_program(
     ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, planes: Planes, in_units: bool = False
 ) -> moderngl.Program:
-    """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a LightUnits."""
+    """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a
+    LightUnits.
+    """
     defines = (*planes.defines, *shares.defines, *["UNITS"] * in_units)
     program = build_program(ctx, "star.vert", "splat.frag", defines, ("planes.glsl", "shares.glsl"))
     shares.set(program)
@@ -179,20 +194,27 @@ def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer, planes: Pl
 
 MAX_RATE = 3e38  # in float32
 APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
-INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}  # star.vert's
-SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
-# Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
+# star.vert's
+INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}
+# cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6
+# px)
+SPRITE_PIXEL_COST = 4
+# Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of
+# light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
 MAX_ERASED_REGION = 0.25  # as much of rectangles, which sprites' overheads do not slow
-# On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1 ms.
+# On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1
+# ms.
 MAX_ERASED_BY_CARD = 1.0
 IMAGES_VERSION = 420  # the OpenGL that has images in shaders
-# A level is missed only where the wings of more stars than this meet outside all of their own squares (see `lit_sides`).
+# A level is missed only where the wings of more stars than this meet outside all of their own
+# squares (see `lit_sides`).
 MEETING_WINGS = 16
-# In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each star's light at a square.
-# No pixel beyond it has more than 1 / CUT_WINGS of the light that lights one, 1 / 64 of the first step. A lone star has the
-# same levels; of 10 000 on 1080p three in a thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower,
-# where wings meet, and all have 0.002 mag rms.
+# In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each
+# star's light at a square. No pixel beyond it has more than 1 / CUT_WINGS of the light that lights
+# one, 1 / 64 of the first step. A lone star has the same levels; of 10 000 on 1080p three in a
+# thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower, where wings
+# meet, and all have 0.002 mag rms.
 CUT_WINGS = 32
 
 
@@ -210,7 +232,8 @@ def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
 
 
 def lit_sides(panel: Panel, lit_e_per_s: float, psf: Psf, wings: int = MEETING_WINGS) -> SpriteSides:
-    """The squares outside which no pixel of a star has 1 / `wings` of the light that lights one, by falling rates.
+    """The squares outside which no pixel of a star has 1 / `wings` of the light that lights one, by
+    falling rates.
 
     There the level is 0 wherever the wings of no more stars than that meet.
     """
@@ -223,7 +246,9 @@ def lit_sides(panel: Panel, lit_e_per_s: float, psf: Psf, wings: int = MEETING_W
 
 
 def most_covered_px(sprites: Sprites, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
-    """Pixels that all sprites together may light, fainter stars within these sides; at most, where that is under `few_px`."""
+    """Pixels that all sprites together may light, fainter stars within these sides; at most,
+    where that is under `few_px`.
+    """
     most = len(sprites) * footprint_px**2
     if not sides or most < few_px:
         return most
@@ -236,9 +261,11 @@ def most_covered_px(sprites: Sprites, footprint_px: int, sides: SpriteSides, few
 
 
 class Eraser:
-    """Makes an image black again where the last frame's sprites were, or all of it where that is faster.
+    """Makes an image black again where the last frame's sprites were, or all of it where that is
+    faster.
 
-    On llvmpipe a clear of 1920 x 1080 takes 0.7 ms of two cores, as long as 1000 stars. It lives in its renderer's context.
+    On llvmpipe a clear of 1920 x 1080 takes 0.7 ms of two cores, as long as 1000 stars. It lives in
+    its renderer's context.
     """
 
     def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool) -> None:
@@ -255,7 +282,9 @@ class Eraser:
         self._footprint_px = 0
 
     def erase_regions(self, fbo: moderngl.Framebuffer, regions: Sequence[Rectangle]) -> None:
-        """Make rectangles of `fbo` black, by a pass: Mesa 22.3's zink loses a clear of a part before which nothing is drawn."""
+        """Make rectangles of `fbo` black, by a pass: Mesa 22.3's zink loses a clear of a part
+        before which nothing is drawn.
+        """
         if not regions:
             return
         fbo.use()
@@ -275,11 +304,15 @@ class Eraser:
         self._program["footprint_px"] = self._footprint_px = footprint_px
 
     def clears(self, count: int | None) -> bool:
-        """Whether a clear of all is faster than erasing `count` sprites (None: it is not known where they are)."""
+        """Whether a clear of all is faster than erasing `count` sprites (None: it is not known
+        where they are).
+        """
         return count is None or count * self._footprint_px**2 > self._most_px
 
     def erase(self, fbo: moderngl.Framebuffer, count: int | None) -> None:
-        """Make `fbo` black where the first `count` sprites of the buffer are; all of it where that is not known."""
+        """Make `fbo` black where the first `count` sprites of the buffer are; all of it where
+        that is not known.
+        """
         width, height = self._size_px
         fbo.use()
         if self.clears(count):
@@ -296,7 +329,9 @@ def draw_tiles(
     size_px: tuple[int, int],
     of_air: tuple[float, float, float, float] | None = None,
 ) -> None:
-    """Draw tiles by their corners (n, 6) with a program of tile.vert, into an image whose framebuffer is in use."""
+    """Draw tiles by their corners (n, 6) with a program of tile.vert, into an image whose
+    framebuffer is in use.
+    """
     if not len(corners):
         return
     set_uniforms(program, {"size_px": size_px, "air": of_air})
@@ -309,9 +344,11 @@ def draw_tiles(
 
 
 class LevelTexture:
-    """The levels of the last frame on the GPU, R8UI up to 256 levels and R16UI beyond; `texture` is what a window shows.
+    """The levels of the last frame on the GPU, R8UI up to 256 levels and R16UI beyond; `texture` is
+    what a window shows.
 
-    Those of primaries have RGBA. It lives in its renderer's context, which is current in every call.
+    Those of primaries have RGBA. It lives in its renderer's context, which is current in every
+    call.
     """
 
     def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes) -> None:
@@ -342,7 +379,9 @@ class LevelTexture:
         return self.texture
 
     def read(self) -> Levels:
-        """The levels (height, width), or of primaries (height, width, 3); the next frame overwrites the same array."""
+        """The levels (height, width), or of primaries (height, width, 3); the next frame
+        overwrites the same array.
+        """
         if not self.in_memory:
             self.fbo.read_into(self.image, components=self._components, dtype=self._dtype, alignment=1)
         return self._levels
@@ -355,7 +394,9 @@ def write(buffer: moderngl.Buffer, values: npt.NDArray[Any]) -> None:
 
 
 class LookupTable:
-    """Values (n,) of four bytes that a shader looks up: in a uniform block where there is room, else in a storage buffer."""
+    """Values (n,) of four bytes that a shader looks up: in a uniform block where there is room,
+    else in a storage buffer.
+    """
 
     def __init__(self, ctx: moderngl.Context, name: str, binding: int, values: npt.NDArray[Any]) -> None:
         rows = table_rows(values, ctx)
@@ -377,7 +418,9 @@ def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[i
 
 
 def level_steps(edges: Sequence[Float32Array]) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:
-    """The table of levels.glsl for planes that count these edges, and its `bins`; None where a bin has several thresholds."""
+    """The table of levels.glsl for planes that count these edges, and its `bins`; None where a
+    bin has several thresholds.
+    """
     tables = [code_table(one) for one in edges]
     steps = [words for table in tables if (words := table.steps()) is not None]
     if len(steps) < len(tables):
@@ -391,9 +434,11 @@ def level_steps(edges: Sequence[Float32Array]) -> tuple[npt.NDArray[Any], list[t
 
 
 class Encoder:
-    """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
+    """Draws the levels of a linear image: only the sprites' footprints where that is less work than
+    the whole image.
 
-    `sprite_program`, of star.vert, encodes sprites. It lives in its renderer's context, which is current in every call.
+    `sprite_program`, of star.vert, encodes sprites. It lives in its renderer's context, which is
+    current in every call.
     """
 
     def __init__(
@@ -449,7 +494,9 @@ class Encoder:
         self._whole_vao = ctx.vertex_array(self._whole, [])
 
     def _program(self, vertex: str, *of_tiles: str) -> moderngl.Program:
-        """The program that encodes the linear image with a vertex shader, or tiles' own light; made when first asked for."""
+        """The program that encodes the linear image with a vertex shader, or tiles' own light;
+        made when first asked for.
+        """
         if (key := (vertex, *of_tiles)) not in self._programs:
             include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
             program = self._built(vertex=vertex, defines=(*self._defines, *(of_tiles or self._of_image)), include=include)
@@ -491,12 +538,14 @@ class Encoder:
         *,
         is_black: bool = True,
     ) -> None:
-        """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is black.
+        """Encode the linear image under the first `count` sprites of the buffer and in `regions`;
+        the rest is black.
 
         Instead of `regions` it may have `tiles`, of which the image has what is no level.
 
-        `uniforms` are the quantiser's of this frame. Each star has `per_star` sprites; together they cover `covered_px`, and
-        where that is most of the image the pass covers all of it. `is_black` says that the levels were erased before.
+        `uniforms` are the quantiser's of this frame. Each star has `per_star` sprites; together
+        they cover `covered_px`, and where that is most of the image the pass covers all of it.
+        `is_black` says that the levels were erased before.
         """
         width, height = self._size_px
         whole, regions = (0, 0, width, height), regions if tiles is None else ()
@@ -553,9 +602,11 @@ def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def table_rows(values: npt.NDArray[Any], ctx: moderngl.Context) -> npt.NDArray[Any] | None:
-    """`values` (n,) of four bytes in rows of four, for a uniform block; None where this GL has no room for so many.
+    """`values` (n,) of four bytes in rows of four, for a uniform block; None where this GL has no
+    room for so many.
 
-    On llvmpipe a block is read in two thirds of the time of a texture, and in half of that of a storage buffer.
+    On llvmpipe a block is read in two thirds of the time of a texture, and in half of that of a
+    storage buffer.
     """
     if 4 * len(values) + 16 > ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]:
         return None

@@ -1,4 +1,5 @@
-"""An ExactQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together.
+"""An ExactQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each
+star's together.
 
 With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
@@ -31,7 +32,8 @@ from hilstar.optics.psf import PIXEL_VARIANCE
 from hilstar.optics.sprites import Sprites
 
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
-# Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
+# Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of
+# thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
 PARTS = tuple(f"{one}.glsl" for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
@@ -44,8 +46,8 @@ SUMS_BYTES = 4 * SUMS
 class ExactPass:
     """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
 
-    `turn` says on which, and for what stars make up there; `left` has room for what all planes leave. It lives in its
-    renderer's context.
+    `turn` says on which, and for what stars make up there; `left` has room for what all planes
+    leave. It lives in its renderer's context.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class ExactPass:
         self._programs: dict[tuple[bool, bool, bool], moderngl.ComputeShader] = {}
 
     def _program(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
-        """The program for stars or paths, whose light is summed, on a `floor` of levels or not, or in the linear image."""
+        """The program for stars or paths, whose light is summed, on a `floor` of levels or not,
+        or in the linear image.
+        """
         if (paths, summed, floor) in self._programs:
             return self._programs[paths, summed, floor]
         order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
@@ -120,7 +124,9 @@ class ExactPass:
 
     @property
     def left(self) -> Left | None:
-        """The errors of the last frame of `temporal`; None at the beginning of a sequence. NumPy's quantiser may give them."""
+        """The errors of the last frame of `temporal`; None at the beginning of a sequence.
+        NumPy's quantiser may give them.
+        """
         return None if self._memory is None else self._memory.left
 
     @left.setter
@@ -134,7 +140,9 @@ class ExactPass:
         return [self._order.buffer, self._light.buffer, *([] if self._gain is None else [self._gain])]
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
-        """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
+        """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or
+        else the linear image.
+        """
         paths = sprites.per_star > 1
         program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
         if passes is None:
@@ -168,7 +176,9 @@ class ExactPass:
 
 
 class Memory:
-    """The errors that the stars of one frame leave to the next, on the GPU; it lives in its renderer's context."""
+    """The errors that the stars of one frame leave to the next, on the GPU; it lives in its
+    renderer's context.
+    """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
@@ -221,7 +231,9 @@ class Memory:
 
 
 def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
-    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
+    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the
+    boxes.
+    """
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
     box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))
@@ -230,10 +242,12 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
 
 
 def overrated(width_px: tuple[float, float]) -> float:
-    """Largest ratio of a path's light as the shader takes it to the true light in a pixel within reach.
+    """Largest ratio of a path's light as the shader takes it to the true light in a pixel within
+    reach.
 
-    The shader takes a Gaussian of the width and a pixel's variance together; where stars are narrow, the true light. Two stars
-    must never own the same pixel, or the order in which threads reach it would choose its level.
+    The shader takes a Gaussian of the width and a pixel's variance together; where stars are
+    narrow, the true light. Two stars must never own the same pixel, or the order in which threads
+    reach it would choose its level.
     """
     if min(width_px) < NARROW_PX:
         return OVERRATED
@@ -244,7 +258,9 @@ def overrated(width_px: tuple[float, float]) -> float:
 
 
 def _ratio(place: float, width_px: float) -> float:
-    """A Gaussian's density of the sigma and a pixel together, over the light in the pixel, `place` wide sigmas off."""
+    """A Gaussian's density of the sigma and a pixel together, over the light in the pixel,
+    `place` wide sigmas off.
+    """
     wide = math.sqrt(width_px**2 + PIXEL_VARIANCE)
     edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
     light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
@@ -252,7 +268,9 @@ def _ratio(place: float, width_px: float) -> float:
 
 
 def stretches_of(star: IntArray) -> IntArray:
-    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and of its path."""
+    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and
+    of its path.
+    """
     begins = np.flatnonzero(np.diff(star, prepend=star[0] - 1))
     ends = np.append(begins[1:], len(star))
     parts = -(-(ends - begins) // CARRIED)

@@ -1,4 +1,6 @@
-"""Extended light, drawn into the linear image before the sprites: maps, glows and discs, each in its rectangle, in order."""
+"""Extended light, drawn into the linear image before the sprites: maps, glows and discs, each in
+its rectangle, in order.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +20,8 @@ NODES = 16  # as in disc.frag
 
 
 class ExtendedLayer:
-    """Draws extended light of one image; it lives in its renderer's context, which is current in every call.
+    """Draws extended light of one image; it lives in its renderer's context, which is current in
+    every call.
 
     Programs and textures are made when they are first needed: a bench without such light has none.
     """
@@ -32,16 +35,19 @@ class ExtendedLayer:
     def draw(
         self, fbo: moderngl.Framebuffer, lights: Sequence[ExtendedLight], sure: Sure | None = None
     ) -> tuple[tuple[Rectangle, ...], Tiles | None]:
-        """Add `lights` to a linear image, in their order; the rectangles that they may have changed.
+        """Add `lights` to a linear image, in their order; the rectangles that they may have
+        changed.
 
-        Where a frame is `sure` of its levels and a disc alone is on the image, what its `Tiles` have as levels is left out.
+        Where a frame is `sure` of its levels and a disc alone is on the image, what its `Tiles`
+        have as levels is left out.
         """
         ctx, regions, found = self._ctx, [], None
         on_image = [(light, region) for light in lights if (region := light.region(self._resolution_px)) is not None]
         sure = sure if len(on_image) == 1 else None
         fbo.use()
         ctx.enable(moderngl.BLEND)
-        # Alpha is the share of a pixel that the light's body covers: what was drawn before it is behind it.
+        # Alpha is the share of a pixel that the light's body covers: what was drawn before it is
+        # behind it.
         ctx.blend_func = (moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
         for light, region in on_image:
             tiles = disc_tiles(light, region, sure) if isinstance(light, DiscLight) else None
@@ -121,7 +127,9 @@ class ExtendedLayer:
     def _program(
         self, fragment: str, include: tuple[str, ...] = (), *defines: str, vertex: str = "full.vert"
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        """A program, and the triangle of `full.vert`; nothing is drawn by that with another vertex shader."""
+        """A program, and the triangle of `full.vert`; nothing is drawn by that with another
+        vertex shader.
+        """
         key = (vertex, fragment, *include, *defines)
         if key not in self._programs:
             program = build_program(self._ctx, vertex, fragment, defines, include)
@@ -129,7 +137,9 @@ class ExtendedLayer:
         return self._programs[key]
 
     def _texture(self, owner: object, image: Any, components: int) -> moderngl.Texture:
-        """The float32 texture of an array, or of a camera's ray shifts; kept while its owner is used."""
+        """The float32 texture of an array, or of a camera's ray shifts; kept while its owner is
+        used.
+        """
         kept = self._textures.pop(id(owner), None)
         if kept is None:
             if len(self._textures) >= KEPT_TEXTURES:

@@ -1,6 +1,8 @@
-"""Frames drawn by NumPy where a machine has no OpenGL: the oracle of the GL renderer as a backend, slower.
+"""Frames drawn by NumPy where a machine has no OpenGL: the oracle of the GL renderer as a backend,
+slower.
 
-The linear image is that of `reference` in float32, and the quantisers are those of `monitor`, which the shaders follow.
+The linear image is that of `reference` in float32, and the quantisers are those of `monitor`, which
+the shaders follow.
 """
 
 import ctypes
@@ -32,13 +34,15 @@ def open_backend(target: Target, context: "Context | None") -> Backend:
     """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
     if context is None:
         return NumpyBackend(target)
-    from hilstar.display.render.renderer import Renderer  # moderngl, which nothing needs where NumPy draws
+    # moderngl, which nothing needs where NumPy draws
+    from hilstar.display.render.renderer import Renderer
 
     return Renderer(target, context)
 
 
 def headless_context(gpu: int | str | None = None) -> "Context | None":
-    """A headless GL context on a GPU (see `create_context`); None where this machine has no OpenGL, so that NumPy draws.
+    """A headless GL context on a GPU (see `create_context`); None where this machine has no OpenGL,
+    so that NumPy draws.
 
     Raises InputError where the machine has no such GPU.
     """
@@ -65,7 +69,9 @@ def _say_once(why: str) -> None:
 
 
 class NumpyBackend(Backend):
-    """Draws sprites of one Target in NumPy; `back_buffer` has the codes (height, width, 3) that were presented."""
+    """Draws sprites of one Target in NumPy; `back_buffer` has the codes (height, width, 3) that
+    were presented.
+    """
 
     back_buffer: npt.NDArray[np.uint16]
 
@@ -81,7 +87,8 @@ class NumpyBackend(Backend):
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: Sprites | None = None
         self._levels: Levels | None = None
-        self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}  # the last of each primary, and its image
+        # the last of each primary, and its image
+        self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
@@ -107,7 +114,9 @@ class NumpyBackend(Backend):
         return self._linear
 
     def levels(self) -> Levels:
-        """The levels of the last draw (height, width); TypeError for a target without a response."""
+        """The levels of the last draw (height, width); TypeError for a target without a
+        response.
+        """
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels
@@ -149,7 +158,9 @@ class NumpyBackend(Backend):
         """Do nothing."""
 
     def _image(self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True) -> Float32Array:
-        """The linear image of a plane, or its extended light; `shrunk` draws fainter stars within the target's `sides`."""
+        """The linear image of a plane, or its extended light; `shrunk` draws fainter stars
+        within the target's `sides`.
+        """
         width, height = self.target.resolution_px
         sprites = as_maps(sprites, self.target) if stars else sprites
         if sprites is None:
@@ -169,7 +180,9 @@ class NumpyBackend(Backend):
         return image.astype(np.float32)
 
     def _extended(self, lights: tuple[ExtendedLight, ...], plane: int) -> FloatArray:
-        """The light of discs and stray light alone (height, width); the same lights again are not drawn again."""
+        """The light of discs and stray light alone (height, width); the same lights again are
+        not drawn again.
+        """
         if plane not in self._lights or self._lights[plane][0] != lights:
             self._lights[plane] = lights, extended_image(lights, self.target.resolution_px)
         return self._lights[plane][1]

@@ -27,7 +27,9 @@ def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8 | np.u
 
 
 def window_context() -> moderngl.Context:
-    """The context of the window that is current in this thread. Raises MachineError with what to install."""
+    """The context of the window that is current in this thread. Raises MachineError with what to
+    install.
+    """
     try:
         settings: Any = {"libgl": GL_LIBRARY, "libx11": X11_LIBRARY}
         return moderngl.create_context(require=330, **settings)
@@ -36,7 +38,8 @@ def window_context() -> moderngl.Context:
 
 
 def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
-    """Which codes the back buffer has otherwise than they were drawn; "" where every code of grey and each primary is there.
+    """Which codes the back buffer has otherwise than they were drawn; "" where every code of grey
+    and each primary is there.
 
     All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
     """
@@ -50,7 +53,8 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             texture = level_texture(context, levels)
             Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
             read = context.screen.read(viewport=(0, 0, width, height), components=3, dtype="f4")
-            _ = context.error  # moderngl asks for an attachment, which a window's back buffer has not, and reads on
+            # moderngl asks for an attachment, which a window's back buffer has not, and reads on
+            _ = context.error
             texture.release()
         drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
         differ = (drawn != part[levels]).any(axis=-1)
@@ -80,7 +84,9 @@ class Presenter:
         self.set_triples(view.triples)
 
     def _build(self, aids: bool) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        """The program without or with crosshair, grid, blank and patch, for this orientation alone."""
+        """The program without or with crosshair, grid, blank and patch, for this orientation
+        alone.
+        """
         view, orientation = self._view, self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
         wanted = flips | {"STEALING": view.triples is not None, "APART": self._apart, "AIDS": aids}
@@ -108,7 +114,8 @@ class Presenter:
             self.table.filter = (moderngl.NEAREST, moderngl.NEAREST)
 
     def wait(self) -> None:
-        """Wait until the last swap is done: a driver that queues swaps has to give the next back buffer for this pixel.
+        """Wait until the last swap is done: a driver that queues swaps has to give the next back
+        buffer for this pixel.
 
         (As Psychtoolbox does after a flip.)
         """
@@ -122,7 +129,8 @@ class Presenter:
         with self._ctx:
             screen = self._ctx.screen
             screen.use()
-            if self._draws_wait:  # llvmpipe's, with the lock held, for the passes that write the levels
+            # llvmpipe's, with the lock held, for the passes that write the levels
+            if self._draws_wait:
                 self._driver.wait()
             else:
                 self._driver.take_back_buffer()

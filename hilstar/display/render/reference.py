@@ -1,4 +1,6 @@
-"""The oracle: what the renderer should draw, in NumPy float64 with an exact erf, and discs by many rays a pixel."""
+"""The oracle: what the renderer should draw, in NumPy float64 with an exact erf, and discs by
+many rays a pixel.
+"""
 
 import numpy as np
 
@@ -14,7 +16,8 @@ REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
 def linear_image(sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None) -> FloatArray:
-    """Electrons per second of each pixel, float64, shape (height, width): extended light, then sprites.
+    """Electrons per second of each pixel, float64, shape (height, width): extended light, then
+    sprites.
 
     `footprint_px` larger than the sprites' own shows what their footprints cut.
     """
@@ -24,7 +27,9 @@ def linear_image(sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, foo
 
 
 def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, int]) -> FloatArray:
-    """Electrons per second of each pixel, float64 (height, width), from discs, stray light and maps alone."""
+    """Electrons per second of each pixel, float64 (height, width), from discs, stray light and
+    maps alone.
+    """
     image = np.zeros(resolution_px[::-1])
     for light in lights:
         region = light.region(resolution_px)
@@ -41,14 +46,17 @@ def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, 
         else:
             own, cover = _disc(light, region)
         where = slice(top, top + height), slice(left, left + width)
-        image[where] = image[where] * (1 - cover) + own  # it hides what was there where it covers that
+        # it hides what was there where it covers that
+        image[where] = image[where] * (1 - cover) + own
     return image
 
 
 def add_stars(
     image: FloatArray, sprites: Sprites, psf: Psf, side_px: int, some: IntArray | slice = slice(None), share: float = 1.0
 ) -> None:
-    """Add a share of the light of `some` sprites to an image (height, width), each in a square of `side_px`, one by one."""
+    """Add a share of the light of `some` sprites to an image (height, width), each in a square
+    of `side_px`, one by one.
+    """
     height, width = image.shape
     steps = np.arange(side_px) - (side_px - 1) // 2
     data, x_px, y_px = sprites.data[some], sprites.x_px[some], sprites.y_px[some]
@@ -75,7 +83,9 @@ def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
 
 
 def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
-    """A disc's light and cover (height, width) in a region: sharp on a grid of rays, then spread by the Gaussian."""
+    """A disc's light and cover (height, width) in a region: sharp on a grid of rays, then spread
+    by the Gaussian.
+    """
     from scipy.ndimage import gaussian_filter
 
     left, top, width, height = region
@@ -96,7 +106,9 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
 
 
 def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> FloatArray:
-    """Light to a pixel, and cover (2, rows, columns), along the rays of places (columns,) in rows (rows,)."""
+    """Light to a pixel, and cover (2, rows, columns), along the rays of places (columns,) in
+    rows (rows,).
+    """
     camera = light.camera
     x_px, y_px = (part.ravel() for part in np.meshgrid(columns_px, rows_px))
     u, v = camera.tangents(x_px, y_px)

@@ -48,10 +48,13 @@ UNTIMED = nullcontext()
 
 
 class Renderer(Backend):
-    """Draws sprites of one Target, in a context of its own or in a window's. Free it with `close`."""
+    """Draws sprites of one Target, in a context of its own or in a window's. Free it with
+    `close`.
+    """
 
     context: Context
-    ON_HOST = True  # whether a linear image alone may be drawn in the process's memory, where this GL can
+    # whether a linear image alone may be drawn in the process's memory, where this GL can
+    ON_HOST = True
 
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
@@ -117,7 +120,8 @@ class Renderer(Backend):
         self._units: LightUnits | None = None
         self._passes: StarPasses | None = None
         self._unit_splat: moderngl.Program | None = None  # where points are in units
-        # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
+        # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the
+        # image.
         self._exact: dict[int, ExactQuantiser] = {}
         self._floor_encoder: Encoder | None = None
         self._floor_levels: LevelTexture | None = None
@@ -239,7 +243,8 @@ class Renderer(Backend):
 
     @cached_property
     def _extended(self) -> "ExtendedLayer":
-        from hilstar.display.render.extended import ExtendedLayer  # no frame of stars alone needs it
+        # no frame of stars alone needs it
+        from hilstar.display.render.extended import ExtendedLayer
 
         return ExtendedLayer(self._ctx, self.target.resolution_px)
 
@@ -283,7 +288,9 @@ class Renderer(Backend):
         return UNTIMED
 
     def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
-        """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
+        """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last
+        frame left.
+        """
         for one in self._exact_passes:
             if self._exact and (left := self._exact[one.plane].left) is not None:
                 one.left, self._exact[one.plane].left = left, None
@@ -311,7 +318,8 @@ class Renderer(Backend):
         levels.write(self._exact_levels)
 
     def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
-        """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
+        """The levels of extended light alone, dithered by a turned mask: stars are added to them in
+        light.
 
         The same lights and turn again give the same levels, which are kept.
         """
@@ -414,7 +422,9 @@ class Renderer(Backend):
 
     @property
     def codes_texture(self) -> moderngl.Texture:
-        """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
+        """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError
+        without a response.
+        """
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
         with self._ctx:

@@ -1,7 +1,8 @@
 """Light in whole units, and the compute passes that add it up star by star.
 
-Each pixel's light is a sum of whole units, which is the same in whatever order several threads add to it. A software OpenGL
-draws star by star, in a quarter of the time of rasterised sprites; a graphics card blends sprites of the same units.
+Each pixel's light is a sum of whole units, which is the same in whatever order several threads add
+to it. A software OpenGL draws star by star, in a quarter of the time of rasterised sprites; a
+graphics card blends sprites of the same units.
 """
 
 import math
@@ -32,20 +33,25 @@ from hilstar.optics.sprites import Sprites
 LOCAL_SIZE = 32  # as in light.comp
 STEPS_BINDING, ORDER_BINDING, TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 1, 2, 3, 7, 8
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
-# Share of the first level's light. Where stars are so many and so bright that a unit would be more, their light is blended.
+# Share of the first level's light. Where stars are so many and so bright that a unit would be more,
+# their light is blended.
 MAX_UNIT = 1 / 64
-# A star's light ends where a pixel has one part in WINGS of what lights one, and where footprints cover the whole image one in
-# WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,
-# where wings meet, and of 50 000 one in seven thousand.
+# A star's light ends where a pixel has one part in WINGS of what lights one, and where footprints
+# cover the whole image one in WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on
+# 1080p eleven of 82 000 lit pixels are one level lower, where wings meet, and of 50 000 one in
+# seven thousand.
 WINGS, DENSER_WINGS = 128, 8
-# A square that is large enough at its worst phase, and in its corners, leaves out as little as an ellipse with so many times
-# the wings: with 4, streaks at 10 deg/s were off by 1.4 arcsec rms and 0.004 mag, by squares 0.6 and 0.001.
+# A square that is large enough at its worst phase, and in its corners, leaves out as little as an
+# ellipse with so many times the wings: with 4, streaks at 10 deg/s were off by 1.4 arcsec rms and
+# 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
-# Share of the image: where footprints cover more, all of it is made black and looked through faster (llvmpipe, 1080p and 4K).
+# Share of the image: where footprints cover more, all of it is made black and looked through faster
+# (llvmpipe, 1080p and 4K).
 MAX_GATHERED = 0.1
 NOWHERE = (np.empty(0, dtype=np.intp),) * 2
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
-RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # runs of stars are sorted by light; runs times half octaves fill 16 bits
+# runs of stars are sorted by light; runs times half octaves fill 16 bits
+RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32
 STRIP_PX = 64.0
 PHASE_PX = 0.1  # a star is at most so far from the middle of its phase
 
@@ -56,10 +62,11 @@ def edges_of(planes: Planes) -> list[Float32Array]:
 
 
 class LightUnits:
-    """The whole units in which each plane's pixels add up stars, and the ellipse within which a star lights them.
+    """The whole units in which each plane's pixels add up stars, and the ellipse within which a
+    star lights them.
 
-    Whatever draws in these units chooses the same levels. `sides` (see `Target.sides`) say how large sprites are at most, and
-    what light of a star alone they may leave out.
+    Whatever draws in these units chooses the same levels. `sides` (see `Target.sides`) say how
+    large sprites are at most, and what light of a star alone they may leave out.
     """
 
     def __init__(self, planes: Planes, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()) -> None:
@@ -73,7 +80,9 @@ class LightUnits:
         self._peak_share = psf.peak_share
         self.axes_px2, self._share_bound = psf.reach
         self.wings = float(WINGS)
-        if sides:  # what part of the light that lights a pixel the squares leave out beside them at most: one in so many
+        # what part of the light that lights a pixel the squares leave out beside them at most: one
+        # in so many
+        if sides:
             outside = [self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px)) for side in sides]
             fewest = min([wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS)
             self.wings = SQUARE_WINGS * max(1.0, fewest)
@@ -82,7 +91,8 @@ class LightUnits:
 
     @staticmethod
     def takes(planes: Planes, size_px: tuple[int, int]) -> bool:
-        """Whether such an image, such sprites and such panels are drawn in units: those that StarPasses can draw.
+        """Whether such an image, such sprites and such panels are drawn in units: those that
+        StarPasses can draw.
 
         A panel's table may have no bin with several thresholds.
         """
@@ -90,7 +100,8 @@ class LightUnits:
         return size <= MAX_WRITTEN_BYTES and side_px * (side_px + 2) <= MAX_ROUNDS and level_steps(edges_of(planes)) is not None
 
     def unit_for(self, sprites: Sprites | None) -> list[float] | None:
-        """The unit of each plane (e-/s) in which no pixel's sum can be too large; None where one is too coarse for its panel.
+        """The unit of each plane (e-/s) in which no pixel's sum can be too large; None where one is
+        too coarse for its panel.
 
         A power of two, from the sum of all stars' brightest pixels, of white at most each.
         """
@@ -103,7 +114,8 @@ class LightUnits:
         return units if fine else None
 
     def reach_per_e(self, sprites: Sprites, alone: bool = False) -> float:
-        """The factor of a star's rate whose logarithm, times `axes_px2`, gives the squared half axes of its ellipse (px2).
+        """The factor of a star's rate whose logarithm, times `axes_px2`, gives the squared half
+        axes of its ellipse (px2).
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
@@ -112,11 +124,13 @@ class LightUnits:
 
 
 class StarPasses:
-    """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
+    """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which
+    is current in every call.
 
-    A compute shader adds up the light of one plane in NumPy's own memory. NumPy makes levels of the sums that light a pixel, of
-    10 000 stars in a third of the time of another pass over stars. The sums stay for `exact` to look at. Where a frame has a
-    `floor`, its stars' levels are added to those in light.
+    A compute shader adds up the light of one plane in NumPy's own memory. NumPy makes levels of the
+    sums that light a pixel, of 10 000 stars in a third of the time of another pass over stars. The
+    sums stay for `exact` to look at. Where a frame has a `floor`, its stars' levels are added to
+    those in light.
     """
 
     def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
@@ -135,10 +149,12 @@ class StarPasses:
         self._images = sums, levels.image.reshape(height, -1)
         wide = [image.shape[1] // width * side_px for image in self._images]
         self._squares = [sliding_window_view(image, (side_px, wide[k]), writeable=True) for k, image in enumerate(self._images)]
-        self._corner: tuple[IntArray, IntArray] | None = None  # row and column of the squares about sprites; None: anywhere
+        # row and column of the squares about sprites; None: anywhere
+        self._corner: tuple[IntArray, IntArray] | None = None
         self._alone = 0  # how many stars need no sums, the first in an order
         self._programs = [self._program("LIGHT", f"FOOTPRINT {units.side_px}")]
-        self.tables: list[moderngl.Texture | moderngl.Buffer] = []  # by which light becomes levels, on the GPU
+        # by which light becomes levels, on the GPU
+        self.tables: list[moderngl.Texture | moderngl.Buffer] = []
         self.floor: LevelTexture | None = None
         self._level_light = planes.panels[0].light_e_per_s()
 
@@ -152,11 +168,15 @@ class StarPasses:
         return program
 
     def forget(self) -> None:
-        """The next `lay` makes all levels and sums black: something else has drawn on them, or they may be lost."""
+        """The next `lay` makes all levels and sums black: something else has drawn on them, or
+        they may be lost.
+        """
         self._corner, self._levels.in_memory = None, False
 
     def lay(self, floor: LevelTexture | None) -> None:
-        """Make black what the last frame drew, and take a frame's floor, which becomes its levels; None for black."""
+        """Make black what the last frame drew, and take a frame's floor, which becomes its
+        levels; None for black.
+        """
         corner = None if floor is None and self.floor is not None else self._corner
         self.floor, self._levels.in_memory, self._corner = floor, True, NOWHERE
         for image, squares in zip(self._images, self._squares, strict=True):
@@ -219,7 +239,8 @@ class StarPasses:
 
 
 class ApartPasses(StarPasses):
-    """The same for the planes of primaries: the shader makes the levels, those of stars that stand alone without sums.
+    """The same for the planes of primaries: the shader makes the levels, those of stars that stand
+    alone without sums.
 
     There each pixel's three levels lie beside each other, which NumPy would look for three times.
     """
@@ -239,11 +260,14 @@ class ApartPasses(StarPasses):
         self.tables += [self._steps.buffer, *([] if self._gains is None else [self._gains])]
 
     def upload(self, sprites: Sprites) -> None:
-        """Take the sprites that `add_light` and `encode` are about: those alone come first, alike light one after another."""
+        """Take the sprites that `add_light` and `encode` are about: those alone come first,
+        alike light one after another.
+        """
         super().upload(sprites)
         reach_per_e, rates = self._units.reach_per_e(sprites), np.ascontiguousarray(sprites.data["electrons_per_s"])
         crowded = np.ones(len(sprites), dtype=np.bool_)
-        if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(self._size_px):  # else few do
+        # else few do
+        if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(self._size_px):
             squares = np.maximum(np.log(np.maximum(reach_per_e * rates, 1e-30)), self._least_reach) * max(self._units.axes_px2)
             crowded = crowded_at(sprites.x_px, sprites.y_px, np.sqrt(squares) + math.hypot(*self._planes.margin_px))
         order = turns_of(rates, self._units.lit_e_per_s)
@@ -273,20 +297,26 @@ class ApartPasses(StarPasses):
 
 
 def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
-    """The order (n,) in which sprites go through the pass: in runs of near neighbours, each by light.
+    """The order (n,) in which sprites go through the pass: in runs of near neighbours, each by
+    light.
 
-    Eight stars go together on a CPU, for as long as the brightest of them needs. A run's own pixels stay in the cache.
+    Eight stars go together on a CPU, for as long as the brightest of them needs. A run's own pixels
+    stay in the cache.
     """
     count = len(electrons_per_s)
     runs = max(1, min(count // RUN, MAX_RUNS))
-    # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows by a pixel or two.
+    # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows
+    # by a pixel or two.
     half_octaves = (electrons_per_s.view(np.int32) >> 22) - (np.float32(step_e_per_s).view(np.int32) >> 22)
     key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
-    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))  # 16-bit keys are sorted by radix
+    # 16-bit keys are sorted by radix
+    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))
 
 
 def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> BoolArray:
-    """Whether the circle of a star, `reach_px` (n,) about it, meets another's, (n,): sought in strips of the image."""
+    """Whether the circle of a star, `reach_px` (n,) about it, meets another's, (n,): sought in
+    strips of the image.
+    """
     low, high = y_px.min(), y_px.max()
     most_px = 2 * float(reach_px.max())  # by which two stars may be apart
     strip, long = np.floor(x_px / max(most_px, STRIP_PX)), high - low + 2 * most_px

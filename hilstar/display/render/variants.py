@@ -1,4 +1,6 @@
-"""Renderers for measurements only: one with another splat, for the study of trade-offs, and one that times its stages."""
+"""Renderers for measurements only: one with another splat, for the study of trade-offs, and one
+that times its stages.
+"""
 
 import time
 from collections.abc import Iterator
@@ -22,7 +24,8 @@ Profile = Literal["renderer", "erf", "exp erf", "table", "centre"]
 
 @dataclass(frozen=True, slots=True)
 class SplatVariant:
-    """A variant of the splat: the profile, the linear image's texel, the footprint's side; by default the renderer's.
+    """A variant of the splat: the profile, the linear image's texel, the footprint's side; by
+    default the renderer's.
 
     `table_size` is the number of samples that the profile `table` interpolates between.
     """
@@ -63,7 +66,8 @@ class VariantRenderer(Renderer):
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
             self._splat["resolution_px"] = self.target.resolution_px
             if variant.profile == "table":
-                # Shares along x and y, the two channels of one row, from a star's centre to past its footprint's edge
+                # Shares along x and y, the two channels of one row, from a star's centre to past
+                # its footprint's edge
                 reach_px, size = self.footprint_px / 2 + 1, variant.table_size
                 offset_px = np.linspace(0, reach_px, size)
                 shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1)
@@ -84,8 +88,8 @@ class VariantRenderer(Renderer):
 
 
 class StagedRenderer(Renderer):
-    """A renderer that waits after each stage. `stage_ms` is the last frame's wall time (ms) of erase, upload, splat, encode,
-    choose and read_back.
+    """A renderer that waits after each stage. `stage_ms` is the last frame's wall time (ms) of
+    erase, upload, splat, encode, choose and read_back.
 
     `gpu_splat` and `gpu_encode` are measured by the driver's own timers, where it has them.
     """

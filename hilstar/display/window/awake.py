@@ -1,10 +1,13 @@
-"""No screen saver and no standby (DPMS) on an X server while a window is shown there; what was set comes back after it.
+"""No screen saver and no standby (DPMS) on an X server while a window is shown there; what was set
+comes back after it.
 
-A process of its own does it, for a run that is killed can restore nothing. It begins with the window, ends when its stdin
-does, and nobody's child: what kills a run's children spares it. Twice a second it looks whether somebody has set blanking
-again, such as another run that has ended: it prevents that too, and restores it instead.
+A process of its own does it, for a run that is killed can restore nothing. It begins with the
+window, ends when its stdin does, and nobody's child: what kills a run's children spares it. Twice a
+second it looks whether somebody has set blanking again, such as another run that has ended: it
+prevents that too, and restores it instead.
 
-This file is also that process's program, by its path and without hilstar's other modules: it takes 20 ms to begin.
+This file is also that process's program, by its path and without hilstar's other modules: it takes
+20 ms to begin.
 """
 
 import contextlib
@@ -22,7 +25,9 @@ DONT_PREFER_BLANKING, SCREEN_SAVER_RESET, DPMS_ON = 0, 0, 0  # X.h, dpmsconst.h
 
 
 class Awake:
-    """Keeps the X server of DISPLAY from blanking until `close`; without such a server it does nothing."""
+    """Keeps the X server of DISPLAY from blanking until `close`; without such a server it does
+    nothing.
+    """
 
     def __init__(self) -> None:
         program = [sys.executable, "-I", "-S", __file__]
@@ -47,7 +52,9 @@ class Awake:
 
 
 class _Blanking(NamedTuple):
-    """What an X server does when nobody types: after how many seconds, how, and whether monitors go to standby."""
+    """What an X server does when nobody types: after how many seconds, how, and whether monitors
+    go to standby.
+    """
 
     timeout_s: int
     interval_s: int

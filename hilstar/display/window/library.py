@@ -1,7 +1,7 @@
 """glfw, with the library that its own package brings.
 
-Its own search begins a Python process that loads each library and says its version: 30 ms of every start-up, and where a
-signal ends the start-up meanwhile, that process prints its traceback.
+Its own search begins a Python process that loads each library and says its version: 30 ms of every
+start-up, and where a signal ends the start-up meanwhile, that process prints its traceback.
 """
 
 import os
@@ -12,7 +12,9 @@ __all__ = ["glfw"]
 
 
 def _own_library() -> Path | None:
-    """The library for X11 of glfw's own package, whatever the session; None where the package has none."""
+    """The library for X11 of glfw's own package, whatever the session; None where the package
+    has none.
+    """
     spec = find_spec("glfw")
     if spec is None or spec.origin is None:
         return None

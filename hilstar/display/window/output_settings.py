@@ -1,8 +1,10 @@
-"""Settings of a display's output that change codes on their way to the panel, or the time of a frame: a table of them.
+"""Settings of a display's output that change codes on their way to the panel, or the time of a
+frame: a table of them.
 
-Names and values are those of the drivers (Linux DRM connectors, which modesetting, amdgpu, radeon and nouveau pass on by
-RandR; xf86-video-amdgpu's own; nvidia-settings' attributes). `dithering mode`, `Broadcast RGB`, `Colorspace`, `vrr_capable`,
-`max bpc` and vibrance were read in drivers' sources; the other names are from their documentation. None was tried on hardware.
+Names and values are those of the drivers (Linux DRM connectors, which modesetting, amdgpu, radeon
+and nouveau pass on by RandR; xf86-video-amdgpu's own; nvidia-settings' attributes). `dithering
+mode`, `Broadcast RGB`, `Colorspace`, `vrr_capable`, `max bpc` and vibrance were read in drivers'
+sources; the other names are from their documentation. None was tried on hardware.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,16 +19,18 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 TRANSFORM_TOLERANCE = 1e-4  # X has 16 bits after the point
 PITCH_TOLERANCE = 0.03
 CM_ROUNDING_MM = 5.0
-MAX_LISTED = 18  # numbers of a property; a longer one (a table of the colour hardware) is not listed
+# numbers of a property; a longer one (a table of the colour hardware) is not listed
+MAX_LISTED = 18
 NVIDIA = "nvidia-settings: "
 WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
 
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """An output as RandR describes it: its mode and the preferred ones (px), its refresh (0 where that is not known), its
-    transform (rows of a 3 x 3 matrix), rotation, properties and EDID (b"" for none); the other outputs that are lit, and the
-    screen's providers (GPUs)."""
+    """An output as RandR describes it: its mode and the preferred ones (px), its refresh (0 where
+    that is not known), its transform (rows of a 3 x 3 matrix), rotation, properties and EDID (b""
+    for none); the other outputs that are lit, and the screen's providers (GPUs).
+    """
 
     name: str
     mode_px: Pair
@@ -62,14 +66,18 @@ class OutputState:
 
 
 class Finding(NamedTuple):
-    """A fault of an output, and what mends it; `refused` where codes or times are known to be wrong by it."""
+    """A fault of an output, and what mends it; `refused` where codes or times are known to be
+    wrong by it.
+    """
 
     text: str
     refused: bool
 
 
 def property_value(kind: str, form: int, items: tuple[int, ...], names: Callable[[int], str]) -> Value | None:
-    """The value of a property of type `kind` with items of `form` bits; `names` resolves atoms. None for none, or a table."""
+    """The value of a property of type `kind` with items of `form` bits; `names` resolves atoms.
+    None for none, or a table.
+    """
     if kind == "ATOM":
         return names(items[0]) if items else None
     if not items or len(items) > MAX_LISTED:
@@ -80,7 +88,9 @@ def property_value(kind: str, form: int, items: tuple[int, ...], names: Callable
 
 
 def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None) -> Iterator[Finding]:
-    """The faults of an output that shows codes of `bits` bits on pixels of that pitch (None: not known)."""
+    """The faults of an output that shows codes of `bits` bits on pixels of that pitch (None: not
+    known).
+    """
     for rule in RULES:
         value = (state.properties or {}).get(rule.name)
         verdict = RIGHT if value is None else rule.judge(value, bits)
@@ -121,7 +131,9 @@ def _geometry_findings(state: OutputState) -> Iterator[Finding]:
 
 
 def size_mm_of(edid: bytes) -> Pair | None:
-    """The picture's size in mm by the first detailed timing of an EDID (VESA E-EDID 1.4, 3.10.2); None where it has none."""
+    """The picture's size in mm by the first detailed timing of an EDID (VESA E-EDID 1.4,
+    3.10.2); None where it has none.
+    """
     timing = edid[54:72]
     if len(edid) < 128 or len(timing) < 18 or not timing[0] | timing[1]:
         return None
@@ -152,7 +164,9 @@ Judge = Callable[[Value, int], str]
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """A property: whether a value is right for codes of some bits, why not, and the command that mends it."""
+    """A property: whether a value is right for codes of some bits, why not, and the command that
+    mends it.
+    """
 
     name: str
     judge: Judge
@@ -161,7 +175,9 @@ class _Rule:
 
 
 def _one_of(right: str, doubtful: str = "") -> Judge:
-    """Right are these values, separated by commas, in any case; some are doubtful; all others are wrong."""
+    """Right are these values, separated by commas, in any case; some are doubtful; all others
+    are wrong.
+    """
     good, unsure = right.lower().split(","), doubtful.lower().split(",") if doubtful else []
 
     def judge(value: Value, bits: int) -> str:
@@ -177,7 +193,9 @@ def _doubtful_unless(right: str) -> Judge:
 
 
 def _identity_matrix(value: Value, bits: int) -> str:
-    """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0 where none is set."""
+    """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0
+    where none is set.
+    """
     halves = np.array([value] if isinstance(value, int) else value).astype(np.int64) & 0xFFFFFFFF if value else np.zeros(1)
     if not np.any(halves):
         return RIGHT

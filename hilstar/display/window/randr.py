@@ -1,4 +1,5 @@
-"""RandR by libXrandr, on a connection of its own: how an output is set, and its gamma ramp. Nothing is changed.
+"""RandR by libXrandr, on a connection of its own: how an output is set, and its gamma ramp. Nothing
+is changed.
 
 Only what the server already knows is asked for, so that no request makes it probe a monitor.
 """
@@ -24,7 +25,8 @@ BYTE_BITS = 8
 _Id, _Ids, UINT = NUMBER, ctypes.POINTER(NUMBER), ctypes.c_uint
 
 
-class _Mode(ctypes.Structure):  # XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
+# XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
+class _Mode(ctypes.Structure):
     _fields_ = (
         *(("id", _Id), ("width", UINT), ("height", UINT), ("dot_clock", NUMBER), ("sync", UINT * 7)),
         *(("name", POINTER), ("name_length", UINT), ("flags", NUMBER)),
@@ -89,9 +91,11 @@ XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 
 
 class Randr(Closing):
-    """A connection to the X server of DISPLAY. Free it with `close`. Raises OSError without a server or libXrandr.
+    """A connection to the X server of DISPLAY. Free it with `close`. Raises OSError without a
+    server or libXrandr.
 
-    Requests for an output that has just gone fail in silence: `survival` is a window's, by default one of its own.
+    Requests for an output that has just gone fail in silence: `survival` is a window's, by default
+    one of its own.
     """
 
     def __init__(self, survival: Survival | None = None) -> None:
@@ -131,7 +135,9 @@ class Randr(Closing):
         return [replace(state, others=rest, providers=providers) for state, rest in zip(lit, others, strict=True)]
 
     def ramp(self, name: str) -> bytes:
-        """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b"" where it is not lit."""
+        """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b""
+        where it is not lit.
+        """
         with self._resources() as resources:
             for number in () if resources is None else resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
@@ -196,7 +202,8 @@ class Randr(Closing):
         failed = self._xrandr.XRRGetOutputProperty(self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results)
         if failed or not data.value:
             return None
-        item = {8: ctypes.c_ubyte, 16: ctypes.c_ushort}.get(form.value, ctypes.c_ulong)  # Xlib gives 32 bits as long
+        # Xlib gives 32 bits as long
+        item = {8: ctypes.c_ubyte, 16: ctypes.c_ushort}.get(form.value, ctypes.c_ulong)
         items = tuple(ctypes.cast(data, ctypes.POINTER(item))[: count.value])
         self._x11.XFree(data)
         if raw and form.value == BYTE_BITS:
@@ -224,7 +231,9 @@ class Randr(Closing):
         return tuple(names)
 
     def _of_nvidia(self, output: str) -> dict[str, Value]:
-        """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of it."""
+        """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of
+        it.
+        """
         tool = shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
         values: dict[str, Value] = {}
         for attribute in () if tool is None else NVIDIA_ATTRIBUTES:

@@ -1,4 +1,6 @@
-"""The identity of a display of this machine: by RandR, DRM and, where the program ddcutil is installed, DDC/CI."""
+"""The identity of a display of this machine: by RandR, DRM and, where the program ddcutil is
+installed, DDC/CI.
+"""
 
 import contextlib
 import re
@@ -22,7 +24,9 @@ DDC_S = 10.0  # ddcutil looks at every bus, and asks again where a monitor does 
 
 
 def identity_here(wanted: int | str) -> MonitorIdentity | None:
-    """The identity of the display that `[monitor] display` means, before a window is on it; None where there is none."""
+    """The identity of the display that `[monitor] display` means, before a window is on it; None
+    where there is none.
+    """
     try:
         display = next(one for one in displays() if one.is_named(wanted))
     except (MachineError, StopIteration):
@@ -47,7 +51,9 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
 
 
 def edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
-    """The kernel's EDID of a connector, which X may call HDMI-1 where the kernel says HDMI-A-1; b"" for none."""
+    """The kernel's EDID of a connector, which X may call HDMI-1 where the kernel says HDMI-A-1;
+    b"" for none.
+    """
     for path in sorted(drm.glob("card*-*/edid")):
         with contextlib.suppress(OSError):
             name = path.parent.name.partition("-")[2]
@@ -57,7 +63,9 @@ def edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
 
 
 def _by_ddc(edid: bytes) -> dict[str, int]:
-    """The monitor's own settings that it tells by DDC/CI; {} where it does not, or ddcutil is not installed."""
+    """The monitor's own settings that it tells by DDC/CI; {} where it does not, or ddcutil is
+    not installed.
+    """
     program = shutil.which("ddcutil")
     if program is None or len(edid) < EDID_BYTES:
         return {}

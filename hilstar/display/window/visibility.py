@@ -1,4 +1,6 @@
-"""Whether an X11 window is seen: a thread with its own connection listens, so that no frame ever asks the server."""
+"""Whether an X11 window is seen: a thread with its own connection listens, so that no frame ever
+asks the server.
+"""
 
 import ctypes
 import os
@@ -13,7 +15,8 @@ from hilstar.display.window.x11 import INT, NUMBER, POINTER, Survival, load_libr
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
 VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
 COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
-LOOK_AGAIN_S = 0.5  # interval of what sends no events: the position of a window's parents, and the display's sleep
+# interval of what sends no events: the position of a window's parents, and the display's sleep
+LOOK_AGAIN_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +27,8 @@ class ScreenArea:
     size_px: tuple[int, int]
 
 
-class _VisibilityEvent(ctypes.Structure):  # XVisibilityEvent of Xlib, and the beginning of every other event
+# XVisibilityEvent of Xlib, and the beginning of every other event
+class _VisibilityEvent(ctypes.Structure):
     _fields_ = (
         *(("type", INT), ("serial", NUMBER), ("send_event", INT)),
         *(("display", POINTER), ("window", NUMBER), ("state", INT)),
@@ -36,7 +40,9 @@ class _Event(ctypes.Union):  # XEvent of Xlib
 
 
 class Visibility:
-    """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly seen, "" where it is."""
+    """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly
+    seen, "" where it is.
+    """
 
     def __init__(self, x11: Any, connection: int, window: int, place: ScreenArea | None) -> None:
         self._x11, self._connection, self._window, self.place = x11, connection, window, place
@@ -52,7 +58,9 @@ class Visibility:
 
     @classmethod
     def of(cls, window: int, place: ScreenArea | None, survival: Survival) -> Self | None:
-        """Watch a window that has to fill `place` (None: that may be anywhere); None without a connection to the server."""
+        """Watch a window that has to fill `place` (None: that may be anywhere); None without a
+        connection to the server.
+        """
         try:
             x11 = xlib()
         except (OSError, AttributeError):
@@ -86,7 +94,9 @@ class Visibility:
                 return
 
     def _off_place(self) -> str:
-        """Why the window is not where it should be: on its display, or wholly on the screen; "" where it is."""
+        """Why the window is not where it should be: on its display, or wholly on the screen; ""
+        where it is.
+        """
         root = self._x11.XDefaultRootWindow(self._connection)
         size, screen = self._geometry(self._window), self._geometry(root)
         x, y, child = ctypes.c_int(), ctypes.c_int(), ctypes.c_ulong()
@@ -124,7 +134,9 @@ def _ended(descriptor: int) -> bool:
 
 
 def _sleep_of(connection: int) -> Any:
-    """A function that tells whether the display sleeps (DPMS); always false where that is not known."""
+    """A function that tells whether the display sleeps (DPMS); always false where that is not
+    known.
+    """
     try:
         library = load_library("libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER))
         parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))

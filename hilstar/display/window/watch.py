@@ -1,4 +1,5 @@
-"""What is done to a display while a window is shown on it: somebody else's gamma ramp, and frames copied or flipped.
+"""What is done to a display while a window is shown on it: somebody else's gamma ramp, and frames
+copied or flipped.
 
 A thread with connections of its own looks once a second, so that no frame ever asks the server.
 """
@@ -28,8 +29,9 @@ UNKNOWN = "unknown"
 def is_straight(ramp: bytes | FloatArray) -> bool:
     """Whether a gamma ramp is the identity, to half a code of its own depth.
 
-    Red, green and blue, in 16 bits a step or (3, steps) from 0 to 1. A driver that keeps 8 bits rounds to them. In a finer
-    table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less light at the faintest code.
+    Red, green and blue, in 16 bits a step or (3, steps) from 0 to 1. A driver that keeps 8 bits
+    rounds to them. In a finer table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less
+    light at the faintest code.
     """
     parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP if isinstance(ramp, bytes) else ramp
     if not parts.size:
@@ -40,7 +42,9 @@ def is_straight(ramp: bytes | FloatArray) -> bool:
 
 
 def ramp_bits(parts: FloatArray) -> int:
-    """The depth in bits of a ramp's entries (3, steps) from 0 to 1: the coarsest, from 8, that holds each of them."""
+    """The depth in bits of a ramp's entries (3, steps) from 0 to 1: the coarsest, from 8, that
+    holds each of them.
+    """
     for bits in range(COARSEST_BITS, RAMP_BITS):
         full = 2**bits - 1
         rounded = np.rint(parts * full) / full
@@ -50,9 +54,11 @@ def ramp_bits(parts: FloatArray) -> int:
 
 
 class PresentEvents:
-    """How the X server shows a window's frames, by the events of its Present extension on an XCB connection.
+    """How the X server shows a window's frames, by the events of its Present extension on an XCB
+    connection.
 
-    Drivers that do not use Present (NVIDIA's, llvmpipe) cause none. Raises OSError without a server, XCB, or Present.
+    Drivers that do not use Present (NVIDIA's, llvmpipe) cause none. Raises OSError without a
+    server, XCB, or Present.
     """
 
     def __init__(self, window: int) -> None:
@@ -101,7 +107,8 @@ class PresentEvents:
 
 
 class DisplayWatch:
-    """Looks once a second whether the gamma ramp of `output` (None: of none) is another, and how a window's frames are shown.
+    """Looks once a second whether the gamma ramp of `output` (None: of none) is another, and how a
+    window's frames are shown.
 
     `ramp_changed` is true while the ramp is neither the one of the start nor straight.
     """
@@ -138,7 +145,9 @@ class DisplayWatch:
 
     @property
     def presented(self) -> dict[str, int]:
-        """Frames by how the X server showed them up to now: flip, copy, skip; empty where it does not say."""
+        """Frames by how the X server showed them up to now: flip, copy, skip; empty where it
+        does not say.
+        """
         self._take_events()
         return dict(self._shown)
 
@@ -158,6 +167,8 @@ class DisplayWatch:
 
 
 def presented_as(shown: dict[str, int]) -> str:
-    """In a word how frames were shown: "flip", "copy", "flip and copy", or "unknown" where the server did not say."""
+    """In a word how frames were shown: "flip", "copy", "flip and copy", or "unknown" where the
+    server did not say.
+    """
     modes = [mode for mode in ("flip", "copy") if shown.get(mode)]
     return " and ".join(modes) or UNKNOWN

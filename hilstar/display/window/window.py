@@ -1,4 +1,6 @@
-"""The window on the monitor: full screen on a chosen display, or an ordinary window. The only user of glfw."""
+"""The window on the monitor: full screen on a chosen display, or an ordinary window. The only
+user of glfw.
+"""
 
 import contextlib
 import ctypes
@@ -41,7 +43,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Display:
-    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say (Xvfb).
+    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say
+    (Xvfb).
 
     `bits` per colour are those of its mode: the minimum of the three.
     """
@@ -68,7 +71,8 @@ class Display:
 
 @dataclass(frozen=True, slots=True)
 class WindowSettings:
-    """`display` is an index or a part of a name, None for an ordinary window; `bits` are requested per colour.
+    """`display` is an index or a part of a name, None for an ordinary window; `bits` are requested
+    per colour.
 
     `refresh_hz` is asked for where the display has it; by default the display keeps its own.
     """
@@ -86,7 +90,9 @@ def displays() -> list[Display]:
 
 
 def window_renderer() -> str:
-    """The GL_RENDERER that draws a window here; "" where none opens. Raises MachineError without a display."""
+    """The GL_RENDERER that draws a window here; "" where none opens. Raises MachineError without
+    a display.
+    """
     with _glfw():
         glfw.window_hint(glfw.VISIBLE, False)
         window = _newest_window(64, 64, None)
@@ -144,8 +150,8 @@ def _pair(values: Any) -> tuple[int, int]:
 class Window(Closing):
     """A window whose GL context is current in the thread that opened it. Free it with `close`.
 
-    `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises MachineError without a
-    display or GL, and for a display that is not there.
+    `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises
+    MachineError without a display or GL, and for a display that is not there.
     """
 
     def __init__(self, settings: WindowSettings) -> None:
@@ -220,7 +226,9 @@ class Window(Closing):
             self._watch = DisplayWatch(name, glfw.get_x11_window(self._window), self._survival)
 
     def _set_identity_ramp(self, monitor: Any) -> None:
-        """Set the identity: a correction by the system would change what the calibration measured."""
+        """Set the identity: a correction by the system would change what the calibration
+        measured.
+        """
         ramp: Any = glfw.get_gamma_ramp(monitor)
         size = 0 if ramp is None else len(ramp.red)
         if not size:
@@ -236,7 +244,9 @@ class Window(Closing):
 
     @property
     def hidden(self) -> str:
-        """Why the window is not seen as drawn: minimised, covered, off the screen; "" where it is, or that is not known."""
+        """Why the window is not seen as drawn: minimised, covered, off the screen; "" where it
+        is, or that is not known.
+        """
         if self.lost:
             return "without its display"
         if self._minimised:
@@ -335,7 +345,9 @@ class Window(Closing):
 
     @property
     def mirrored(self) -> str | None:
-        """The name of another display that shows the same part of the desktop, where there is one."""
+        """The name of another display that shows the same part of the desktop, where there is
+        one.
+        """
         if self.display is None:
             return None
         same = (d.name for d in _displays() if d.name != self.display.name and d.position_px == self.display.position_px)
@@ -343,14 +355,18 @@ class Window(Closing):
 
     @property
     def modes_hz(self) -> tuple[int, ...]:
-        """The refresh rates that the display has at its size, whole Hz as the system gives them; none where it does not say."""
+        """The refresh rates that the display has at its size, whole Hz as the system gives them;
+        none where it does not say.
+        """
         display = self.display
         monitor = None if self.gone is not None else glfw.get_window_monitor(self._window)
         return () if not monitor or display is None else _modes_hz(display, monitor)
 
     @property
     def output(self) -> OutputState | None:
-        """How the display's output is set; None in an ordinary window, and where RandR does not say."""
+        """How the display's output is set; None in an ordinary window, and where RandR does not
+        say.
+        """
         if self.display is None or self.gone is not None:
             return None
         return output_named(self.display.name, self._survival)
@@ -362,7 +378,9 @@ class Window(Closing):
 
     @property
     def presented(self) -> dict[str, int]:
-        """Frames that the X server flipped, copied or skipped up to now; empty where it does not say."""
+        """Frames that the X server flipped, copied or skipped up to now; empty where it does not
+        say.
+        """
         return {} if self._watch is None or self.gone is not None else self._watch.presented
 
     @property
@@ -371,9 +389,11 @@ class Window(Closing):
         return self._stamps.source
 
     def swap(self, wait: Callable[[], None] = lambda: None) -> int:
-        """Show what was drawn; the host time, ns, of the swap: the driver's, else that once it is done.
+        """Show what was drawn; the host time, ns, of the swap: the driver's, else that once it is
+        done.
 
-        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may return earlier and the driver has no times.
+        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may return earlier and
+        the driver has no times.
         """
         if self.gone is not None:
             return time.monotonic_ns()
@@ -412,7 +432,8 @@ def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
 
 
 def _newest_window(width: int, height: int, monitor: Any) -> Any:
-    """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or newer.
+    """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or
+    newer.
 
     A context without robustness never tells that its GPU was reset; some drivers have none with it.
     """

@@ -1,7 +1,9 @@
-"""Calls to X11 and GLX through ctypes: when a swap reached the screen, whether a compositor runs, and whether the server
+"""Calls to X11 and GLX through ctypes: when a swap reached the screen, whether a compositor runs,
+and whether the server
 or the window is gone.
 
-Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
+Each answer is None or False where the system has no such thing: Wayland, or a driver without the
+extension.
 """
 
 import ctypes
@@ -16,13 +18,15 @@ from hilstar.basics.units import NS_PER_US
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
 GL_DRAW_FRAMEBUFFER, GL_BACK_LEFT, GL_SAMPLES = 0x8CA9, 0x0402, 0x80A9
-GL_COLOUR_SIZES = (0x8212, 0x8213, 0x8214)  # GL_FRAMEBUFFER_ATTACHMENT_RED_SIZE, _GREEN_SIZE, _BLUE_SIZE
+# GL_FRAMEBUFFER_ATTACHMENT_RED_SIZE, _GREEN_SIZE, _BLUE_SIZE
+GL_COLOUR_SIZES = (0x8212, 0x8213, 0x8214)
 CLOCK = "after-swap clock"
 SYNC_EXTENSION = b"GLX_OML_sync_control"
 # A UST further back is of another clock than this host's monotonic one, or of another swap.
 MAX_UST_AGE_NS = 1_000_000_000
 MAX_GAPS = 30  # swaps in a row without a time stamp that can be right
-BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
+# X.h; those of extensions are GLX's here
+BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128
 SERVER_GONE = "the X server is gone, or has closed the window's connection"
 WINDOW_GONE = "the window is gone: another program has closed it"
 
@@ -33,7 +37,9 @@ log = logging.getLogger(__name__)
 
 
 def load_library(name: str, **functions: tuple[Any, ...]) -> Any:
-    """A library whose `functions` have these types: of the result, then of the arguments. Raises OSError or AttributeError."""
+    """A library whose `functions` have these types: of the result, then of the arguments. Raises
+    OSError or AttributeError.
+    """
     library: Any = ctypes.CDLL(name)
     for function, (result, *arguments) in functions.items():
         found = getattr(library, function)
@@ -67,7 +73,9 @@ def xlib() -> Any:
 
 
 def server_of() -> str:
-    """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without libX11."""
+    """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without
+    libX11.
+    """
     library = xlib()
     display = library.XOpenDisplay(None)
     if not display:
@@ -92,7 +100,9 @@ _ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_
 
 
 class Survival:
-    """Xlib ends the process when the server or a window goes away; while this object lives, it calls `on_end(why)` instead."""
+    """Xlib ends the process when the server or a window goes away; while this object lives, it
+    calls `on_end(why)` instead.
+    """
 
     def __init__(self, on_end: Callable[[str], None]) -> None:
         self._undecided: set[int] = set()  # connections whose errors say nothing of the window
@@ -121,10 +131,13 @@ class Survival:
         self._library.XSetErrorHandler(self._before[1])
 
     def cover(self, x_display: int, decides: bool = True) -> None:
-        """Survive the end of this connection; unless it `decides`, errors of its requests say nothing of the window."""
+        """Survive the end of this connection; unless it `decides`, errors of its requests say
+        nothing of the window.
+        """
         if not decides:
             self._undecided.add(x_display)
-        if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; with an older one the process ends
+        # libX11 1.7 of 2020; with an older one the process ends
+        if hasattr(self._library, "XSetIOErrorExitHandler"):
             self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
             self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)
 
@@ -142,7 +155,9 @@ class SyncControl:
         self._window = (x_display, drawable)
 
     def swap_ns(self) -> int | None:
-        """Wait for the last swap; the driver's time of it (host's monotonic clock), None where it does not say."""
+        """Wait for the last swap; the driver's time of it (host's monotonic clock), None where
+        it does not say.
+        """
         ust, msc, sbc = (ctypes.c_int64() for _ in range(3))
         if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
             return None
@@ -150,10 +165,12 @@ class SyncControl:
 
 
 class SwapStamps:
-    """When each swap reached the screen: by the driver where it says, else by the host's clock once the swap is done.
+    """When each swap reached the screen: by the driver where it says, else by the host's clock once
+    the swap is done.
 
-    Linux stamps the *end* of a vertical blank, when the first row is lit, and tells of it at its beginning: up to a
-    millisecond ahead of now. So a stamp may be a refresh period ahead; a single one that cannot be right is passed over.
+    Linux stamps the *end* of a vertical blank, when the first row is lit, and tells of it at its
+    beginning: up to a millisecond ahead of now. So a stamp may be a refresh period ahead; a single
+    one that cannot be right is passed over.
     """
 
     def __init__(self, sync: SyncControl | None, period_ns: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -162,7 +179,9 @@ class SwapStamps:
         self.source = CLOCK if sync is None else SYNC_EXTENSION.decode()
 
     def after_swap(self, wait: Callable[[], None]) -> int:
-        """Time of the swap just asked for, host ns; `wait` returns once it is done, where the driver does not say."""
+        """Time of the swap just asked for, host ns; `wait` returns once it is done, where the
+        driver does not say.
+        """
         if self._sync is not None:
             swap_ns = self._sync.swap_ns()
             if swap_ns is not None and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS:
@@ -191,7 +210,9 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
 
 @dataclass(frozen=True, slots=True)
 class BackBuffer:
-    """A back buffer: bits of each colour (the fewest of the three), and samples of a pixel (0 or 1: one)."""
+    """A back buffer: bits of each colour (the fewest of the three), and samples of a pixel (0 or
+    1: one).
+    """
 
     bits: int
     samples: int
@@ -221,7 +242,9 @@ def has_extension(x_display: int | None, name: bytes) -> bool:
 
 
 def is_composited(x_display: int | None) -> bool:
-    """True where a compositing manager owns the screen (ICCCM selection _NET_WM_CM_S0); it may delay frames."""
+    """True where a compositing manager owns the screen (ICCCM selection _NET_WM_CM_S0); it may
+    delay frames.
+    """
     if not x_display:
         return False
     try:

@@ -1,4 +1,5 @@
-"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors.
+"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the
+bench's own errors.
 
 Lock is availability, acquisition and loss: which of the answers that were due came.
 """
@@ -50,7 +51,9 @@ MAX_CYCLES = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """A time without right answers: its start in run time and its length, s; `lost` if longer than LOST_CYCLES."""
+    """A time without right answers: its start in run time and its length, s; `lost` if longer
+    than LOST_CYCLES.
+    """
 
     start_s: float
     length_s: float
@@ -61,7 +64,9 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """The run time, s, at which a sky appeared, and the wait for the first right answer; None if none came before it went."""
+    """The run time, s, at which a sky appeared, and the wait for the first right answer; None if
+    none came before it went.
+    """
 
     start_s: float
     wait_s: float | None
@@ -98,7 +103,9 @@ class Lock:
 
 
 def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: BoolArray) -> Lock:
-    """The lock over rows at rising run times (n,): right answers, wrong ones, and rows without an answer."""
+    """The lock over rows at rising run times (n,): right answers, wrong ones, and rows without
+    an answer.
+    """
     cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
     cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
     due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
@@ -140,14 +147,17 @@ MIN_PAIRS = 8
 SEED = 0  # the bootstrap's seed: the same files give the same intervals
 SMALL = 0.3  # share of the noise above which the display's own error gets a note
 BENT_ARCSEC = 0.1
-TOGETHER, SLOW_SHARE = 20, 0.1  # noise that lasts for so many answers gets a note from this share of the variance on
+# noise that lasts for so many answers gets a note from this share of the variance on
+TOGETHER, SLOW_SHARE = 20, 0.1
 CLOCK_SET = "the tracker's clock was set during the run: its answers are placed by their arrivals, not by their stamps"
-SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3  # answers whose median shift against their arrivals is compared with the next ones'
+# answers whose median shift against their arrivals is compared with the next ones'
+SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3
 
 
 @dataclass(frozen=True, slots=True)
 class AssessSettings:
-    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the display is tested.
+    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the
+    display is tested.
 
     Without a `stamp` it is the bench file's for its own answers, and the middle for a file's.
     """
@@ -179,12 +189,16 @@ class RunLedger:
         return Scale(1e3 * tracker.focal_length_mm / tracker.pixel_pitch_um, (width, height))
 
     def bench_file(self) -> BenchFile:
-        """The bench by its text in the ledger; the files that it names have to be where they were. Raises InputError."""
+        """The bench by its text in the ledger; the files that it names have to be where they
+        were. Raises InputError.
+        """
         return bench_file_of(Path(self.head.get("bench_file", "bench.toml")), self.head.get("bench_text", ""))
 
 
 def read_ledger(path: Path) -> RunLedger:
-    """Read a ledger. Raises InputError for a file that is none, for damage, and for a run without attitudes or bench file."""
+    """Read a ledger. Raises InputError for a file that is none, for damage, and for a run
+    without attitudes or bench file.
+    """
     head, run = read_head(path), read_commanded(path)
     shown = run.commanded.shown
     if shown.sum() < 2:
@@ -193,14 +207,17 @@ def read_ledger(path: Path) -> RunLedger:
     config = config_of(head)
     if config is None:
         raise InputError(f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger")
-    # A moment stands for an exposure about it; a refresh period more, for it is known to some milliseconds.
+    # A moment stands for an exposure about it; a refresh period more, for it is known to some
+    # milliseconds.
     reach_s = config.tracker.exposure_s / 2 + 1 / config.monitor.refresh_hz
     return RunLedger(path, head, config, replace(run, commanded=run.commanded.over_exposures(reach_s)))
 
 
 @dataclass(frozen=True, slots=True)
 class WrongAnswer:
-    """An answer that is no attitude of this sky: its row, its own time and the run's, s, and its error."""
+    """An answer that is no attitude of this sky: its row, its own time and the run's, s, and its
+    error.
+    """
 
     row: int
     t_s: float
@@ -210,9 +227,11 @@ class WrongAnswer:
 
 @dataclass(frozen=True)
 class Assessment:
-    """The whole assessment. `noise_arcsec` excludes the display's own error where the answers show it.
+    """The whole assessment. `noise_arcsec` excludes the display's own error where the answers show
+    it.
 
-    `limit_arcsec` is the smallest noise that the tracker's stars allow, None where the bench cannot be read.
+    `limit_arcsec` is the smallest noise that the tracker's stars allow, None where the bench cannot
+    be read.
 
     `offset_s` is the tracker's clock minus the run's at the run's start.
     """
@@ -248,10 +267,12 @@ class Assessment:
 
 
 class LedgerAnswers(NamedTuple):
-    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of the run's, as known live.
+    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of
+    the run's, as known live.
 
-    `centroids` are the stars that each of them holds. They are sorted by their times; `out_of_order` counts those that came
-    after a later one. `clock_set` says that the tracker's clock was set in the run, and that arrivals count instead.
+    `centroids` are the stars that each of them holds. They are sorted by their times;
+    `out_of_order` counts those that came after a later one. `clock_set` says that the tracker's
+    clock was set in the run, and that arrivals count instead.
     """
 
     telemetry: Telemetry
@@ -263,7 +284,9 @@ class LedgerAnswers(NamedTuple):
 
 
 def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
-    """The answers that a run recorded, by the tracker's own times where it sends any. Raises InputError where it has none."""
+    """The answers that a run recorded, by the tracker's own times where it sends any. Raises
+    InputError where it has none.
+    """
     records = list(answer_records(ledger))
     if not any(record.valid and record.q is not None for record in records):
         has = f"{len(records)} answers, none of them with an attitude" if records else "no answers of a tracker"
@@ -286,7 +309,9 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
 
 
 def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
-    """When each answer (n,) looked, on the run's clock, ns, as it was known live; of one not judged by the others' delay."""
+    """When each answer (n,) looked, on the run's clock, ns, as it was known live; of one not
+    judged by the others' delay.
+    """
     judged = [record for record in records if record.verdict != "unjudged"]
     late_ns = [record.host_ns - record.middle_ns for record in judged]
     usual_ns = int(np.median(late_ns)) if late_ns else 0
@@ -296,7 +321,9 @@ def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
 
 
 def _clock_was_set(t_ns: IntArray, host_ns: IntArray) -> bool:
-    """Whether stamps (n,) step against arrivals (n,) for good; where an answer was overtaken the next one is as before."""
+    """Whether stamps (n,) step against arrivals (n,) for good; where an answer was overtaken the
+    next one is as before.
+    """
     blocks = len(t_ns) // SET_BLOCK
     if blocks < 2:
         return False
@@ -307,7 +334,9 @@ def _clock_was_set(t_ns: IntArray, host_ns: IntArray) -> bool:
 
 
 def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings) -> Assessment:
-    """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a fault of either."""
+    """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a
+    fault of either.
+    """
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
     centroids: Sequence[Centroids] = ()
@@ -318,7 +347,8 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         base_ns, telemetry = zero_ns + ahead_ns, ledger
     else:
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
-        # The telemetry's times from the run's zero where the two overlap, else from their own first.
+        # The telemetry's times from the run's zero where the two overlap, else from their own
+        # first.
         overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
         base_ns = zero_ns if overlap else int(answers.t_ns[0])
     base_s = (base_ns - zero_ns) / NS_PER_S
@@ -382,7 +412,9 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
 
 
 def _glass_of(file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroids]) -> tuple[GlassCost | None, list[str]]:
-    """What the glass costs, by the stars of the right answers where these have enough; a note where the PSF file tells it."""
+    """What the glass costs, by the stars of the right answers where these have enough; a note
+    where the PSF file tells it.
+    """
     turned = multiply(from_rotation_vector(found.bias_arcsec / ARCSEC_PER_RAD), found.commanded_q)
     cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
     if cost is None or cost.source != FILE:
@@ -394,7 +426,8 @@ def _glass_of(file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroi
 def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArray) -> CoarseClock:
     """Where valid answers (n, 4) at times (n,) lie on the run's clock.
 
-    Raises InputError for other conventions than hilstar's, for another frame, and for answers of another run.
+    Raises InputError for other conventions than hilstar's, for another frame, and for answers of
+    another run.
     """
     commanded = run.commanded
     coarse = coarse_offset(commanded, tau_s, q)
@@ -464,7 +497,8 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
             "the run turns at a constant rate: an offset of the clock cannot be told from a bias along the motion, and is taken"
             f" to be {1e3 * clock.offset_s:.3g} ms beside the rough one"
         )
-    # A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off the middle's attitude.
+    # A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off
+    # the middle's attitude.
     step_s = np.diff(clock.t_s[found.row])
     near = step_s < 1.0
     if len(found.row) >= MIN_ROWS and near.any():
@@ -472,7 +506,8 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
         bent = float(np.percentile(change / step_s[near], 99)) * run.config.tracker.exposure_s**2 / 24
         if bent >= BENT_ARCSEC:
             notes.append(f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec")
-    # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the bumps do.
+    # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the
+    # bumps do.
     rows = len(parts.left) // TOGETHER * TOGETHER
     if rows >= MIN_ROWS * TOGETHER:
         means = parts.left[:rows].reshape(-1, TOGETHER, 3).mean(axis=1)

@@ -1,9 +1,11 @@
-"""How the error depends on the frame: the field's rate, its brightness, and the display's own error.
+"""How the error depends on the frame: the field's rate, its brightness, and the display's own
+error.
 
-For the display's own error, the twin's noiseless tracker looks at the display and at the sky, at attitudes of the run. A star's
-place differs between the two: codes are too coarse for a place between pixels, or the true lens is not the assumed one. The
-display's attitude error is the small rotation e that turns the sky's directions v into the shown ones, v + e x v. Stars are
-weighted by their light.
+For the display's own error, the twin's noiseless tracker looks at the display and at the sky, at
+attitudes of the run. A star's place differs between the two: codes are too coarse for a place
+between pixels, or the true lens is not the assumed one. The display's attitude error is the small
+rotation e that turns the sky's directions v into the shown ones, v + e x v. Stars are weighted by
+their light.
 """
 
 import math
@@ -31,19 +33,23 @@ from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.tracker.centroiders import star_places
 
 BINS, MIN_IN_BIN = 5, 20
-FIELDS = 400  # attitudes at which the field's light is summed; other answers take the nearest of them
+# attitudes at which the field's light is summed; other answers take the nearest of them
+FIELDS = 400
 LIMIT_FIELDS = 12  # attitudes whose stars tell the limit of the noise
 MIN_STARS = 3
 Centroids = Sequence[tuple[float, float, float | None, int | None]]
 FILE = "PSF file"
 SEEN_FIELDS, WRONG_SHARE = 400, 5.0
-GLASS_FIELDS, GLASS_STARS = 40, 20  # attitudes, and the brightest stars of each, that tell a glass's part
+# attitudes, and the brightest stars of each, that tell a glass's part
+GLASS_FIELDS, GLASS_STARS = 40, 20
 SURE = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """Answers between two values of a quantity: count, noise (one sigma) and whole error (rms about the bias), arcsec."""
+    """Answers between two values of a quantity: count, noise (one sigma) and whole error (rms
+    about the bias), arcsec.
+    """
 
     low: float
     high: float
@@ -55,7 +61,8 @@ class Slice:
 
 
 def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: float) -> tuple[Slice, ...]:
-    """Up to five slices with equal numbers of answers, by a value (n,), of noise (n, 3) and errors about the bias (n, 3).
+    """Up to five slices with equal numbers of answers, by a value (n,), of noise (n, 3) and errors
+    about the bias (n, 3).
 
     `freedom` is the number of degrees of freedom that the fits took.
     """
@@ -82,9 +89,11 @@ def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: f
 
 
 def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
-    """The V magnitude of all catalogued light in the field, sampled along attitudes (n, 4); NaN without a star.
+    """The V magnitude of all catalogued light in the field, sampled along attitudes (n, 4); NaN
+    without a star.
 
-    The precision of an attitude grows with the light of all stars together. Raises InputError for a wrong catalogue.
+    The precision of an attitude grows with the light of all stars together. Raises InputError for a
+    wrong catalogue.
     """
     stars = bench_stars(file.config, file.folder)
     camera = tracker_camera(file.config.tracker, file.folder)
@@ -106,7 +115,8 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
 
 
 def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
-    """The smallest noise of an answer by the bench's tracker (Cramer and Rao): the median along attitudes (n, 4).
+    """The smallest noise of an answer by the bench's tracker (Cramer and Rao): the median along
+    attitudes (n, 4).
 
     One exposure at rest, arcsec; None for fields of too few stars. Raises InputError.
     """
@@ -116,7 +126,8 @@ def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
 
 
 def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
-    """The display's attitude errors (n, 3), arcsec, cam axes, at attitudes (n, 4); NaN where it shows too few stars.
+    """The display's attitude errors (n, 3), arcsec, cam axes, at attitudes (n, 4); NaN where it
+    shows too few stars.
 
     Raises InputError for a bench that cannot be built, and MachineError without OpenGL.
     """
@@ -136,7 +147,9 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
 
 
 def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> FloatArray:
-    """The small rotation (3,), rad, that turns unit vectors (n, 3) into others with the smallest weighted error."""
+    """The small rotation (3,), rad, that turns unit vectors (n, 3) into others with the smallest
+    weighted error.
+    """
     cross = np.zeros((len(true), 3, 3))  # e x v = -[v] e
     x, y, z = true.T
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
@@ -148,10 +161,12 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
 
 @dataclass(frozen=True, slots=True)
 class GlassCost:
-    """What glass does to the places of stars, by the centroids that answers hold (`source`), or else by the bench's PSF file.
+    """What glass does to the places of stars, by the centroids that answers hold (`source`), or
+    else by the bench's PSF file.
 
-    `rms_px` and `fov_arcsec` have all of it (`total`), and what each correction would leave: a distortion file, one by
-    catalogue colour, both. `fov_arcsec` is the attitude's error about its mean over `attitudes`, one sigma.
+    `rms_px` and `fov_arcsec` have all of it (`total`), and what each correction would leave: a
+    distortion file, one by catalogue colour, both. `fov_arcsec` is the attitude's error about its
+    mean over `attitudes`, one sigma.
     """
 
     source: str
@@ -171,7 +186,9 @@ class GlassCost:
 
 
 def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
-    """The glass's part of the field-of-view error along attitudes (n, 4); None without a glass, or with too few stars."""
+    """The glass's part of the field-of-view error along attitudes (n, 4); None without a glass,
+    or with too few stars.
+    """
     tracker, fields = file.config.tracker, []
     psf, camera = tracker_psf(tracker, file.folder), tracker_camera(tracker, file.folder)
     if not isinstance(psf, GlassPsf):
@@ -192,7 +209,8 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
 
 
 def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]) -> GlassCost | None:
-    """The same by the stars that answers name, [x_px, y_px, dn, hip], against the bench's camera at their attitudes (n, 4).
+    """The same by the stars that answers name, [x_px, y_px, dn, hip], against the bench's camera at
+    their attitudes (n, 4).
 
     The tracker's noise is in it. None for too few stars.
     """
@@ -207,7 +225,8 @@ def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Ce
     if not fields:
         return None
     far_px = np.concatenate([np.hypot(*off.T) for _, off in fields])
-    usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)  # a star by another's name is no error of places
+    # a star by another's name is no error of places
+    usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)
     near = [np.hypot(*off.T) < usual_px for _, off in fields]
     kept = [(rows[good], off[good]) for (rows, off), good in zip(fields, near, strict=True) if good.sum() >= MIN_STARS]
     return _cost("answers' stars", "tracker", camera, kept)
@@ -216,7 +235,9 @@ def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Ce
 def _cost(
     source: str, kind: str, camera: Camera, fields: Sequence[tuple[npt.NDArray[np.void], FloatArray]]
 ) -> GlassCost | None:
-    """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for too few stars."""
+    """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for
+    too few stars.
+    """
     if sum(len(rows) for rows, _ in fields) < MIN_SPLIT_STARS:
         return None
     rows, errors = (np.concatenate(parts) for parts in zip(*fields, strict=True))
@@ -244,9 +265,11 @@ def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) 
 
 @dataclass(frozen=True, slots=True)
 class DisplayCost:
-    """The display's own error, one sigma across and about the boresight, arcsec, at `attitudes` of the run.
+    """The display's own error, one sigma across and about the boresight, arcsec, at `attitudes` of
+    the run.
 
-    `seen` is the share of it in the tracker's answers, with one sigma: 1 if the tracker looked at this display, 0 if not.
+    `seen` is the share of it in the tracker's answers, with one sigma: 1 if the tracker looked at
+    this display, 0 if not.
     """
 
     cross_arcsec: float
@@ -257,12 +280,16 @@ class DisplayCost:
 
     @property
     def subtracted(self) -> float:
-        """The share of the display's variance that is subtracted from the noise; 0 unless `seen` exceeds three sigma."""
+        """The share of the display's variance that is subtracted from the noise; 0 unless `seen`
+        exceeds three sigma.
+        """
         return min(self.seen, 1.0) ** 2 if self.seen > SURE * self.sigma_seen else 0.0
 
 
 def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCost | None:
-    """The cost from the display's errors (n, 3), NaN for none, and the tracker's noise (n, 3) at the same attitudes."""
+    """The cost from the display's errors (n, 3), NaN for none, and the tracker's noise (n, 3) at
+    the same attitudes.
+    """
     known = np.isfinite(error_arcsec).all(axis=1)
     if known.sum() < MIN_STARS:
         return None

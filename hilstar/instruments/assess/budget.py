@@ -1,4 +1,6 @@
-"""The error budget of a tracker, from a run's telemetry or from independent cases, with its 95 % intervals."""
+"""The error budget of a tracker, from a run's telemetry or from independent cases, with its 95 %
+intervals.
+"""
 
 from dataclasses import dataclass
 
@@ -18,12 +20,15 @@ BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # the bootstrap's blocks and draws
 COVERED = (2.5, 97.5)  # percent
 HALF_OF_95 = 1.96  # sigmas of a normal distribution
 UNUSUAL_SIGMAS = 5.0
-MAX_SPREAD_ARCSEC = 600.0  # one sigma; a larger spread is no star tracker but another run with a similar motion
+# one sigma; a larger spread is no star tracker but another run with a similar motion
+MAX_SPREAD_ARCSEC = 600.0
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """One sigma across the boresight (an axis) and about it, arcsec; None where it cannot be told."""
+    """One sigma across the boresight (an axis) and about it, arcsec; None where it cannot be
+    told.
+    """
 
     cross: float | None
     roll: float | None
@@ -31,7 +36,9 @@ class Axes:
 
 @dataclass(frozen=True, slots=True)
 class Intervals:
-    """95 % intervals, low and high, arcsec: the bias (2, 3), and each part across and about the boresight (2, 2)."""
+    """95 % intervals, low and high, arcsec: the bias (2, 3), and each part across and about the
+    boresight (2, 2).
+    """
 
     bias: FloatArray
     fov: FloatArray
@@ -43,9 +50,9 @@ class Intervals:
 class Decomposed:
     """A budget and its ingredients.
 
-    `row` (k,) are the indices of the right answers, `components` the parts of their residuals, `commanded_q` (k, 4) and
-    `rate_rad_s` (k, 3) the attitudes and rates commanded at them. `wrong` (m,) are the indices of answers that are no attitude
-    of this sky.
+    `row` (k,) are the indices of the right answers, `components` the parts of their residuals,
+    `commanded_q` (k, 4) and `rate_rad_s` (k, 3) the attitudes and rates commanded at them. `wrong`
+    (m,) are the indices of answers that are no attitude of this sky.
     """
 
     bias_arcsec: FloatArray
@@ -65,8 +72,8 @@ class Decomposed:
 class DecomposedRun(Decomposed):
     """The budget of a run, with the clock that was found together with the bias.
 
-    `held` (h,) are the indices of answers that looked while a frame was held for missed ones. They are in no figure, and wrong
-    only where they are further off than the field turned meanwhile.
+    `held` (h,) are the indices of answers that looked while a frame was held for missed ones. They
+    are in no figure, and wrong only where they are further off than the field turned meanwhile.
     """
 
     clock: ClockFit
@@ -76,10 +83,12 @@ class DecomposedRun(Decomposed):
 def assess_run(
     commanded: Commanded, tau_s: FloatArray, reported: FloatArray, coarse: CoarseClock, scale: Scale, rng: np.random.Generator
 ) -> DecomposedRun:
-    """The budget of answers (n, 4) at rising times (n,), s of the tracker's clock, against the attitudes that a run commanded.
+    """The budget of answers (n, 4) at rising times (n,), s of the tracker's clock, against the
+    attitudes that a run commanded.
 
-    `coarse` is where the telemetry lies on the run's clock (see `clock.coarse_offset`). Raises InputError for fewer than
-    MIN_ROWS answers while the sky was shown, and where half or more of them are wild.
+    `coarse` is where the telemetry lies on the run's clock (see `clock.coarse_offset`). Raises
+    InputError for fewer than MIN_ROWS answers while the sky was shown, and where half or more of
+    them are wild.
     """
     clock = ClockSolver(commanded, tau_s, reported, scale).fit(coarse)
     known, held = clock.moments.known, clock.moments.known & (clock.moments.held_s > 0)
@@ -118,9 +127,11 @@ def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
 def assess_cases(
     commanded: FloatArray, reported: FloatArray, scale: Scale, rng: np.random.Generator, rate_rad_s: FloatArray | None = None
 ) -> Decomposed:
-    """The budget of cases: reported attitudes (n, 4), NaN where there is none, against the commanded ones (n, 4).
+    """The budget of cases: reported attitudes (n, 4), NaN where there is none, against the
+    commanded ones (n, 4).
 
-    `rate_rad_s` (n, 3), cam, is the rate of each case. Raises InputError for fewer than MIN_ROWS answers, or half of them wild.
+    `rate_rad_s` (n, 3), cam, is the rate of each case. Raises InputError for fewer than MIN_ROWS
+    answers, or half of them wild.
     """
     known = np.asarray(np.isfinite(reported).all(axis=1) & np.isfinite(commanded).all(axis=1))
     if known.sum() < MIN_ROWS:
@@ -139,7 +150,9 @@ def assess_cases(
 def _right_answers(
     error_arcsec: FloatArray, q: FloatArray, used: npt.NDArray[np.bool_], scale: Scale
 ) -> tuple[IntArray, Components]:
-    """The indices (k,) of the right answers among those used (n,), and the components of their errors."""
+    """The indices (k,) of the right answers among those used (n,), and the components of their
+    errors.
+    """
     row = np.flatnonzero(used)
     parts = components_of(error_arcsec[row], q[row], scale)
     stray = _stray(parts, error_arcsec[row])
@@ -170,7 +183,9 @@ def _decomposed(
 
 
 def _stray(parts: Components, error_arcsec: FloatArray) -> npt.NDArray[np.bool_]:
-    """Answers (k,) far outside the noise and the errors as a whole: among few answers the fit alone can be far off."""
+    """Answers (k,) far outside the noise and the errors as a whole: among few answers the fit
+    alone can be far off.
+    """
     sigma = np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2))
     off = error_arcsec - np.median(error_arcsec, axis=0)
     usual = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
@@ -189,9 +204,11 @@ def _told(part: Component) -> Axes:
 
 
 def intervals_of(parts: Components, rng: np.random.Generator, sigma_bias_arcsec: FloatArray | None = None) -> Intervals:
-    """The intervals of components by the block bootstrap (Kuensch 1989): errors of neighbouring answers go together.
+    """The intervals of components by the block bootstrap (Kuensch 1989): errors of neighbouring
+    answers go together.
 
-    `sigma_bias_arcsec` (3,) is the smallest uncertainty of the bias, where the clock was found together with it.
+    `sigma_bias_arcsec` (3,) is the smallest uncertainty of the bias, where the clock was found
+    together with it.
     """
     left, fov, pixel = parts.left, parts.fov, parts.pixel
     n = len(left)
@@ -222,6 +239,8 @@ def intervals_of(parts: Components, rng: np.random.Generator, sigma_bias_arcsec:
 
 
 def _covered(variance: FloatArray) -> FloatArray:
-    """Low and high of one sigma across and about the boresight, (2, 2), from drawn variances (draws, 3)."""
+    """Low and high of one sigma across and about the boresight, (2, 2), from drawn variances
+    (draws, 3).
+    """
     axes = np.sqrt(np.stack([variance[:, :2].mean(axis=1), variance[:, 2]], axis=1))
     return np.asarray(np.percentile(axes, COVERED, axis=0))

@@ -1,21 +1,25 @@
-"""The tracker's clock against the run's: a coarse offset from angular speeds, then clock and bias together.
+"""The tracker's clock against the run's: a coarse offset from angular speeds, then clock and bias
+together.
 
-**Coarse**, to some tenths of a second. The angular speed of an attitude is the same in every convention of axes and
-quaternions. So the speeds of the run and of the telemetry are correlated at every offset at once, by Fourier transforms; where
-the speed does not vary, the attitudes themselves are compared. The best offset is the one at which the rotation from commanded
-to reported attitudes is most nearly constant. Of offsets as good as that, zero is preferred, then the smallest rotation.
+**Coarse**, to some tenths of a second. The angular speed of an attitude is the same in every
+convention of axes and quaternions. So the speeds of the run and of the telemetry are correlated at
+every offset at once, by Fourier transforms; where the speed does not vary, the attitudes themselves
+are compared. The best offset is the one at which the rotation from commanded to reported attitudes
+is most nearly constant. Of offsets as good as that, zero is preferred, then the smallest rotation.
 
-**Fine.** With tau the telemetry's time and t the run's, tau = t + o + d (t - t_0). Reading the run at t' = t + delta adds omega
-delta to the residual e of T C(t')*, so that
+**Fine.** With tau the telemetry's time and t the run's, tau = t + o + d (t - t_0). Reading the run
+at t' = t + delta adds omega delta to the residual e of T C(t')*, so that
 
     e_i = b + omega_i (delta_0 + delta_1 s_i) + f(place_i) + n_i,        s = (t - t_0) / T
 
-is linear in bias and clock. They are first fitted robustly without f (Tukey's weights: Beaton and Tukey 1974). Then f is a
-random function of the place, a sum of bumps of variance kappa sigma^2, with the kappa and the spacing under which the residuals
-are most likely. Bias and clock are the generalised least squares estimate (Aitken 1935) under its covariance. So an error that
-repeats with the place is not taken for a clock, and a clock not for such an error.
+is linear in bias and clock. They are first fitted robustly without f (Tukey's weights: Beaton and
+Tukey 1974). Then f is a random function of the place, a sum of bumps of variance kappa sigma^2,
+with the kappa and the spacing under which the residuals are most likely. Bias and clock are the
+generalised least squares estimate (Aitken 1935) under its covariance. So an error that repeats with
+the place is not taken for a clock, and a clock not for such an error.
 
-An answer whose exposure touches a frame that was held for missed ones saw another sky than the commanded one. It is in no fit.
+An answer whose exposure touches a frame that was held for missed ones saw another sky than the
+commanded one. It is in no fit.
 """
 
 from dataclasses import dataclass
@@ -38,9 +42,11 @@ TRIED = 12  # offsets tried
 COMPARED = 400  # attitudes compared at each
 STARTS = 40  # rotations that are tried as the one with half of all nearest to it
 SCANNED = 3000  # offsets of the scan by attitudes
-AS_GOOD, SMALL_RAD = 1.2, 1e-4  # a spread up to this factor and this angle above the smallest is as good
+# a spread up to this factor and this angle above the smallest is as good
+AS_GOOD, SMALL_RAD = 1.2, 1e-4
 OVERLAP_SHARE = 0.8  # offsets with a smaller share of the largest overlap are dropped
-TURN_RAD = np.radians(0.5)  # a tracker reports nearly the commanded attitude; a run that repeats itself elsewhere does not
+# a tracker reports nearly the commanded attitude; a run that repeats itself elsewhere does not
+TURN_RAD = np.radians(0.5)
 # Fine.
 CUT_SIGMAS = 8.0
 AGREE_ARCSEC = 3600.0  # an answer further from the others is of another sky, whatever their spread
@@ -58,10 +64,11 @@ KAPPAS = np.logspace(-5, 4, 37)
 
 @dataclass(frozen=True, slots=True)
 class CoarseClock:
-    """Seconds to add to the telemetry's times, and how nearly its attitudes then follow the commanded ones.
+    """Seconds to add to the telemetry's times, and how nearly its attitudes then follow the
+    commanded ones.
 
-    `rotation` (4,) leads from the commanded to the reported attitudes, half of which lie within `spread_rad` of it.
-    `compared` counts the attitudes with a commanded one.
+    `rotation` (4,) leads from the commanded to the reported attitudes, half of which lie within
+    `spread_rad` of it. `compared` counts the attitudes with a commanded one.
     """
 
     offset_s: float
@@ -76,7 +83,9 @@ class CoarseClock:
 
 
 def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> CoarseClock | None:
-    """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset gives an overlap."""
+    """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset
+    gives an overlap.
+    """
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
     t, q = t_s[few], reported[few]
     # Starts or ends together, and where speeds or attitudes agree.
@@ -97,7 +106,9 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
 
 
 def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> FloatArray:
-    """Offsets (k,), s, at which the angular speeds agree, best first, and zero. They hold in every convention."""
+    """Offsets (k,), s, at which the angular speeds agree, best first, and zero. They hold in
+    every convention.
+    """
     return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
 
 
@@ -126,7 +137,9 @@ def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offs
 
 
 def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
-    """The rotation among (n, 4) with half of all nearest to it, and the angle within which they lie, rad."""
+    """The rotation among (n, 4) with half of all nearest to it, and the angle within which they
+    lie, rad.
+    """
     chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
     cosine = np.abs(rotations @ rotations[chosen].T)
     # The chord is exact for tiny angles, where the cosine is not.
@@ -137,7 +150,9 @@ def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
-    """The offsets at which attitudes are nearest to the commanded ones, and the step of the scan."""
+    """The offsets at which attitudes are nearest to the commanded ones, and the step of the
+    scan.
+    """
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED // 4).astype(int))
     t, q = t_s[few], reported[few]
     reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
@@ -169,7 +184,9 @@ def _by_speed(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tu
 
 
 def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_s: float) -> FloatArray:
-    """The median angular speed, rad/s, in each bin of a grid, over turns of about one step; NaN in an empty bin."""
+    """The median angular speed, rad/s, in each bin of a grid, over turns of about one step; NaN
+    in an empty bin.
+    """
     bins = int(span_s / step_s) + 1
     after = np.searchsorted(t_s, t_s + step_s)
     inside = after < len(t_s)
@@ -192,7 +209,9 @@ def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How well b, begun `lag` bins after a, explains it: common bins times the information per bin; and the lags."""
+    """How well b, begun `lag` bins after a, explains it: common bins times the information per
+    bin; and the lags.
+    """
     size = fft.next_fast_len(len(a) + len(b), real=True)
     weight_a, weight_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
     # A wild pair of answers turns at any speed: speeds above twice the run's largest are clipped.
@@ -229,11 +248,12 @@ def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class ClockFit:
-    """The clock, the bias (a rotation (4,) from commanded to reported), and which answers (n,) are of this sky.
+    """The clock, the bias (a rotation (4,) from commanded to reported), and which answers (n,) are
+    of this sky.
 
-    `offset_s` is the telemetry's time minus the run's at the run's start, `drift` the excess rate of its clock, `sigma_*` one
-    sigma. `residual_arcsec` (n, 3), cam, is the error beyond bias and clock at the commanded `moments`; NaN where those are
-    not known.
+    `offset_s` is the telemetry's time minus the run's at the run's start, `drift` the excess rate
+    of its clock, `sigma_*` one sigma. `residual_arcsec` (n, 3), cam, is the error beyond bias and
+    clock at the commanded `moments`; NaN where those are not known.
     """
 
     offset_s: float
@@ -259,9 +279,11 @@ class ClockFit:
 
 
 class ClockSolver:
-    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded attitudes.
+    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded
+    attitudes.
 
-    t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]; `rotation` (4,) is the bias.
+    t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]; `rotation` (4,) is the
+    bias.
     """
 
     def __init__(self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale) -> None:
@@ -283,7 +305,8 @@ class ClockSolver:
         stretch = self.stretch_s / self.span_s
         sigma = np.sqrt(np.diag(covariance))
         return ClockFit(
-            offset_s=self.delay_s,  # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
+            # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
+            offset_s=self.delay_s,
             drift=stretch / (1 - stretch),
             sigma_offset_s=float(sigma[3]),
             sigma_drift=float(sigma[4]) / self.span_s,
@@ -296,7 +319,9 @@ class ClockSolver:
         )
 
     def _align(self, step: FloatArray | None = None) -> None:
-        """Take a step (5,) of bias, arcsec, delay and stretch, and find the run's times and the residuals there."""
+        """Take a step (5,) of bias, arcsec, delay and stretch, and find the run's times and the
+        residuals there.
+        """
         if step is not None:
             turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
             self.rotation = normalise(multiply(turn, self.rotation))
@@ -312,7 +337,9 @@ class ClockSolver:
         self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
 
     def _design(self, rows: BoolArray) -> FloatArray:
-        """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3, rows, 5), arcsec."""
+        """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3,
+        rows, 5), arcsec.
+        """
         omega = ARCSEC_PER_RAD * self.moments.rate_rad_s[rows]
         design = np.zeros((3, int(rows.sum()), 5))
         for axis in range(3):
@@ -327,7 +354,9 @@ class ClockSolver:
         return np.diag(precision), precision * np.array([0, 0, 0, delay_s - self.delay_s, -self.stretch_s])
 
     def _robust(self, begun_s: float) -> BoolArray:
-        """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not wild."""
+        """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not
+        wild.
+        """
         for _ in range(ROUNDS):
             rows, residual = self.free, self.residual[self.free]
             if rows.sum() < MIN_USED:
@@ -369,8 +398,8 @@ class ClockSolver:
 def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> FloatArray:
     """A covariance (5, 5) whose sigmas are at least those by which parts of the field differ.
 
-    `pulls` (n, 5) are the answers' terms in the normal equations. An error that lasts longer than the random function allows
-    pulls neighbours the same way (Liang and Zeger 1986).
+    `pulls` (n, 5) are the answers' terms in the normal equations. An error that lasts longer than
+    the random function allows pulls neighbours the same way (Liang and Zeger 1986).
     """
     centre = centres_of(place, PART_PX)
     _, part = cKDTree(centre).query(place)
@@ -382,7 +411,9 @@ def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> Floa
 
 
 def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """One sigma (3,) by the median deviation, and Tukey's weights (n,) of residuals (n, 3); 0 for a wild answer."""
+    """One sigma (3,) by the median deviation, and Tukey's weights (n,) of residuals (n, 3); 0
+    for a wild answer.
+    """
     off = residual_arcsec - np.median(residual_arcsec, axis=0)
     sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
     squared = ((off / sigma) ** 2).sum(axis=1)
@@ -392,9 +423,11 @@ def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Smooth:
-    """A random function of the place and white noise, with `kappa` (3,) and `variance` (3,), arcsec^2, of each axis.
+    """A random function of the place and white noise, with `kappa` (3,) and `variance` (3,),
+    arcsec^2, of each axis.
 
-    `turn` (p, p) and `square` (p,) are the eigenvectors and eigenvalues of the bumps' normal matrix.
+    `turn` (p, p) and `square` (p,) are the eigenvectors and eigenvalues of the bumps' normal
+    matrix.
     """
 
     bumps: sparse.csr_matrix | None
@@ -413,7 +446,9 @@ class Smooth:
 
 
 def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
-    """The spacing, and each axis's variances, under which residuals (n, 3) about their mean are most likely."""
+    """The spacing, and each axis's variances, under which residuals (n, 3) about their mean are
+    most likely.
+    """
     left = residual - residual.mean(axis=0)
     n = len(left)
     power = np.maximum((left**2).mean(axis=0), FLOOR_ARCSEC**2)

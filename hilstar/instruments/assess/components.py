@@ -1,25 +1,29 @@
 """The parts of residuals: field-of-view error, pixel error, and noise.
 
-Of residuals e_i (3 axes, arcsec) about their mean, the part that repeats with the star field's place in the field of view is
-a sum of bumps F c (see `places`). The part that repeats with its place within a pixel is a sum of waves P d. Both are fitted in
-turns until they hold, and the rest is noise. With r the rest, and p_F, p_P the degrees of freedom of the fits,
+Of residuals e_i (3 axes, arcsec) about their mean, the part that repeats with the star field's
+place in the field of view is a sum of bumps F c (see `places`). The part that repeats with its
+place within a pixel is a sum of waves P d. Both are fitted in turns until they hold, and the rest
+is noise. With r the rest, and p_F, p_P the degrees of freedom of the fits,
 
     sigma^2 = |r|^2 / (n - 1 - p_F - p_P),    fov^2 = (|F c|^2 - p_F sigma^2) / n,    pixel^2 = (|P d|^2 - p_P sigma^2) / n:
 
-a fit takes up its degrees of freedom's share of the noise. That share is subtracted, so that none of the three depends on how
-many functions were tried.
+a fit takes up its degrees of freedom's share of the noise. That share is subtracted, so that none
+of the three depends on how many functions were tried.
 
-**Waves.** A star of direction r is at f (R r)_x / (R r)_z on the detector, px from its middle. All stars near it move alike, so
-one direction gives the phase of the field, as far as the camera does not roll. Two families of functions are tried, and the one
-that explains more for its degrees of freedom is kept. The first is the harmonics of one direction's phase, the same over the
-whole run. Directions tried are the boresight at the start, in the middle and on average, the turn from the start as angles, and
-one that is searched for. The second is the harmonics of the phase of each place's own direction, with amplitudes that change
-from place to place, as they do where stars enter and leave the field.
+**Waves.** A star of direction r is at f (R r)_x / (R r)_z on the detector, px from its middle. All
+stars near it move alike, so one direction gives the phase of the field, as far as the camera does
+not roll. Two families of functions are tried, and the one that explains more for its degrees of
+freedom is kept. The first is the harmonics of one direction's phase, the same over the whole run.
+Directions tried are the boresight at the start, in the middle and on average, the turn from the
+start as angles, and one that is searched for. The second is the harmonics of the phase of each
+place's own direction, with amplitudes that change from place to place, as they do where stars enter
+and leave the field.
 
-**Search for the direction.** The phase of one direction makes a wave; that of another direction, eta px away, has another
-frequency as soon as the camera rolls. So short stretches of the run, in which the roll changes little, are correlated with the
-waves of a coarse grid of directions, and their powers are added. Grid and stretches are then refined by halves, until the whole
-run is one stretch.
+**Search for the direction.** The phase of one direction makes a wave; that of another direction,
+eta px away, has another frequency as soon as the camera rolls. So short stretches of the run, in
+which the roll changes little, are correlated with the waves of a coarse grid of directions, and
+their powers are added. Grid and stretches are then refined by halves, until the whole run is one
+stretch.
 """
 
 from collections.abc import Iterator
@@ -45,12 +49,15 @@ MAX_BUMPS = 1500
 MIN_EXTENT_PX = 40.0
 # Waves.
 HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
-SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))  # 89 % of a saw's power; two harmonics have 76 %
+# 89 % of a saw's power; two harmonics have 76 %
+SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))
 LOCAL_HARMONICS = ((1, 0), (0, 1))
 LOCAL_SPACINGS_PX = (160.0, 80.0, 40.0, 20.0)
 MAX_LOCAL = 3000
 MIN_EXTENT_OF_PIXEL_PX = 2.0
-APART = 0.5  # share of the waves' power that bumps must not explain, for pixel and field-of-view error to be told apart
+# share of the waves' power that bumps must not explain, for pixel and field-of-view error to be
+# told apart
+APART = 0.5
 HOPELESS = 0.5  # local waves below this share of the best are not refined
 SOUGHT = "the phase of the direction that the error follows best"
 SHARP = ", to its fifth harmonic"
@@ -58,7 +65,8 @@ EDGES = "jumps within a pixel"
 LOCAL = "phases from place to place"
 MAX_EDGES = 12
 EDGE_STEPS = 1024  # places within a pixel at which an edge is tried
-# Power that an edge must explain, in units of the noise's variance: the best of all places explained 33 in 300 runs of noise.
+# Power that an edge must explain, in units of the noise's variance: the best of all places
+# explained 33 in 300 runs of noise.
 SURE_OF_EDGE = 50.0
 # Search for a direction.
 MIN_FORWARD = 0.3  # smallest component along the boresight, for a place on the detector's plane
@@ -72,7 +80,8 @@ COARSE_ANSWERS, FINE_ANSWERS = 3000, 8000  # answers used, spread over the run
 
 @dataclass(frozen=True)
 class Component:
-    """A part of the error: its variance (3,), arcsec^2, the fit (n, 3), arcsec, and the fit's degrees of freedom.
+    """A part of the error: its variance (3,), arcsec^2, the fit (n, 3), arcsec, and the fit's
+    degrees of freedom.
 
     `reason` says why the part cannot be told, `detail` how it was found.
     """
@@ -86,7 +95,9 @@ class Component:
 
 @dataclass(frozen=True)
 class Components:
-    """The parts of residuals (n, 3), arcsec: mean (3,), two parts that repeat, noise variance (3,), the rest `left` (n, 3)."""
+    """The parts of residuals (n, 3), arcsec: mean (3,), two parts that repeat, noise variance
+    (3,), the rest `left` (n, 3).
+    """
 
     mean: FloatArray
     fov: Component
@@ -127,7 +138,9 @@ def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -
 
 
 def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector | None, str]:
-    """The finest bumps that the samples can tell apart and how they are spaced, or None and the reason."""
+    """The finest bumps that the samples can tell apart and how they are spaced, or None and the
+    reason.
+    """
     n = len(place)
     if extent_px < MIN_EXTENT_PX:
         return None, f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
@@ -144,7 +157,9 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
 def _waves(
     about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale, extent_px: float, bumps: Projector | None
 ) -> tuple[Projector | None, Component]:
-    """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can be told."""
+    """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can
+    be told.
+    """
     none = Component(NOTHING, np.zeros_like(about), 0.0)
     if extent_px < MIN_EXTENT_OF_PIXEL_PX:
         reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
@@ -179,7 +194,9 @@ def _waves(
 
 
 def _best_of(tried: "list[Phases]", about: FloatArray, freedom: float) -> "tuple[Projector | None, Component, Phases | None]":
-    """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise; None where none does."""
+    """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise;
+    None where none does.
+    """
     power, waves, best = 0.0, None, None
     found = Component(NOTHING, np.zeros_like(about), 0.0)
     # With answers enough those of an error that jumps from pixel to pixel are tried as well.
@@ -202,7 +219,9 @@ def _apart(columns: FloatArray, bumps: Projector) -> float:
 
 
 def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
-    """The power explained beyond noise, in units of the noise's variance; 0 where noise alone may explain as much."""
+    """The power explained beyond noise, in units of the noise's variance; 0 where noise alone
+    may explain as much.
+    """
     n, freedom = len(about), max(found.freedom, 1.0)
     noise = ((about - found.fitted) ** 2).sum(axis=0) / max(n - freedom - other_freedom, 1.0)
     excess = n * float((found.variance / np.maximum(noise, 1e-12)).sum())
@@ -214,7 +233,9 @@ def _surely(found: Component, about: FloatArray, other_freedom: float, sure: flo
 
 @dataclass(frozen=True)
 class Phases:
-    """The place (n, 2), px, of a direction that stands for the field's place within a pixel, and its name in words."""
+    """The place (n, 2), px, of a direction that stands for the field's place within a pixel, and
+    its name in words.
+    """
 
     name: str
     place_px: FloatArray
@@ -226,10 +247,12 @@ class Phases:
 
 
 def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
-    """Saws (n, m) of the place within a pixel that explain most of residuals (n, 3) beyond a base (n, k) of harmonics.
+    """Saws (n, m) of the place within a pixel that explain most of residuals (n, 3) beyond a base
+    (n, k) of harmonics.
 
-    They are added one after another (orthogonal matching pursuit: Pati et al. 1993) while each is above SURE_OF_EDGE. A jump
-    is a saw and something smooth, so a few saws and harmonics make any function that is smooth but for a few jumps.
+    They are added one after another (orthogonal matching pursuit: Pati et al. 1993) while each is
+    above SURE_OF_EDGE. A jump is a saw and something smooth, so a few saws and harmonics make any
+    function that is smooth but for a few jumps.
     """
     columns = base
     n = len(about)
@@ -299,7 +322,9 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
 
 
 def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) -> FloatArray | None:
-    """The direction (3,), ICRS, whose waves explain most of residuals (n, 3); None if the boresights share no half sky."""
+    """The direction (3,), ICRS, whose waves explain most of residuals (n, 3); None if the
+    boresights share no half sky.
+    """
     boresight = axes[:, 2]
     mean = boresight.mean(axis=0)
     size = float(np.linalg.norm(mean))
@@ -332,9 +357,12 @@ def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) 
 
 
 def _wave_power(value: FloatArray, axes: FloatArray, directions: FloatArray, scale: Scale, start: IntArray) -> FloatArray:
-    """The power (k,) of each direction's waves in values (n, 3), summed over stretches that begin at `start` (m,)."""
+    """The power (k,) of each direction's waves in values (n, 3), summed over stretches that
+    begin at `start` (m,).
+    """
     power = np.zeros(len(directions))
-    # Components lie one after the other, each of all rows: products and sums of 3000 rows take a quarter less.
+    # Components lie one after the other, each of all rows: products and sums of 3000 rows take a
+    # quarter less.
     value, axes = np.ascontiguousarray(value.T), axes.reshape(-1, 3)
     for k, direction in enumerate(directions):
         seen = (axes @ direction).reshape(-1, 3).T
@@ -346,7 +374,8 @@ def _wave_power(value: FloatArray, axes: FloatArray, directions: FloatArray, sca
 
 
 def _stretches(roll_rad: FloatArray, cell_px: float, answers: int) -> tuple[IntArray, IntArray]:
-    """Stretches whose phase holds over a cell, spread over the run with about so many answers together.
+    """Stretches whose phase holds over a cell, spread over the run with about so many answers
+    together.
 
     Their first answers (m,) among the rows (n,) that they have.
     """

@@ -1,9 +1,10 @@
 """The place of a star field in the field of view, and smooth functions of that place.
 
-A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x axis times the usual distance
-of a star from the boresight. The distance of two places is how far the field moves on the detector between the two attitudes,
-so that the same attitude is the same place however the run got there. A smooth function of the place is a sum of bumps
-(Wendland 1995), a `spacing` apart wherever the run has been.
+A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x
+axis times the usual distance of a star from the boresight. The distance of two places is how far
+the field moves on the detector between the two attitudes, so that the same attitude is the same
+place however the run got there. A smooth function of the place is a sum of bumps (Wendland 1995), a
+`spacing` apart wherever the run has been.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD
 
 ROLL_SHARE = 0.3  # usual distance of a star from the boresight, in sides of the detector
-REACH = 2.5  # radius of a bump, in spacings: a sine of four spacings or longer is then fitted to 1 %
+# radius of a bump, in spacings: a sine of four spacings or longer is then fitted to 1 %
+REACH = 2.5
 CLOSE = 0.7  # bumps nearer than this, in spacings, are one
 RIDGE = 1e-7  # share of the mean diagonal, for bumps that few samples tell apart
 
@@ -49,7 +51,8 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
     """Centres (p, 6) about a spacing apart that cover the places (n, 6)."""
     cell = np.floor(place / spacing_px).astype(np.int64)
     _, first, inverse = np.unique(_numbers(cell), return_index=True, return_inverse=True)
-    inverse = np.argsort(np.argsort(first))[inverse]  # cells in the order in which they were first seen
+    # cells in the order in which they were first seen
+    inverse = np.argsort(np.argsort(first))[inverse]
     count = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, column) for column in place.T], axis=1) / count[:, None]
     kept = np.ones(len(mean), dtype=bool)
@@ -60,10 +63,13 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
 
 
 def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """A number (n,) for each cell (n, 6): a multiplicative hash without collisions among thousands of cells."""
+    """A number (n,) for each cell (n, 6): a multiplicative hash without collisions among
+    thousands of cells.
+    """
     mixed = np.zeros(len(cell), dtype=np.uint64)
     for column in (cell - cell.min(axis=0)).T.astype(np.uint64):
-        mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 1998, 6.4)
+        # 2^64 over the golden ratio (Knuth 1998, 6.4)
+        mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
     return mixed.astype(np.int64)
 
@@ -82,7 +88,8 @@ def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> sparse
 
 
 class Projector:
-    """Least squares fits by the columns of a sparse matrix (n, p), with a ridge too small to matter.
+    """Least squares fits by the columns of a sparse matrix (n, p), with a ridge too small to
+    matter.
 
     `freedom` is the number of degrees of freedom that a fit takes.
     """

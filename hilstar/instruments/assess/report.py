@@ -1,4 +1,6 @@
-"""An assessment for its readers: the JSON object, tables, lines on the terminal, and one page with charts."""
+"""An assessment for its readers: the JSON object, tables, lines on the terminal, and one page
+with charts.
+"""
 
 from collections.abc import Iterator
 from dataclasses import astuple, fields
@@ -28,7 +30,8 @@ AXES = ("x", "y", "about the boresight")
 def budget_of(found: Assessment) -> dict[str, Any]:
     """The JSON object of `hilstar assess`.
 
-    `clock` is the tracker's minus the run's at the run's start, and its excess rate; null where the motion does not tell.
+    `clock` is the tracker's minus the run's at the run's start, and its excess rate; null where the
+    motion does not tell.
     """
     parts, clock = found.found, found.found.clock
     return {
@@ -52,7 +55,9 @@ def budget_of(found: Assessment) -> dict[str, Any]:
 
 
 def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]:
-    """How much of the tracker's bias the bench could have made: how far it may be off at 95 %, and that over the bias."""
+    """How much of the tracker's bias the bench could have made: how far it may be off at 95 %,
+    and that over the bias.
+    """
     bias = np.abs(parts.bias_arcsec)
     found: dict[str, Any] = {"certificate": certificate.number, "off_arcsec": None, "share_of_bias": None}
     if certificate.attitude_arcsec is not None:
@@ -75,7 +80,9 @@ class FigureRow(NamedTuple):
 
 
 def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRow]:
-    """The rows of bias, field-of-view error, pixel error and noise; without values where `parts` is None."""
+    """The rows of bias, field-of-view error, pixel error and noise; without values where `parts`
+    is None.
+    """
     for k, axis in enumerate("xyz"):
         value = None if parts is None else float(parts.bias_arcsec[k])
         yield FigureRow("bias", axis, value, "arcsec", *([] if parts is None else parts.intervals.bias[:, k].tolist()))

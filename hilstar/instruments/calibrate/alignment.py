@@ -1,10 +1,12 @@
-"""From pairs of attitudes to a geometry file: the rotation between them, taken out of `q_cam_to_mon`.
+"""From pairs of attitudes to a geometry file: the rotation between them, taken out of
+`q_cam_to_mon`.
 
-The screen shows the star at v (ICRS) where the camera Q C v has it, with C the commanded attitude and Q the file's
-q_cam_to_mon; the tracker, which truly stands at Q', sees it in the direction Q'* Q C v, and so reports T = Q'* Q C. The
-rotation M = T C* of all pairs is then Q'* Q, and Q' = Q M*.
+The screen shows the star at v (ICRS) where the camera Q C v has it, with C the commanded attitude
+and Q the file's q_cam_to_mon; the tracker, which truly stands at Q', sees it in the direction Q'* Q
+C v, and so reports T = Q'* Q C. The rotation M = T C* of all pairs is then Q'* Q, and Q' = Q M*.
 
-The residual is judged by attitudes that were repeated: their scatter is noise, and what exceeds it no rotation explains.
+The residual is judged by attitudes that were repeated: their scatter is noise, and what exceeds it
+no rotation explains.
 """
 
 import datetime
@@ -59,9 +61,11 @@ class AxesArcsec:
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """The residual of the pairs used: the whole, the scatter of repeated attitudes (None without any), and the excess over it.
+    """The residual of the pairs used: the whole, the scatter of repeated attitudes (None without
+    any), and the excess over it.
 
-    `unexplained` is 0 where the repeats' scatter explains the whole; `causes` are lines that name a likely cause.
+    `unexplained` is 0 where the repeats' scatter explains the whole; `causes` are lines that name a
+    likely cause.
     """
 
     rms: AxesArcsec
@@ -73,9 +77,11 @@ class Residual:
 
 @dataclass(frozen=True, slots=True)
 class Aligned:
-    """The rotation from the commanded to the reported attitudes, and the alignment that takes it out.
+    """The rotation from the commanded to the reported attitudes, and the alignment that takes it
+    out.
 
-    `camera` is the bench's present geometry. `wild` are the lines of the file whose pairs do not fit the rotation.
+    `camera` is the bench's present geometry. `wild` are the lines of the file whose pairs do not
+    fit the rotation.
     """
 
     pairs: Pairs
@@ -95,13 +101,17 @@ class Aligned:
 
     @property
     def rotation_arcsec(self) -> tuple[float, float, float]:
-        """The rotation vector from the commanded to the reported attitude, cam axes: x, y, and z about the boresight."""
+        """The rotation vector from the commanded to the reported attitude, cam axes: x, y, and z
+        about the boresight.
+        """
         x, y, z = (ARCSEC_PER_RAD * to_rotation_vector(self.fit.q)).tolist()
         return x, y, z
 
 
 def align_files(file: BenchFile, table: Path, ledger: Path | None, offset_s: float) -> Aligned:
-    """Align a bench by a table of pairs, or by the telemetry of a run with its ledger. Raises InputError."""
+    """Align a bench by a table of pairs, or by the telemetry of a run with its ledger. Raises
+    InputError.
+    """
     pairs = read_pairs(table) if ledger is None else pair_with_ledger(table, ledger, offset_s)
     return align(pairs, bench_camera(file.config, file.folder))
 
@@ -109,7 +119,8 @@ def align_files(file: BenchFile, table: Path, ledger: Path | None, offset_s: flo
 def align(pairs: Pairs, camera: Camera) -> Aligned:
     """Find the alignment of a tracker behind the monitor's `camera`.
 
-    Raises InputError, with the cure, for too few pairs, other conventions, and half or more of wild ones.
+    Raises InputError, with the cure, for too few pairs, other conventions, and half or more of wild
+    ones.
     """
     if len(pairs) < MIN_PAIRS:
         skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
@@ -143,7 +154,9 @@ def corrected(q_cam_to_mon: FloatArray, q_commanded_to_reported: FloatArray) -> 
 
 
 def groups_of(commanded: FloatArray) -> IntArray:
-    """The group (n,) of each commanded attitude (n, 4); attitudes within SAME_ATTITUDE have one group."""
+    """The group (n,) of each commanded attitude (n, 4); attitudes within SAME_ATTITUDE have one
+    group.
+    """
     largest = np.argmax(np.abs(commanded), axis=1)
     sign = np.sign(np.take_along_axis(commanded, largest[:, None], axis=1))
     rounded = np.round(commanded * sign / SAME_ATTITUDE).astype(np.int64)
@@ -183,9 +196,11 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
 def _causes(
     commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray, group: IntArray
 ) -> tuple[str, ...]:
-    """Causes that explain most of the residual: a turned reference frame, a clock's offset, a drift.
+    """Causes that explain most of the residual: a turned reference frame, a clock's offset, a
+    drift.
 
-    They are fitted to the mean of each attitude's pairs, so that an attitude counts once however often it was repeated.
+    They are fitted to the mean of each attitude's pairs, so that an attitude counts once however
+    often it was repeated.
     """
     row = np.linspace(-0.5, 0.5, len(group))[:, None]
     if group.max() == 0:
@@ -218,7 +233,9 @@ def _means(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | None:
-    """The amounts (p,) of the columns (n, 3, p) that, beside a constant turn, explain most of residuals (n, 3); else None."""
+    """The amounts (p,) of the columns (n, 3, p) that, beside a constant turn, explain most of
+    residuals (n, 3); else None.
+    """
     pairs, _, amounts = columns.shape
     scale = np.sqrt((residual_rad**2).mean(axis=0))
     cross = max(float(np.sqrt((scale[0] ** 2 + scale[1] ** 2) / 2)), FLOOR_RAD)
@@ -235,13 +252,16 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
 
 
 def _f_limit(above: float, below: float) -> float:
-    from scipy.special import fdtri  # F's quantile; scipy.stats has the same one and takes half a second to import
+    # F's quantile; scipy.stats has the same one and takes half a second to import
+    from scipy.special import fdtri
 
     return float(fdtri(above, below, 1 - FALSE_ALARM))
 
 
 def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: MonitorIdentity | None = None) -> None:
-    """Write the bench's present geometry with the alignment that was found. Raises InputError where it cannot be written."""
+    """Write the bench's present geometry with the alignment that was found. Raises InputError
+    where it cannot be written.
+    """
     name = file.config.collimator.geometry
     if name is None:
         camera, notes, lens_of = found.camera, Notes({}, ErrorTable(model="ideal lens"), MadeTable()), "the bench file"
@@ -276,8 +296,9 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: Monit
 def summary_of(found: Aligned) -> dict[str, Any]:
     """An alignment in figures, by the keys of --json.
 
-    `rotation_arcsec` is the rotation vector from the commanded to the reported attitude, cam axes, with `sigma_arcsec` of each
-    axis. `wild_rows` are lines of the file. `repeat_arcsec` and `unexplained_arcsec` are None where too few attitudes repeat.
+    `rotation_arcsec` is the rotation vector from the commanded to the reported attitude, cam axes,
+    with `sigma_arcsec` of each axis. `wild_rows` are lines of the file. `repeat_arcsec` and
+    `unexplained_arcsec` are None where too few attitudes repeat.
     """
     residual = found.residual
     return {

@@ -1,12 +1,16 @@
-"""Pairs of a commanded and a reported attitude, the one rotation that relates them, and conventions that are not hilstar's.
+"""Pairs of a commanded and a reported attitude, the one rotation that relates them, and conventions
+that are not hilstar's.
 
-Pairs come from a table of both attitudes, or from a tracker's telemetry and the ledger of the run that it saw.
+Pairs come from a table of both attitudes, or from a tracker's telemetry and the ledger of the run
+that it saw.
 
-The rotation is a robust mean of the pairs' rotations. It starts at the one among them that has half of all nearest to it, and
-is iterated in the tangent space with Tukey's weights (Beaton and Tukey 1974). Their scale is the median absolute deviation,
-taken separately across and about the boresight: a tracker knows its roll several times worse.
+The rotation is a robust mean of the pairs' rotations. It starts at the one among them that has half
+of all nearest to it, and is iterated in the tangent space with Tukey's weights (Beaton and Tukey
+1974). Their scale is the median absolute deviation, taken separately across and about the
+boresight: a tracker knows its roll several times worse.
 
-A wrong convention (inverse, scalar last, mirrored) is recognised because all pairs agree when it is undone.
+A wrong convention (inverse, scalar last, mirrored) is recognised because all pairs agree when it is
+undone.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,17 +35,21 @@ MAX_ROWS = 100_000
 COMMANDED, REPORTED = ("qw", "qx", "qy", "qz"), ("tw", "tx", "ty", "tz")
 SKIP = "delete the row, or write valid = 0"
 PAIRS_ADVICE = f"write a CSV with the columns {','.join((*COMMANDED, *REPORTED))} (commanded, then the tracker's; scalar first)"
-AGREE_RAD = np.radians(1.0)  # two rotations further apart do not belong to one alignment, whatever the noise
-STARTS = 100  # one of them is near the truth with probability 1 - 2^-100 while fewer than half are wild
-# Tukey's weights end here, in sigmas of three axes together: 7e-8 of a Gaussian lies beyond. The scale of a few pairs is itself
-# uncertain, so for n of them it is 6 (1 + (10 / n)^2): 12 of 1000 clean sets of 3 pairs then lose one, at most 2 of 4 and more.
+# two rotations further apart do not belong to one alignment, whatever the noise
+AGREE_RAD = np.radians(1.0)
+# one of them is near the truth with probability 1 - 2^-100 while fewer than half are wild
+STARTS = 100
+# Tukey's weights end here, in sigmas of three axes together: 7e-8 of a Gaussian lies beyond. The
+# scale of a few pairs is itself uncertain, so for n of them it is 6 (1 + (10 / n)^2): 12 of 1000
+# clean sets of 3 pairs then lose one, at most 2 of 4 and more.
 CUT_SIGMAS, FEW = 6.0, 10.0
 FLOOR_RAD = 0.01 / ARCSEC_PER_RAD  # smallest scale: the digits of written quaternions
 ROUNDS, DONE_RAD = 50, 1e-13
 MAX_PAIRS = 500  # enough, spread over the table, to recognise a convention
 CLEARLY = 5.0  # how many times better another convention must fit where the pairs agree as they are
 CLEARLY_RAD = 30.0 / ARCSEC_PER_RAD  # below this scatter no other convention is sought
-SIMPLER = 1.5  # the simpler convention is named if its fit is at most this many times worse than the best
+# the simpler convention is named if its fit is at most this many times worse than the best
+SIMPLER = 1.5
 
 Change = Callable[[FloatArray], FloatArray]
 
@@ -50,8 +58,8 @@ Change = Callable[[FloatArray], FloatArray]
 class Pairs:
     """Commanded and reported unit q_icrs_to_cam, (n, 4) each, with each pair's line in its file.
 
-    `rate_rad_s` (n, 3), cam, is the commanded rate, None without a ledger. `skipped` counts rows that are not valid or have no
-    commanded attitude. `names` are the reported columns.
+    `rate_rad_s` (n, 3), cam, is the commanded rate, None without a ledger. `skipped` counts rows
+    that are not valid or have no commanded attitude. `names` are the reported columns.
     """
 
     source: Path
@@ -67,7 +75,9 @@ class Pairs:
 
 
 def read_pairs(path: Path) -> Pairs:
-    """The pairs of a table; rows with valid = 0 are skipped. Raises InputError with the line of what is no attitude."""
+    """The pairs of a table; rows with valid = 0 are skipped. Raises InputError with the line of
+    what is no attitude.
+    """
     columns = (*COMMANDED, *REPORTED)
     lines: list[int] = []
     numbers: list[list[float]] = []
@@ -86,7 +96,9 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _unit(path: Path, lines: IntArray, q: FloatArray, names: tuple[str, ...]) -> FloatArray:
-    """Unit quaternions (n, 4) of the columns `names`. Raises InputError with the line of one whose norm is not 1."""
+    """Unit quaternions (n, 4) of the columns `names`. Raises InputError with the line of one
+    whose norm is not 1.
+    """
     norm = np.sqrt((q * q).sum(axis=1))
     off = np.abs(norm - 1) > NORM_TOLERANCE
     if off.any():
@@ -99,10 +111,12 @@ def _unit(path: Path, lines: IntArray, q: FloatArray, names: tuple[str, ...]) ->
 
 
 def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
-    """Pair each valid row of telemetry with the attitude that a run commanded at the row's time plus `offset_s`.
+    """Pair each valid row of telemetry with the attitude that a run commanded at the row's time
+    plus `offset_s`.
 
-    A ledger's `light_ns` is on the sender's clock, when the middle row lights. Rows before, after or within a gap or a jump of
-    the frames are skipped. Raises InputError for telemetry or a ledger that cannot be read, and where no row is left.
+    A ledger's `light_ns` is on the sender's clock, when the middle row lights. Rows before, after
+    or within a gap or a jump of the frames are skipped. Raises InputError for telemetry or a ledger
+    that cannot be read, and where no row is left.
     """
     telemetry, run = read_telemetry(path, rising=False), read_commanded(ledger)
     valid = telemetry.valid
@@ -129,7 +143,9 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
 
 @dataclass(frozen=True, slots=True)
 class RotationFit:
-    """The rotation (4,), and each pair's residual (n, 3), rad, and weight (n,), 0 for a wild pair."""
+    """The rotation (4,), and each pair's residual (n, 3), rad, and weight (n,), 0 for a wild
+    pair.
+    """
 
     q: FloatArray
     residual_rad: FloatArray
@@ -141,9 +157,11 @@ class RotationFit:
         return np.asarray(self.weight > 0)
 
     def covariance_rad2(self, group: IntArray) -> tuple[FloatArray, int]:
-        """Covariance (3, 3) of the rotation, cam axes, if errors within each `group` (n,) are common to it, and its freedom.
+        """Covariance (3, 3) of the rotation, cam axes, if errors within each `group` (n,) are
+        common to it, and its freedom.
 
-        The pairs of a single group count as independent, so that an error of that attitude itself is not included.
+        The pairs of a single group count as independent, so that an error of that attitude itself
+        is not included.
         """
         weighted = self.weight[:, None] * self.residual_rad
         if len(np.unique(group[self.used])) == 1:
@@ -155,7 +173,9 @@ class RotationFit:
 
 
 def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The rotation among (n, 4) that has half of all nearest to it, and the angle (n,) of each to it, rad."""
+    """The rotation among (n, 4) that has half of all nearest to it, and the angle (n,) of each
+    to it, rad.
+    """
     chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
     best, angles, reach = rotations[0], np.zeros(len(rotations)), np.inf
     for candidate in rotations[chosen]:
@@ -212,7 +232,9 @@ def _scalar_last(q: FloatArray) -> FloatArray:
 
 
 def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]:
-    """The usual mistakes, the most usual first: the changes of commanded and of reported quaternions, and the cure."""
+    """The usual mistakes, the most usual first: the changes of commanded and of reported
+    quaternions, and the cure.
+    """
     w, x, y, z = names
     tracker = f"the tracker's quaternions ({','.join(names)})"
     inverse = f"are the inverse (cam to ICRS); write {w},-{x},-{y},-{z}"
@@ -232,7 +254,8 @@ def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]
 
 
 def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
-    """Refuse (InputError) pairs that agree only by another convention than hilstar's, or half or more of which are wild.
+    """Refuse (InputError) pairs that agree only by another convention than hilstar's, or half or
+    more of which are wild.
 
     Also where the rotation would turn the screen, of `field_radius_rad`, out of the tracker's view.
     """
@@ -263,7 +286,9 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
 
 
 def _spread(commanded: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
-    """The rotation with half of all pairs nearest to it, and the angle within which they lie, rad."""
+    """The rotation with half of all pairs nearest to it, and the angle within which they lie,
+    rad.
+    """
     rotations = multiply(reported, conjugate(commanded))
     rotation, angle = start_of(rotations)
     return rotation, float(np.quantile(angle, 0.5, method="higher"))

@@ -1,10 +1,11 @@
 """The effective PSF of a tracker over its field, from the dot frames of the geometric calibration.
 
-As Anderson and King (2000, PASP 112, 1360): one model of what pixels get, built from dots at many places within a pixel, whose
-places and light are fitted to it in turn. The model is a Gaussian whose covariance changes with the field, and a spline on a
-grid of half pixels for all that is not Gaussian, its coefficients polynomials over the field. The square of each dot is
-convolved in the model, so what is found is without it; the pixel is integrated, and the collimator is in it. Dots held out of
-the fit say how right both are, and whether the data ask for more than the Gaussian.
+As Anderson and King (2000, PASP 112, 1360): one model of what pixels get, built from dots at many
+places within a pixel, whose places and light are fitted to it in turn. The model is a Gaussian
+whose covariance changes with the field, and a spline on a grid of half pixels for all that is not
+Gaussian, its coefficients polynomials over the field. The square of each dot is convolved in the
+model, so what is found is without it; the pixel is integrated, and the collimator is in it. Dots
+held out of the fit say how right both are, and whether the data ask for more than the Gaussian.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,8 @@ from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of
 from hilstar.server.bench.bench_file import BenchFile
 
 MAX_HALF_PX, MIN_HALF_PX = 12, 4
-SEEN_SIGMAS, SEEN_SHARE = 3.0, 3e-4  # a ring about the dots is light above so many sigmas, and so much of the middle's
+# a ring about the dots is light above so many sigmas, and so much of the middle's
+SEEN_SIGMAS, SEEN_SHARE = 3.0, 3e-4
 NODES = 9  # quadrature over dot and pixel, along each axis
 KNOT_PX = 0.5
 PRIOR_SHARE = 0.03  # sigma of a spline's coefficient, share of a dot's light in a pixel
@@ -44,7 +46,9 @@ POINTS = 5  # field points along each side of the file
 
 @dataclass(frozen=True, slots=True)
 class Dots:
-    """Mean images of n dots (n, side, side), DN, and their variance; the middle pixels, the dots' places and sides, px."""
+    """Mean images of n dots (n, side, side), DN, and their variance; the middle pixels, the
+    dots' places and sides, px.
+    """
 
     images: FloatArray
     variance: FloatArray
@@ -67,9 +71,11 @@ class Dots:
 
 @dataclass(frozen=True, slots=True)
 class Effective:
-    """What pixels get of a point over the field: polynomials of a Gaussian's covariance (T, 3), and of a spline (T', m, m).
+    """What pixels get of a point over the field: polynomials of a Gaussian's covariance (T, 3), and
+    of a spline (T', m, m).
 
-    `middle_px` and `scale_px` make places a polynomial's; `knots_px` (m,) are the middles of the spline's functions.
+    `middle_px` and `scale_px` make places a polynomial's; `knots_px` (m,) are the middles of the
+    spline's functions.
     """
 
     middle_px: FloatArray
@@ -79,7 +85,9 @@ class Effective:
     spline: FloatArray
 
     def of(self, x_px: FloatArray, y_px: FloatArray, offsets: tuple[FloatArray, FloatArray], side_px: FloatArray) -> FloatArray:
-        """Shares (n, h, w) of pixels at offsets (n, w), (n, h) from squares of `side_px` (n,), 0 or more, at places (n,)."""
+        """Shares (n, h, w) of pixels at offsets (n, w), (n, h) from squares of `side_px` (n,), 0
+        or more, at places (n,).
+        """
         found = gaussians(*offsets, self._of(x_px, y_px, self.covariance), side_px)
         if len(self.spline):
             across, down = (_functions(self.knots_px, off, side_px) for off in offsets)
@@ -99,7 +107,9 @@ def terms_of(place: FloatArray, count: int) -> FloatArray:
 
 @lru_cache(maxsize=1024)
 def _quadrature(side_px: float) -> tuple[FloatArray, FloatArray]:
-    """Gauss's nodes and weights for a pixel convolved with a square's side (Golub and Welsch 1969)."""
+    """Gauss's nodes and weights for a pixel convolved with a square's side (Golub and Welsch
+    1969).
+    """
     at = (np.arange(600) + 0.5) / 600 * (1 + side_px) - (1 + side_px) / 2
     weight = np.clip((1 + side_px) / 2 - np.abs(at), 0, min(1.0, side_px) or 1.0)
     if side_px == 0:
@@ -117,7 +127,9 @@ def _quadrature(side_px: float) -> tuple[FloatArray, FloatArray]:
 
 
 def gaussians(x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_px: FloatArray) -> FloatArray:
-    """Shares (n, h, w) of pixels at offsets (n, w), (n, h): Gaussians of covariance xx, xy, yy (n, 3), over squares (n,)."""
+    """Shares (n, h, w) of pixels at offsets (n, w), (n, h): Gaussians of covariance xx, xy, yy
+    (n, 3), over squares (n,).
+    """
     xx, xy, yy = covariance.T
     xx, yy = np.maximum(xx, MIN_VARIANCE_PX2), np.maximum(yy, MIN_VARIANCE_PX2)
     most = 0.95 * np.sqrt(xx * yy)
@@ -136,7 +148,9 @@ def gaussians(x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_p
 
 
 def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray) -> FloatArray:
-    """Cubic B-splines about `knots_px` (m,), mean over a square's side about offsets (n, w): (n, w, m)."""
+    """Cubic B-splines about `knots_px` (m,), mean over a square's side about offsets (n, w): (n,
+    w, m).
+    """
     from scipy.interpolate import BSpline
 
     one = BSpline.basis_element(np.arange(-2, 3) * KNOT_PX, extrapolate=False)
@@ -164,7 +178,9 @@ def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Pat
 
 
 def _dot_sides(data: MatchedDots, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """The side of a dot where each centroid is, tracker px (n,), by a cubic map from the tracker to the monitor."""
+    """The side of a dot where each centroid is, tracker px (n,), by a cubic map from the tracker
+    to the monitor.
+    """
     place = np.stack([data.seen.x_px, data.seen.y_px], axis=1)
     middle, scale = place.mean(axis=0), float(np.abs(place - place.mean(axis=0)).max())
     powers = [(i, j) for i in range(4) for j in range(4 - i) if len(data) > 40 or i + j < 2]
@@ -184,7 +200,9 @@ def cut_out(
     data: MatchedDots,
     sides_px: FloatArray,
 ) -> Dots:
-    """The mean image of each dot in each pose over the frames in which none lies near it. Raises InputError."""
+    """The mean image of each dot in each pose over the frames in which none lies near it. Raises
+    InputError.
+    """
     _, which = np.unique(np.stack([data.seen.pose, data.dot]), axis=1, return_inverse=True)
     which = which.ravel()
     count = np.bincount(which)
@@ -210,7 +228,9 @@ def cut_out(
 
 
 def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px: float) -> Dots:
-    """Dots of `side_px` at places (n,) of one image (h, w) that stand alone. Raises InputError where they are too few."""
+    """Dots of `side_px` at places (n,) of one image (h, w) that stand alone. Raises InputError
+    where they are too few.
+    """
     padded = np.pad(image, MAX_HALF_PX, constant_values=np.nan)
     apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px)) + np.where(np.eye(len(x_px)), np.inf, 0)
     column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
@@ -221,7 +241,9 @@ def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px
 
 
 def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[Any, ...]) -> Dots:
-    """Dots by the sums of their images, of the squares of these, and how many there were. Raises InputError for too few."""
+    """Dots by the sums of their images, of the squares of these, and how many there were. Raises
+    InputError for too few.
+    """
     total, squares, lit = sums
     kept = np.flatnonzero((lit > 0) & np.isfinite(total).all(axis=(1, 2)))
     if len(kept) < MIN_DOTS:
@@ -239,7 +261,9 @@ def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[An
 
 
 def _variance(mean: FloatArray, spread: FloatArray, lit: FloatArray) -> FloatArray:
-    """The variance of one frame's pixels (n, s, s), linear in their light, by what repeats of a dot differ by."""
+    """The variance of one frame's pixels (n, s, s), linear in their light, by what repeats of a
+    dot differ by.
+    """
     again = np.flatnonzero(lit > 1)
     light = mean - np.median(mean)
     if not len(again):
@@ -267,7 +291,9 @@ def _half_px(dots: Dots) -> int:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Of dots held out of a fit: rms of pixels relative to a dot's brightest one, what noise makes, and chi square by dot."""
+    """Of dots held out of a fit: rms of pixels relative to a dot's brightest one, what noise
+    makes, and chi square by dot.
+    """
 
     name: str
     rms: float
@@ -277,7 +303,9 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An effective PSF as a tracker's glass, the models that were held to dots that they had not seen, and the one chosen."""
+    """An effective PSF as a tracker's glass, the models that were held to dots that they had not
+    seen, and the one chosen.
+    """
 
     glass: Glass
     models: list[HeldOut]
@@ -289,7 +317,9 @@ class Found:
 
 
 def fit_effective(dots: Dots, per_px: int) -> Found:
-    """Fit dots, choose the model by those held out, and make the file's glass. Raises InputError for dots that are none."""
+    """Fit dots, choose the model by those held out, and make the file's glass. Raises InputError
+    for dots that are none.
+    """
     place = np.stack([dots.x_px, dots.y_px], axis=1)
     middle, scale = (place.max(axis=0) + place.min(axis=0)) / 2, max(float(np.ptp(place, axis=0).max()) / 2, 1.0)
     dots, covariance = _each_gaussian(dots)
@@ -315,7 +345,9 @@ def _knots(dots: Dots) -> FloatArray:
 
 
 def _each_gaussian(dots: Dots) -> tuple[Dots, FloatArray]:
-    """Dots with their places, and covariances (n, 3), each by a Gaussian of its own (Gauss-Newton)."""
+    """Dots with their places, and covariances (n, 3), each by a Gaussian of its own
+    (Gauss-Newton).
+    """
     covariance = np.tile([0.5, 0.0, 0.5], (len(dots.x_px), 1))
     for _ in range(FIT_ROUNDS):
         own = gaussians(*dots.offsets, covariance, dots.side_px)
@@ -339,7 +371,9 @@ def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
 
 
 def _amplitudes(dots: Dots, own: FloatArray, slopes: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Light and background (n, 2) of dots by weighted least squares, and steps (n, k) along `slopes` of the model."""
+    """Light and background (n, 2) of dots by weighted least squares, and steps (n, k) along
+    `slopes` of the model.
+    """
     columns = np.stack([own, np.ones_like(own), *slopes], axis=1).reshape(len(own), 2 + len(slopes), -1)
     weight = 1 / dots.variance.reshape(len(own), 1, -1)
     normal = (columns * weight) @ columns.transpose(0, 2, 1)
@@ -351,7 +385,9 @@ def _amplitudes(dots: Dots, own: FloatArray, slopes: Sequence[FloatArray]) -> tu
 
 
 def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]:
-    """Dots with their places by a model, its shares (n, s, s), and their light and background (n, 2)."""
+    """Dots with their places by a model, its shares (n, s, s), and their light and background
+    (n, 2).
+    """
     x_px, y_px = dots.x_px, dots.y_px
     for _ in range(PLACE_ROUNDS):
         own = model.of(x_px, y_px, dots.offsets, dots.side_px)
@@ -364,7 +400,9 @@ def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]
 
 
 def _fitted(start: Effective, dots: Dots, covariance: FloatArray, count: int) -> tuple[Effective, Dots]:
-    """A model of dots: the Gaussian's covariance over the field, and a spline with `count` terms over the field."""
+    """A model of dots: the Gaussian's covariance over the field, and a spline with `count` terms
+    over the field.
+    """
     place = (np.stack([dots.x_px, dots.y_px], axis=1) - start.middle_px) / start.scale_px
     terms = terms_of(place, len(start.covariance))
     # Robust: a dot with a neighbour or a hot pixel has another covariance.
@@ -386,7 +424,9 @@ def _fitted(start: Effective, dots: Dots, covariance: FloatArray, count: int) ->
 
 
 def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int) -> FloatArray:
-    """The spline (count, m, m) of what dots have beside a Gaussian, by least squares with a prior of PRIOR_SHARE."""
+    """The spline (count, m, m) of what dots have beside a Gaussian, by least squares with a
+    prior of PRIOR_SHARE.
+    """
     from scipy.sparse.linalg import LinearOperator, lsqr
 
     flux, background = amplitudes.T[:, :, None, None]
@@ -411,7 +451,9 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
 
 
 def _held_out(start: Effective, dots: Dots, covariance: FloatArray, fold: IntArray, count: int) -> HeldOut:
-    """How far a model is off dots that it was not fitted to; only their places, light and background are."""
+    """How far a model is off dots that it was not fitted to; only their places, light and
+    background are.
+    """
     chi2, rms, noise = (np.zeros(len(fold)) for _ in range(3))
     for number in range(FOLDS):
         known, held = np.flatnonzero(fold != number), np.flatnonzero(fold == number)
@@ -454,7 +496,8 @@ def draw_effective(path: Path, found: Found) -> None:
     )
     with chart(path, finding, height_inch=6.6) as (axes,):
         picked = images.reshape(POINTS, POINTS, *images.shape[1:])[:: POINTS // 2, :: POINTS // 2]
-        picture = picked.transpose(1, 2, 0, 3).reshape(3 * images.shape[1], -1)  # points are sorted by x, then y
+        # points are sorted by x, then y
+        picture = picked.transpose(1, 2, 0, 3).reshape(3 * images.shape[1], -1)
         axes.imshow(np.sqrt(picture.clip(min=0)), cmap="viridis", interpolation="nearest")
         axes.set(xticks=[], yticks=[], xlabel="left, middle and right of the dots' field", ylabel="bottom, middle, top")
         axes.grid(visible=False)

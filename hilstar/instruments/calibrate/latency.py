@@ -1,4 +1,6 @@
-"""Latency by a photodiode: the edges that it saw, paired with the frames of the ledger that caused them."""
+"""Latency by a photodiode: the edges that it saw, paired with the frames of the ledger that
+caused them.
+"""
 
 import math
 import re
@@ -39,10 +41,11 @@ class Edges:
 
 
 def capture_edges(port: str, baud: int, seconds: float) -> Edges:
-    """Record the edges that a device on a serial port reports within `seconds` (see DEVICE_FORM); other lines are skipped.
+    """Record the edges that a device on a serial port reports within `seconds` (see DEVICE_FORM);
+    other lines are skipped.
 
-    Device times are converted to the host's clock by the lower hull of their delays, so the minimum delay stays in the latency.
-    Raises InputError where there are too few.
+    Device times are converted to the host's clock by the lower hull of their delays, so the minimum
+    delay stays in the latency. Raises InputError where there are too few.
     """
     lines = read_lines(port, baud, seconds)
     found = [(host_ns, match) for host_ns, line in lines if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))]
@@ -90,9 +93,11 @@ def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
 
 
 MAX_LATENCY_NS = 500 * NS_PER_MS
-MAX_EARLY_NS = 5 * NS_PER_MS  # a clock that is read after the swap may give a time later than that of the light
+# a clock that is read after the swap may give a time later than that of the light
+MAX_EARLY_NS = 5 * NS_PER_MS
 BIN_NS = NS_PER_MS
-LIKELY_SHARE = 0.9  # relative to the best peak: with a square that toggles, the latency repeats every two frames
+# relative to the best peak: with a square that toggles, the latency repeats every two frames
+LIKELY_SHARE = 0.9
 AGREEING_SHARE = 0.5  # share of the edges that must find their frames
 
 
@@ -100,7 +105,8 @@ AGREEING_SHARE = 0.5  # share of the edges that must find their frames
 class Paired:
     """Latencies from swap to edge, ns, of the edges matched to frames, and their levels; (n,) each.
 
-    `unmatched` counts the other edges during the run. `ambiguous`: the latency is known only up to whole pairs of frames.
+    `unmatched` counts the other edges during the run. `ambiguous`: the latency is known only up to
+    whole pairs of frames.
     """
 
     latency_ns: FloatArray
@@ -110,7 +116,9 @@ class Paired:
 
 
 def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
-    """Match each edge to its frame by the most frequent latency, within half a period. Raises InputError if too few agree."""
+    """Match each edge to its frame by the most frequent latency, within half a period. Raises
+    InputError if too few agree.
+    """
     inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS)
     host_ns, level = seen.host_ns[inside], seen.level[inside]
     guess_ns, ambiguous = _likely_latency_ns(Edges(host_ns, level), shown)
@@ -138,7 +146,9 @@ def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
 
 
 def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
-    """The most frequent delay from a change to an edge of the same level, and whether others are about as frequent."""
+    """The most frequent delay from a change to an edge of the same level, and whether others are
+    about as frequent.
+    """
     bins = (MAX_LATENCY_NS + MAX_EARLY_NS) // BIN_NS
     counts = np.zeros(bins, dtype=np.int64)
     for value in (0, 1):
@@ -157,8 +167,9 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
 def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
     """The figures of a latency measurement, by the keys of `hilstar latency --json`.
 
-    The square is at the foot of the screen and lights almost a scan-out after the swap, `swap_to_square_ms`, which is
-    subtracted from the median: the rest is the panel's own, `panel_delay_ms`.
+    The square is at the foot of the screen and lights almost a scan-out after the swap,
+    `swap_to_square_ms`, which is subtracted from the median: the rest is the panel's own,
+    `panel_delay_ms`.
     """
     ms = paired.latency_ns / NS_PER_MS
     to_square_ms = swap_to_square_ms(config.monitor)
@@ -180,13 +191,17 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
 
 
 def swap_to_square_ms(monitor: Monitor) -> float:
-    """Time from the first row's light to that of the square's middle, at the foot of the screen, by the scan-out."""
+    """Time from the first row's light to that of the square's middle, at the foot of the screen,
+    by the scan-out.
+    """
     rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
     return monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
 
 
 def checked_delay_ms(panel_delay_ms: float) -> float:
-    """The delay rounded for a bench file. Raises InputError where light came before the scan-out that the file assumes."""
+    """The delay rounded for a bench file. Raises InputError where light came before the scan-out
+    that the file assumes.
+    """
     if panel_delay_ms < 0:
         raise InputError(
             f"the square lit {-panel_delay_ms:.2f} ms before the scan-out could reach it; set [monitor] scanout_ms to what the "
@@ -196,9 +211,11 @@ def checked_delay_ms(panel_delay_ms: float) -> float:
 
 
 def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> None:
-    """Set `[monitor] panel_delay_ms` and `[certify] panel_delay_u_ms` in a bench file and leave the rest unchanged.
+    """Set `[monitor] panel_delay_ms` and `[certify] panel_delay_u_ms` in a bench file and leave the
+    rest unchanged.
 
-    Raises InputError where the light came before the scan-out that the file assumes, and for a file that cannot be changed.
+    Raises InputError where the light came before the scan-out that the file assumes, and for a file
+    that cannot be changed.
     """
     value = checked_delay_ms(panel_delay_ms)
     text = with_key(read_text(path, "give the path of a bench file", MAX_TOML_BYTES), "monitor", "panel_delay_ms", value)

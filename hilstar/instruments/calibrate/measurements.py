@@ -23,8 +23,11 @@ NEEDED = ("code", "channel", "value")
 USUAL_BITS = (8, 10, 12, 14, 16)
 MAX_BYTES = 10_000_000
 ADVICE = "give a CSV file with code,channel,value"
-MIN_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
-FALSE_ALARM_SIGMA = 4.0  # one run in a few hundred is refused because of noise alone, with 32 levels
+# at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8
+# leave 4.4 %
+MIN_CODES = 10
+# one run in a few hundred is refused because of noise alone, with 32 levels
+FALSE_ALARM_SIGMA = 4.0
 MIN_DRIFT = 0.005  # over the run; less does not matter beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # quantile of the F distribution beyond which additive noise is believed
@@ -35,11 +38,12 @@ CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """Light (n,) of patches in one linear unit, their codes and channels, and the time of each (s, or the row's number).
+    """Light (n,) of patches in one linear unit, their codes and channels, and the time of each (s,
+    or the row's number).
 
-    `clipped` has by channel the codes that share the largest reading, where that looks like the instrument's limit. `sigma`
-    (n,) is the standard error of each value, 0 where none is stated; `common` (n, causes) is what one standard error of a
-    cause does to all of them.
+    `clipped` has by channel the codes that share the largest reading, where that looks like the
+    instrument's limit. `sigma` (n,) is the standard error of each value, 0 where none is stated;
+    `common` (n, causes) is what one standard error of a cause does to all of them.
     """
 
     source: str
@@ -66,11 +70,13 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLevels:
-    """Repeats combined: for each distinct code (n,), rising, the mean light and the number of readings.
+    """Repeats combined: for each distinct code (n,), rising, the mean light and the number of
+    readings.
 
-    `relative_noise` is that of one reading, nan where nothing was repeated; `additive_noise` is in the unit of measurement.
-    Both are what repeats scatter beyond the readings' own errors, where these are stated: `stated` (n,) is that of the mean.
-    `common` (n, causes) is what one standard error of a cause does to the means.
+    `relative_noise` is that of one reading, nan where nothing was repeated; `additive_noise` is in
+    the unit of measurement. Both are what repeats scatter beyond the readings' own errors, where
+    these are stated: `stated` (n,) is that of the mean. `common` (n, causes) is what one standard
+    error of a cause does to the means.
     """
 
     code: IntArray
@@ -87,12 +93,16 @@ class MeasuredLevels:
         return bool(self.stated.any())
 
     def reading_noise(self, relative_noise: float) -> float:
-        """The noise of one reading of white, relative to it, for a given relative noise beyond stated errors."""
+        """The noise of one reading of white, relative to it, for a given relative noise beyond
+        stated errors.
+        """
         stated = float(self.stated[-1] * math.sqrt(self.count[-1]) / self.mean[-1])
         return math.hypot(relative_noise, stated)
 
     def standard_error(self, relative_noise: float) -> FloatArray:
-        """Standard error of the mean (n,), in its unit, for a given relative noise of one reading."""
+        """Standard error of the mean (n,), in its unit, for a given relative noise of one
+        reading.
+        """
         variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
         return np.asarray(np.sqrt(variance / self.count + self.stated**2), dtype=np.float64)
 
@@ -110,8 +120,9 @@ class _Row(NamedTuple):
 def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     """Read `code,channel,value` rows; '#' starts a comment line.
 
-    `exposure_s`, `t_s`, `order`, `sigma` and any `common_NAME` are read where they are given. Values and their errors are
-    divided by exposure_s. `bits` is by default the smallest of 8, 10, 12, 14, 16 that holds every code.
+    `exposure_s`, `t_s`, `order`, `sigma` and any `common_NAME` are read where they are given.
+    Values and their errors are divided by exposure_s. `bits` is by default the smallest of 8, 10,
+    12, 14, 16 that holds every code.
     Raises InputError: file, line, what is wrong.
     """
     raw = read_bytes(path, ADVICE, MAX_BYTES)
@@ -220,14 +231,18 @@ def _number(place: str, name: str, text: str) -> float:
 
 
 def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
-    """The codes that share the largest reading, if several do and it is frequent: the instrument is at its limit."""
+    """The codes that share the largest reading, if several do and it is frequent: the instrument
+    is at its limit.
+    """
     at_limit = reading == reading.max()
     codes = np.unique(code[at_limit])
     return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []
 
 
 def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
-    """Combine the repeats of one channel; code 0 is the same black in every channel, so all its readings count."""
+    """Combine the repeats of one channel; code 0 is the same black in every channel, so all its
+    readings count.
+    """
     chosen = (measured.channel == channel) | (measured.code == 0)
     value = measured.value[chosen]
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
@@ -237,7 +252,8 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     # What repeats scatter beyond the readings' own errors.
     squares -= (count - 1) * variance
     floor = 0.0 if variance.any() else NOISE_FLOOR
-    # The relative noise of the bright half, where the instrument's floor is negligible; of all but black if too few repeat.
+    # The relative noise of the bright half, where the instrument's floor is negligible; of all but
+    # black if too few repeat.
     relative = math.nan
     for part in ((mean > 0) & (code > 0), mean > np.median(mean)):
         dof = int((count[part] - 1).sum())
@@ -259,8 +275,11 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
 
 
 def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:
-    """The instrument's floor, in its unit, if the faintest third, black included, scatters more than `relative` explains."""
-    from scipy.special import fdtri  # F's quantile; scipy.stats has the same one and takes half a second to import
+    """The instrument's floor, in its unit, if the faintest third, black included, scatters more
+    than `relative` explains.
+    """
+    # F's quantile; scipy.stats has the same one and takes half a second to import
+    from scipy.special import fdtri
 
     faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
     dof = int((count[faint] - 1).sum())
@@ -273,7 +292,9 @@ def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: 
 
 
 def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -> None:
-    """Refuse (InputError) levels that no response can be fitted to, with the reason and the cure."""
+    """Refuse (InputError) levels that no response can be fitted to, with the reason and the
+    cure.
+    """
     place = f"{measured.source}: channel {channel}"
     if levels.code[0] != 0:
         raise InputError(f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times")
@@ -305,7 +326,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
 
 
 def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLevels, error: FloatArray) -> None:
-    """Refuse (InputError) a saturated top: one flatter than the S-curve sin^2, which falls by 3 (1 - code / white)^2 there."""
+    """Refuse (InputError) a saturated top: one flatter than the S-curve sin^2, which falls by 3
+    (1 - code / white)^2 there.
+    """
     clipped = measured.clipped.get(channel, [])
     white = levels.mean[-1]
     noise = float(np.hypot(error, error[-1])[-1] / white)
@@ -321,7 +344,8 @@ def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLeve
 
 
 def drift_over_run(measured: Measurements) -> tuple[float, float]:
-    """The trend of repeated patches from the first to the last measurement and its standard error, both relative.
+    """The trend of repeated patches from the first to the last measurement and its standard error,
+    both relative.
 
     Both are nan where nothing was repeated. Code 0 is left out: its noise is not that of light.
     """
@@ -341,7 +365,9 @@ def drift_over_run(measured: Measurements) -> tuple[float, float]:
 
 
 def check_drift(measured: Measurements) -> float:
-    """The drift over the run, relative (nan where nothing was repeated). Raises InputError where it is beyond the noise."""
+    """The drift over the run, relative (nan where nothing was repeated). Raises InputError where
+    it is beyond the noise.
+    """
     drift, error = drift_over_run(measured)
     if abs(drift) > max(FALSE_ALARM_SIGMA * error, MIN_DRIFT):
         raise InputError(

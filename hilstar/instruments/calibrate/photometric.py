@@ -1,18 +1,24 @@
-"""From measured patches to a response: a penalised spline of log light, with the black level as a parameter.
+"""From measured patches to a response: a penalised spline of log light, with the black level as a
+parameter.
 
-The model of a patch is `black + base(s) exp(g(v(s)))`, with s = code / white. Residuals are relative to the noise of each
-level's mean, so a faint level counts as much as a bright one. `g` is a cubic spline, in one of three shapes:
+The model of a patch is `black + base(s) exp(g(v(s)))`, with s = code / white. Residuals are
+relative to the noise of each level's mean, so a faint level counts as much as a bright one. `g` is
+a cubic spline, in one of three shapes:
 
-    power   base s^2.2    g over log s, penalty on g''            a power law is left alone by the penalty
-    srgb    base sRGB     g over log s, penalty on g''            so is sRGB with its linear toe, to a power
-    smooth  base s^2.2    g over s plus a log s, penalty on g'''  S-curves of liquid crystals: analytic in s
+    power   base s^2.2    g over log s, penalty on g''            a power law is left alone by the
+    penalty
+    srgb    base sRGB     g over log s, penalty on g''            so is sRGB with its linear toe, to
+    a power
+    smooth  base s^2.2    g over s plus a log s, penalty on g'''  S-curves of liquid crystals:
+    analytic in s
 
-The stiffness of the penalty and the shape are those of the maximum marginal likelihood (with weak normal priors on the
-coefficients). The noise is that stated with the readings, and what the repeats scatter beyond it. Black is a parameter with
-the repeats of code 0 as its prior. So is each cause of errors that readings have in common, in units of its standard error.
+The stiffness of the penalty and the shape are those of the maximum marginal likelihood (with weak
+normal priors on the coefficients). The noise is that stated with the readings, and what the repeats
+scatter beyond it. Black is a parameter with the repeats of code 0 as its prior. So is each cause of
+errors that readings have in common, in units of its standard error.
 
-Where the levels are further from the fit than their noise explains, the errors grow by the root of chi-square over its
-freedom (Birge, Phys. Rev. 40 (1932) 207).
+Where the levels are further from the fit than their noise explains, the errors grow by the root of
+chi-square over its freedom (Birge, Phys. Rev. 40 (1932) 207).
 """
 
 import datetime
@@ -44,16 +50,20 @@ LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
 SETTLED = 1e-6  # change of log light
 STIFFNESS_STEPS = 8  # the stiffness is chosen anew in each of the first steps
-BLACK_FLOOR = 1e-6  # relative to white: how well a black level of zero is known, where its readings state no error
+# relative to white: how well a black level of zero is known, where its readings state no error
+BLACK_FLOOR = 1e-6
 STATED_FLOOR = 1e-9  # where they do, which may be none
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
 MIN_LIGHT = 1e-9  # relative to white, at code 1
-MIN_STEP = 1e-12  # relative to white: in float64 it survives a black level a thousand times as bright
+# relative to white: in float64 it survives a black level a thousand times as bright
+MIN_STEP = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The base that the spline corrects, its coordinate, and the order of the penalised derivative."""
+    """The base that the spline corrects, its coordinate, and the order of the penalised
+    derivative.
+    """
 
     name: str
     base: Curve
@@ -73,12 +83,13 @@ SHAPES = (
 class ChannelFit:
     """The response of one channel and its errors.
 
-    `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` (above black) and `black` are in the unit of
-    measurement, `black_error` the standard error of `black` beside white. `error` (2^bits,) is the relative standard error of
-    `light`.
-    Of each level but code 0 (levels - 1,): `residual` is its relative error in a fit without it, `residual_error` that
-    residual's standard error; `level_off` is its light, corrected for common causes, over the fit's, less 1, and
-    `level_error` its relative standard error. `lack_of_fit` is the factor by which the errors were raised, 1 for none.
+    `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` (above black) and
+    `black` are in the unit of measurement, `black_error` the standard error of `black` beside
+    white. `error` (2^bits,) is the relative standard error of `light`.
+    Of each level but code 0 (levels - 1,): `residual` is its relative error in a fit without it,
+    `residual_error` that residual's standard error; `level_off` is its light, corrected for common
+    causes, over the fit's, less 1, and `level_error` its relative standard error. `lack_of_fit` is
+    the factor by which the errors were raised, 1 for none.
     """
 
     light: FloatArray
@@ -99,7 +110,9 @@ class ChannelFit:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """One shape's matrices: spline values at the levels and at all codes, penalty, prior; light in units of white."""
+    """One shape's matrices: spline values at the levels and at all codes, penalty, prior; light
+    in units of white.
+    """
 
     at_levels: FloatArray
     at_codes: FloatArray
@@ -145,7 +158,9 @@ class _Solution:
 
 
 def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit:
-    """The response of one channel. Raises InputError for data that no response can be fitted to (`check_levels`)."""
+    """The response of one channel. Raises InputError for data that no response can be fitted to
+    (`check_levels`).
+    """
     levels = measurements.group_levels(measured, channel)
     measurements.check_levels(measured, channel, levels)
     try:
@@ -192,7 +207,9 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
 
 
 def _residual_noise(levels: measurements.MeasuredLevels, white: int) -> float:
-    """The relative noise of a reading where nothing was repeated: by the residuals of a first fit."""
+    """The relative noise of a reading where nothing was repeated: by the residuals of a first
+    fit.
+    """
     first = _best_solution(levels, white, measurements.ASSUMED_NOISE)
     noise = measurements.ASSUMED_NOISE * math.sqrt(first.square_per_freedom)
     return max(noise, measurements.NOISE_FLOOR)
@@ -222,7 +239,8 @@ def _levels_about(best: "_Solution", fitted: FloatArray) -> tuple[FloatArray, Fl
 
 
 def strictly_rising(light: FloatArray) -> FloatArray:
-    """`light` (n,), 0 to 1, with each code at least 1e-6 (relative) above the code before, and code 1 at least 1e-9.
+    """`light` (n,), 0 to 1, with each code at least 1e-6 (relative) above the code before, and code
+    1 at least 1e-9.
 
     A response may be flat at its dark end, as over a link in limited range.
     """
@@ -237,7 +255,8 @@ def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float
     for shape in SHAPES:
         problem = _problem(shape, levels, white, noise)
         solutions.append(_solve(shape, problem, is_whole=False))
-        # Far from its place a stiff curve misfits and a soft one leads: from there on the whole range
+        # Far from its place a stiff curve misfits and a soft one leads: from there on the whole
+        # range
         # of stiffness is looked at again. Where that has not settled it is no solution.
         again = _solve(shape, problem, is_whole=True)
         solutions += [again] * again.has_settled
@@ -321,7 +340,9 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
 
 
 def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:
-    """Minus twice the log marginal likelihood of the linearised problem, up to a constant, and the posterior precision."""
+    """Minus twice the log marginal likelihood of the linearised problem, up to a constant, and
+    the posterior precision.
+    """
     prior = math.exp(stiffness) * problem.penalty + problem.prior
     precision = design.T @ design
     count = len(prior)
@@ -365,10 +386,13 @@ def calibrate_photometric(
     bits: int | None = None,
     identity: MonitorIdentity | None = None,
 ) -> dict[str, Any]:
-    """Fit a response to MEASURED.csv, write MONITOR.toml with its CSV beside it, and return the figures by the keys of --json.
+    """Fit a response to MEASURED.csv, write MONITOR.toml with its CSV beside it, and return the
+    figures by the keys of --json.
 
-    `channels` has each channel's; those of the first one in the calibration file stand at the top level, too.
-    Raises InputError for files that cannot be read or written, and for data that are too few, saturated, falling or drifting.
+    `channels` has each channel's; those of the first one in the calibration file stand at the top
+    level, too.
+    Raises InputError for files that cannot be read or written, and for data that are too few,
+    saturated, falling or drifting.
     """
     data = measurements.read_measurements(measured, bits)
     fits = fit_all(data)
@@ -390,7 +414,8 @@ def calibrate_photometric(
         output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity, errors=errors_of(fits)
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
-    additivity, crosstalk, unsure = None, None, None  # r + g + b against w, above black: at white and codes decades below it
+    # r + g + b against w, above black: at white and codes decades below it
+    additivity, crosstalk, unsure = None, None, None
     if len(fits) == len(measurements.CHANNELS):
         together = np.sum([fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0)
         more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
@@ -398,7 +423,8 @@ def calibrate_photometric(
         decades = {f"1e-{decade}": place for decade, place in _decades(fits["w"]).items()}
         crosstalk = {decade: float(more[place]) for decade, place in decades.items()}
         at = [*decades.values()]
-        # A channel's errors are relative to its white, which is as well known as its readings are many.
+        # A channel's errors are relative to its white, which is as well known as its readings are
+        # many.
         off: dict[str, FloatArray] = {}
         for name, one in fits.items():
             white_error = one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1]
@@ -420,7 +446,9 @@ def calibrate_photometric(
 
 
 def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
-    """How far white's levels are from the fit, and how well each is known; None where white or its repeats are missing."""
+    """How far white's levels are from the fit, and how well each is known; None where white or
+    its repeats are missing.
+    """
     fit = fits.get("w")
     if fit is None or "r" in fits:
         return None
@@ -442,7 +470,9 @@ def _rounded(values: FloatArray | float) -> list[float]:
 
 
 def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
-    """The response of each channel that was measured. Raises InputError where it is neither w nor all of r, g and b."""
+    """The response of each channel that was measured. Raises InputError where it is neither w
+    nor all of r, g and b.
+    """
     channels = data.channels
     if "w" not in channels and channels != measurements.PRIMARIES:
         raise InputError(f"{data.source}: only channel {', '.join(channels)}; measure w, or all of r, g and b")
@@ -457,7 +487,9 @@ def _decades(fit: ChannelFit) -> dict[int, int]:
 
 
 def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
-    """One channel's figures: its black level over white and in the unit of measurement, and errors at decades below white."""
+    """One channel's figures: its black level over white and in the unit of measurement, and
+    errors at decades below white.
+    """
     count = fit.levels.count
     return {
         "codes": len(count),
@@ -477,7 +509,9 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
 
 
 def held_out(fit: ChannelFit) -> dict[str, float]:
-    """The errors of a fit's levels, each held out of the fit, from white to three decades below; light is above black."""
+    """The errors of a fit's levels, each held out of the fit, from white to three decades below;
+    light is above black.
+    """
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
     sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
@@ -493,7 +527,8 @@ NAMES = {"w": "white", "r": "red", "g": "green", "b": "blue"}
 
 
 def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str:
-    """Draw the response and the held-out residuals of MEASURED.csv into a PNG; returns the finding as a sentence.
+    """Draw the response and the held-out residuals of MEASURED.csv into a PNG; returns the finding
+    as a sentence.
 
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """

@@ -1,4 +1,6 @@
-"""Patches for a monitor's response: the plan of codes in order, written as pictures or shown on a display."""
+"""Patches for a monitor's response: the plan of codes in order, written as pictures or shown on
+a display.
+"""
 
 import logging
 import math
@@ -24,8 +26,10 @@ if TYPE_CHECKING:
     from hilstar.display.window.window import Window
 
 MAX_PLAN_BYTES = 100_000_000
-MIN_PLANNED_LIGHT = 10**-3.2  # relative to white: a little beyond three decades, so that nothing is extrapolated there
-FAINT_LIGHT = 1e-2  # relative to white; levels below it are planned twice as often, because the black level drowns them
+# relative to white: a little beyond three decades, so that nothing is extrapolated there
+MIN_PLANNED_LIGHT = 10**-3.2
+# relative to white; levels below it are planned twice as often, because the black level drowns them
+FAINT_LIGHT = 1e-2
 PATCHES_PER_REFERENCE = 8  # between two rounds of black, half and white
 
 
@@ -39,7 +43,9 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The plan's size: bits of a code, levels from black to white, repeats of each, channels. Raises InputError."""
+    """The plan's size: bits of a code, levels from black to white, repeats of each, channels.
+    Raises InputError.
+    """
 
     bits: int
     levels: int = 32
@@ -60,8 +66,9 @@ class PlanSettings:
 def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch]:
     """The patches in the order of measurement.
 
-    Levels run from black to white in equal steps of log light. Each comes `repeats` times, those below 1 % of white twice as
-    often, in random order, with black, half and white between every eight as a reference for drift.
+    Levels run from black to white in equal steps of log light. Each comes `repeats` times, those
+    below 1 % of white twice as often, in random order, with black, half and white between every
+    eight as a reference for drift.
     """
     codes, white = planned_codes(settings.bits, settings.levels), 2**settings.bits - 1
     light = (np.array(codes) / white) ** 2.2
@@ -77,10 +84,13 @@ def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch
 
 
 def planned_codes(bits: int, levels: int) -> list[int]:
-    """Black, and codes in equal steps of the log light of an sRGB monitor, from 3.2 decades below white up to white."""
+    """Black, and codes in equal steps of the log light of an sRGB monitor, from 3.2 decades
+    below white up to white.
+    """
     white = 2**bits - 1
     light = np.geomspace(MIN_PLANNED_LIGHT, 1, levels - 1)
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    # IEC 61966-2-1
+    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     codes = [0]
     for place, code in enumerate(np.rint(signal * white).astype(int)):
         largest = white - (levels - 2 - place)  # leaves a code for each level that follows
@@ -90,7 +100,9 @@ def planned_codes(bits: int, levels: int) -> list[int]:
 
 
 def write_plan(path: Path, patches: list[Patch]) -> None:
-    """Write PLAN.csv, order,code,channel,value with value left empty. Raises InputError where it cannot be written."""
+    """Write PLAN.csv, order,code,channel,value with value left empty. Raises InputError where it
+    cannot be written.
+    """
     rows = [f"{order},{patch.code},{patch.channel}," for order, patch in enumerate(patches, start=1)]
     write_whole(path, "\n".join(["order,code,channel,value", *rows]) + "\n")
 
@@ -111,7 +123,9 @@ log = logging.getLogger(__name__)
 
 
 def patch_image(patch: Patch, resolution_px: tuple[int, int], bits: int) -> npt.NDArray[np.uint8 | np.uint16]:
-    """A square patch in the middle of a black screen: (height, width) for w, (height, width, 3) for one primary."""
+    """A square patch in the middle of a black screen: (height, width) for w, (height, width, 3)
+    for one primary.
+    """
     width, height = resolution_px
     side = max(1, round(min(width, height) * PATCH_SHARE))
     top, left = (height - side) // 2, (width - side) // 2
@@ -130,7 +144,9 @@ def in_channel(codes: npt.NDArray[Level], channel: str) -> npt.NDArray[Level]:
 
 
 def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[int, int], bits: int) -> None:
-    """Write a PNG of `resolution_px` (width, height) for each different patch. Raises InputError where that cannot be done."""
+    """Write a PNG of `resolution_px` (width, height) for each different patch. Raises InputError
+    where that cannot be done.
+    """
     make_directory(folder)
     patches = sorted(set(planned))
     if bits > 8 and any(patch.channel != "w" for patch in patches):
@@ -143,9 +159,11 @@ def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[i
 
 
 def show_patches(planned: Sequence[Patch], bits: int, display: int | str, seconds: float | None) -> int:
-    """Show each patch on a display until space is pressed, or for `seconds`; q quits. Returns how many were shown.
+    """Show each patch on a display until space is pressed, or for `seconds`; q quits. Returns how
+    many were shown.
 
-    Raises MachineError without a display or where that goes away, InputError for one that is not there.
+    Raises MachineError without a display or where that goes away, InputError for one that is not
+    there.
     """
     from hilstar.display.window.window import Window, WindowSettings
 
@@ -166,7 +184,9 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
 
 
 def stays_until_key(window: "Window", presenter: Presenter, seconds: float | None) -> bool:
-    """Present until space is pressed or `seconds` are over; False if q was pressed. Raises MachineError without the display."""
+    """Present until space is pressed or `seconds` are over; False if q was pressed. Raises
+    MachineError without the display.
+    """
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     while time.monotonic() < end_s:
         presenter.present()

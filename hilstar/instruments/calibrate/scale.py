@@ -1,4 +1,6 @@
-"""Full scale of the light by the tracker: stars shown, their DN read, and the light of white that follows."""
+"""Full scale of the light by the tracker: stars shown, their DN read, and the light of white
+that follows.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,15 +16,17 @@ from hilstar.server.bench.bench_file import BenchFile, with_key
 from hilstar.server.bench.config import read_config
 from hilstar.server.bench.frame import Bench
 
-# Error of a star's light beside its noise and its codes: what the window's sum, the response and the uniformity map leave on a
-# well measured bench.
+# Error of a star's light beside its noise and its codes: what the window's sum, the response and
+# the uniformity map leave on a well measured bench.
 STAR_MAG = 0.004
 UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
 
 
 @dataclass(frozen=True, slots=True)
 class StarReading:
-    """A star shown, the sum of its DN above background, and the noise of that sum, DN; 0 where it is not known."""
+    """A star shown, the sum of its DN above background, and the noise of that sum, DN; 0 where
+    it is not known.
+    """
 
     hip: int
     dn: float
@@ -31,7 +35,8 @@ class StarReading:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredScale:
-    """The light of white by the tracker; of each reading (n,) the ratio of measured to wanted light, and its weight.
+    """The light of white by the tracker; of each reading (n,) the ratio of measured to wanted
+    light, and its weight.
 
     `noise_mag` is the error that the readings' own noise leaves, 0 where it is not known.
     """
@@ -55,11 +60,14 @@ class MeasuredScale:
 
     @property
     def relative_error(self) -> float | None:
-        """The relative standard error of the light of white, by the readings' scatter and noise; None for one."""
+        """The relative standard error of the light of white, by the readings' scatter and noise;
+        None for one.
+        """
         count = len(self.ratios)
         if count < 2:
             return None
-        alike = float(self.weights.sum() ** 2 / (self.weights**2).sum())  # as many readings of one weight
+        # as many readings of one weight
+        alike = float(self.weights.sum() ** 2 / (self.weights**2).sum())
         by_scatter = ERROR_OF_MEDIAN * self.scatter_mag / math.sqrt(alike)
         return max(by_scatter, self.noise_mag) / MAG_PER_RELATIVE
 
@@ -81,7 +89,8 @@ def scale_of(white_e_per_s: float, ratios: FloatArray, noise_mag: FloatArray) ->
 def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: float) -> MeasuredScale:
     """The light of white from the median ratio of measured to wanted light.
 
-    Raises InputError for a star that the bench does not have, that clips, or that is too faint to be shown.
+    Raises InputError for a star that the bench does not have, that clips, or that is too faint to
+    be shown.
     """
     detector = bench.config.tracker.detector
     if exposure_s <= 0:
@@ -103,7 +112,8 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
 
 
 def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> None:
-    """Write a copy of a bench file with the light of white and its standard error set, and comments kept.
+    """Write a copy of a bench file with the light of white and its standard error set, and comments
+    kept.
 
     Raises InputError where that cannot be done.
     """

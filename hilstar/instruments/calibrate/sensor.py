@@ -1,7 +1,9 @@
-"""A sensor's `[tracker.detector]` from an EMVA 1288 data sheet, or from a user's own flats and darks by photon transfer.
+"""A sensor's `[tracker.detector]` from an EMVA 1288 data sheet, or from a user's own flats and
+darks by photon transfer.
 
-Photon transfer (Janesick 2007; EMVA 1288, release 4.0): two frames of one exposure give the noise by their difference and the
-fixed pattern by their covariance. Shot noise makes the variance K times the signal, with K in DN/e-.
+Photon transfer (Janesick 2007; EMVA 1288, release 4.0): two frames of one exposure give the noise
+by their difference and the fixed pattern by their covariance. Shot noise makes the variance K times
+the signal, with K in DN/e-.
 """
 
 import json
@@ -30,9 +32,11 @@ FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
 EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530nm,62,%"
 ICE_K = 273.15
 EXPOSURE_KEY = "EXPTIME"
-DARK_SPREAD = 0.5  # of the temporal noise: means of one level drift by less, and 128 x 128 px tell them to 0.01
+# of the temporal noise: means of one level drift by less, and 128 x 128 px tell them to 0.01
+DARK_SPREAD = 0.5
 ROUNDING_DN2 = 1 / 12
-LINEAR_SHARE = 0.7  # share of saturation: the standard's range for the slope of variance over signal
+# share of saturation: the standard's range for the slope of variance over signal
+LINEAR_SHARE = 0.7
 
 
 GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
@@ -75,9 +79,11 @@ QUANTITIES = (
 
 @dataclass(frozen=True, slots=True)
 class SensorFile:
-    """A sensor's keys with one-sigma errors where measured, quantum efficiency (nm, share), and what is to be said.
+    """A sensor's keys with one-sigma errors where measured, quantum efficiency (nm, share), and
+    what is to be said.
 
-    `transfer` (2, n) is the signal above dark and its variance less dark's, DN and DN^2; `dark` (2, m) seconds and mean DN.
+    `transfer` (2, n) is the signal above dark and its variance less dark's, DN and DN^2; `dark` (2,
+    m) seconds and mean DN.
     """
 
     keys: dict[str, Any]
@@ -234,7 +240,9 @@ def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Pairs of frames by mean, (n,) each: temporal and spatial (fixed-pattern) variance, and exposure, NaN if not known."""
+    """Pairs of frames by mean, (n,) each: temporal and spatial (fixed-pattern) variance, and
+    exposure, NaN if not known.
+    """
 
     mean_dn: FloatArray
     temporal_dn2: FloatArray
@@ -244,7 +252,9 @@ class Levels:
     shape: tuple[int, ...]
 
     def line(self, name: str, power: int, error: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A column over the exposure to a power, where exposures differ: slope and value at 0, and their one-sigma errors."""
+        """A column over the exposure to a power, where exposures differ: slope and value at 0,
+        and their one-sigma errors.
+        """
         weight = math.sqrt(math.prod(self.shape)) / np.maximum(error, 1e-9)
         place = np.nan_to_num(self.exposure_s) ** power
         values, covariance = np.polyfit(place, getattr(self, name), int(self.timed), w=weight, cov="unscaled")
@@ -262,7 +272,9 @@ class Levels:
 
 
 def read_levels(paths: Sequence[Path], what: str) -> Levels:
-    """Levels of frames that come in pairs: two of one light and exposure after each other. Raises InputError."""
+    """Levels of frames that come in pairs: two of one light and exposure after each other.
+    Raises InputError.
+    """
     if not paths or len(paths) % 2:
         raise InputError(f"{what}: {len(paths)} frames; give two of each exposure, one after the other")
     rows, largest_dn, shape = [], 0.0, read_image(paths[0], advice=FRAME_ADVICE).shape
@@ -301,7 +313,8 @@ def _refuse_unlike_darks(dark: Levels) -> None:
 def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     """A sensor from pairs of flats and darks. Raises InputError where they cannot tell its gain.
 
-    Errors are those of a finite number of pixels. Light that is not even over the sensor counts as PRNU.
+    Errors are those of a finite number of pixels. Light that is not even over the sensor counts as
+    PRNU.
     """
     light, dark = read_levels(flats, "FLATS"), read_levels(darks, "--darks")
     if light.shape != dark.shape:
@@ -352,7 +365,9 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
 
 
 def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
-    """Write the TOML file, a curve of quantum efficiency beside it, and the charts. Gives the files. Raises InputError."""
+    """Write the TOML file, a curve of quantum efficiency beside it, and the charts. Gives the
+    files. Raises InputError.
+    """
     settings = sensor.settings
     curve, chart = output.with_name(f"{output.stem}_qe.csv"), output.with_name(f"{output.stem}_curves")
     lines, many = [f"# {source}", *(f"# {note}" for note in sensor.notes)], len(sensor.efficiency) > 1
@@ -367,7 +382,9 @@ def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
 
 
 def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> None:
-    """Variance over signal, and dark signal over exposure, as the standard plots them: the file's lines, measured points."""
+    """Variance over signal, and dark signal over exposure, as the standard plots them: the
+    file's lines, measured points.
+    """
     gain, measured = settings.gain_e_per_dn, sensor.transfer is not None and sensor.dark is not None
     finding = f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at {settings.full_well_e:.0f} e-"
     signal_dn = np.array([0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()])

@@ -1,13 +1,16 @@
-"""Warm-up: from readings of white against time, when white is stable to 0.2 %, and the drift that remains.
+"""Warm-up: from readings of white against time, when white is stable to 0.2 %, and the drift that
+remains.
 
-White is stable at a time t when it changes by less than 0.2 % in the ten minutes after t. That change is taken from the law
-that explains the readings best (Akaike's criterion), fitted by least squares:
+White is stable at a time t when it changes by less than 0.2 % in the ten minutes after t. That
+change is taken from the law that explains the readings best (Akaike's criterion), fitted by least
+squares:
 
     line          white = w + s t
     exponential   white = w + a exp(-t / tau)
 
-Where neither explains them (a step, a second time constant at the start), the first eighth of the readings is left out, then
-the second, and so on. A law is refused where successive residuals are alike (von Neumann 1941) or one of them jumps.
+Where neither explains them (a step, a second time constant at the start), the first eighth of the
+readings is left out, then the second, and so on. A law is refused where successive residuals are
+alike (von Neumann 1941) or one of them jumps.
 """
 
 import math
@@ -30,18 +33,22 @@ ALIKE_SIGMAS, JUMP_SIGMAS = 3.0, 6.0  # beyond which a law is refused
 CONFIDENCE = 0.975  # one-sided bound: both sides together leave 5 %
 FLOOR = 1e-6  # relative: an instrument's rounding, below which residuals say nothing
 LIKELY = 6.0  # Akaike's criterion above the best law's: one in twenty as likely
-TAUS, MAX_TAU = 12, 3.0  # time constants that are tried, from a step between readings to 3 times their span
+# time constants that are tried, from a step between readings to 3 times their span
+TAUS, MAX_TAU = 12, 3.0
 END_SHARE = 0.01  # of the step between two time constants: nearer to the last one is at the end
 S_PER_H = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """When white is stable, and how it drifts at the last reading, relative to white there; errors are standard errors.
+    """When white is stable, and how it drifts at the last reading, relative to white there; errors
+    are standard errors.
 
-    `stable_after_s` is on the clock of the readings: infinite where the law never is stable, after the last reading where
-    it will be. `ahead` is the relative change in the next ten minutes; `is_stable` says that it is within `limit` at 95 %.
-    `law` explains the readings from `from_s` on; it is "none" where no law does, and then the figures are not known (nan).
+    `stable_after_s` is on the clock of the readings: infinite where the law never is stable, after
+    the last reading where
+    it will be. `ahead` is the relative change in the next ten minutes; `is_stable` says that it is
+    within `limit` at 95 %. `law` explains the readings from `from_s` on; it is "none" where no law
+    does, and then the figures are not known (nan).
     """
 
     law: str
@@ -60,7 +67,9 @@ class WarmUp:
 
     @property
     def bound(self) -> float:
-        """The relative change in the next ten minutes that is not exceeded at 95 %; nan where no law is found."""
+        """The relative change in the next ten minutes that is not exceeded at 95 %; nan where no
+        law is found.
+        """
         return abs(self.ahead) + float(stdtrit(self.dof, CONFIDENCE)) * self.ahead_error
 
     @property
@@ -90,7 +99,8 @@ class WarmUp:
 class _Law:
     """A law's parameters (w, s) or (w, a, tau), their covariance, and relative residuals (n,).
 
-    `at_end` says that the time constant is at an end of those that are tried: the readings do not have it.
+    `at_end` says that the time constant is at an end of those that are tried: the readings do not
+    have it.
     """
 
     parameters: FloatArray
@@ -121,9 +131,12 @@ class _Law:
         return len(self.parameters) == 3 and abs(self.parameters[1]) * math.exp(-at_s / self.parameters[2]) < self.noise / 3
 
     def foretold(self, span_s: float, limit: float) -> tuple[list[float], list[float]]:
-        """At `span_s`: slope, 1/s, and change in the next ten minutes, relative; when white is stable, s; and their errors."""
+        """At `span_s`: slope, 1/s, and change in the next ten minutes, relative; when white is
+        stable, s; and their errors.
+        """
         at = self._figures(self.parameters, span_s, limit)
-        steps = 1e-4 * np.sqrt(np.diag(self.covariance))  # small where an error is: the figures are linear there
+        # small where an error is: the figures are linear there
+        steps = 1e-4 * np.sqrt(np.diag(self.covariance))
         slopes = np.stack([(self._figures(self.parameters + step, span_s, limit) - at) / step.sum() for step in np.diag(steps)])
         return at.tolist(), np.sqrt(np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)).tolist()
 
@@ -142,9 +155,11 @@ class _Law:
 def watch_white(
     read: Callable[[], float], clock_ns: Callable[[], int], wait: Callable[[float], object], longest_s: float = LONGEST_S
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (n,), s from the first, and readings (n,) of white, every EVERY_S until it is stable or `longest_s` are over.
+    """Times (n,), s from the first, and readings (n,) of white, every EVERY_S until it is stable or
+    `longest_s` are over.
 
-    `wait` lets seconds pass. At least 12 readings are taken. Raises InputError for a reading without light.
+    `wait` lets seconds pass. At least 12 readings are taken. Raises InputError for a reading
+    without light.
     """
     t_s: list[float] = []
     light: list[float] = []
@@ -164,7 +179,9 @@ def watch_white(
 
 
 def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> WarmUp:
-    """When white is stable to `limit`, by readings (n,) at times (n,). Raises InputError for fewer than 12, or no readings."""
+    """When white is stable to `limit`, by readings (n,) at times (n,). Raises InputError for
+    fewer than 12, or no readings.
+    """
     if len(light) < MIN_READINGS or not (np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()):
         raise InputError(f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at rising times")
     for first in (part * len(light) // PARTS for part in range(PARTS)):
@@ -180,7 +197,8 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
 def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> WarmUp:
     """The figures of a law of readings (n,) at `t_s` (n,)."""
     span_s, half = float(t_s[-1] - t_s[0]), len(t_s) // 2
-    # An exponential that has died away says nothing of the drift: a line through the last half of the readings does.
+    # An exponential that has died away says nothing of the drift: a line through the last half of
+    # the readings does.
     end = _line(t_s[half:], light[half:]) if law.died_away(float(t_s[half] - t_s[0])) else law
     (_, _, stable_s), (_, _, stable_error_s) = law.foretold(span_s, limit)
     (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(span_s if end is law else 0.0, limit)
@@ -204,7 +222,9 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
 
 
 def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArray:
-    """White (n,) by the law that was found in these readings (n,), in their unit, for a chart; nan before `from_s`."""
+    """White (n,) by the law that was found in these readings (n,), in their unit, for a chart;
+    nan before `from_s`.
+    """
     drawn, used = np.full(len(t_s), np.nan), t_s >= found.from_s
     if found.law != "none":
         law = _laws(t_s[used], light[used])[found.law == "exponential"]

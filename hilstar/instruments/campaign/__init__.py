@@ -1,1 +1,3 @@
-"""Campaigns: many cases of a bench, run over every core and machine, into one table with its error budget."""
+"""Campaigns: many cases of a bench, run over every core and machine, into one table with its
+error budget.
+"""

@@ -1,4 +1,6 @@
-"""What a campaign on the bench says beside its budget: cases without answers, wrong answers, and the drift of the bench."""
+"""What a campaign on the bench says beside its budget: cases without answers, wrong answers, and
+the drift of the bench.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,9 @@ MAX_NAMED = 10
 
 
 def bench_summary(table: Path) -> dict[str, Any]:
-    """Write wrong.csv; the keys `no_answer`, `wrong_cases` and `drift` of `hilstar campaign --json`. Raises InputError."""
+    """Write wrong.csv; the keys `no_answer`, `wrong_cases` and `drift` of `hilstar campaign
+    --json`. Raises InputError.
+    """
     cases = read_cases(table)
     numbers, some = cases.numbers, np.flatnonzero(np.nan_to_num(cases.numbers["wrong"]) > 0)
     wrong = [

@@ -1,13 +1,18 @@
-"""A campaign before the real tracker (`through = "bench"`): the display shows each case, and `[answers]` says what it answered.
+"""A campaign before the real tracker (`through = "bench"`): the display shows each case, and
+`[answers]` says what it answered.
 
 One process and one frame loop, which never waits for the tracker. Laws:
 
-1. The order of the cases is drawn from the seed. Those that need another renderer stand together. A check case, always the same
+1. The order of the cases is drawn from the seed. Those that need another renderer stand together. A
+   check case, always the same
    attitude, comes before each `check_every` of them and at the end.
-2. A case has its row once it is over, and not before: one that a kill interrupts is shown again, in its place in the order.
-3. An answer belongs to a case whose frames alone were lit over its exposure. Until a case's first right answer, one that
+2. A case has its row once it is over, and not before: one that a kill interrupts is shown again, in
+   its place in the order.
+3. An answer belongs to a case whose frames alone were lit over its exposure. Until a case's first
+   right answer, one that
    fits the case before better than this one is late, and counts for neither.
-4. A tracker that falls silent within a case is waited for, up to `silent_s` after its last message. The case then begins again.
+4. A tracker that falls silent within a case is waited for, up to `silent_s` after its last message.
+   The case then begins again.
 """
 
 import csv
@@ -58,7 +63,9 @@ CHECK_COLUMNS = ("check", "begun_utc", "run", "answers", *(f"error_{axis}_arcsec
 
 
 class OpenDisplay(NamedTuple):
-    """An open bench with its screen (None: headless), a sink for its frames, and who follows the run."""
+    """An open bench with its screen (None: headless), a sink for its frames, and who follows the
+    run.
+    """
 
     bench: Bench
     screen: Screen | None = None
@@ -70,7 +77,9 @@ Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
 
 
 class BenchOrder:
-    """The order in which cases (and, from `cases` on, check cases) are shown; `keys` are the varied keys of the renderer."""
+    """The order in which cases (and, from `cases` on, check cases) are shown; `keys` are the
+    varied keys of the renderer.
+    """
 
     def __init__(self, plan: Plan, cases: int, maker: CaseMaker, design: Design) -> None:
         self.plan, self.maker, self.cases = plan, maker, cases
@@ -99,12 +108,16 @@ class BenchOrder:
         return Case(number, {}, 0, View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns))
 
     def renderer(self, number: int) -> str:
-        """What a case's renderer depends on, as a text that is the same for all cases of one renderer."""
+        """What a case's renderer depends on, as a text that is the same for all cases of one
+        renderer.
+        """
         values = self.case(number).values
         return msgspec.json.encode([values.get(key) for key in self._keys]).decode() if self._keys else ""
 
     def turns(self) -> Iterator[tuple[str, int, int]]:
-        """Renderer, number and place in the order of each case, check cases among them with the renderer of the next one."""
+        """Renderer, number and place in the order of each case, check cases among them with the
+        renderer of the next one.
+        """
         renderer = ""
         for place, number in enumerate(self.order.tolist()):
             renderer = self.renderer(number)
@@ -117,7 +130,9 @@ class BenchOrder:
 
 @dataclass(slots=True)
 class Tally:
-    """A case on the display, and its answers so far; times are of the host, ns. `begun_ns` None: nothing is lit yet."""
+    """A case on the display, and its answers so far; times are of the host, ns. `begun_ns` None:
+    nothing is lit yet.
+    """
 
     case: Case
     place: int
@@ -155,7 +170,9 @@ class Tally:
 
 
 class BenchRun:
-    """Shows the missing cases of a campaign, and keeps the row of each. Raises InputError and MachineError."""
+    """Shows the missing cases of a campaign, and keeps the row of each. Raises InputError and
+    MachineError.
+    """
 
     def __init__(
         self,
@@ -189,10 +206,13 @@ class BenchRun:
         self._now: Tally | None = None
         self._dark_until_ns = 0
         self._file_sha256 = ""
-        self._light_ns = self._last_row_ns = 0  # from a swap to the light of the middle row, and from there to the last one
+        # from a swap to the light of the middle row, and from there to the last one
+        self._light_ns = self._last_row_ns = 0
 
     def run(self, display: Display) -> bool:
-        """Show the missing cases, each renderer's on a display of its own; False where a signal ended the run first."""
+        """Show the missing cases, each renderer's on a display of its own; False where a signal
+        ended the run first.
+        """
         self._on_done(self._done)
         missing = {number for block in range(self.journal.blocks) for number in self.journal.missing(block)}
         for _, group in groupby((turn for turn in self._order.turns() if turn[1] in missing), lambda turn: turn[0]):
@@ -209,7 +229,9 @@ class BenchRun:
         self._on_done(self._done)
 
     def show(self, turns: list[tuple[int, int]], opened: OpenDisplay) -> bool:
-        """Show cases (number, place) that have one renderer; whether all of them are over, and no signal ended the run."""
+        """Show cases (number, place) that have one renderer; whether all of them are over, and
+        no signal ended the run.
+        """
         bench, screen = opened.bench, opened.screen
         period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         if self._frames is None:
@@ -306,14 +328,17 @@ class BenchRun:
             write_whole(self._now_path, msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}))
 
     def _listen(self, now_ns: int) -> None:
-        """Take the answers that have come, and end the case that has enough of them or whose time is over."""
+        """Take the answers that have come, and end the case that has enough of them or whose
+        time is over.
+        """
         assert self._judge is not None
         self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
         refused = sum(self._source.refusals().values())
         answers = self._source.take()
         if answers or refused != self._refused:
             self._heard_ns, self._refused = now_ns, refused
-            if self._waiting and self._now is not None:  # the tracker is back: its case begins again
+            # the tracker is back: its case begins again
+            if self._waiting and self._now is not None:
                 self._notices.tell("tracker-back", f"the tracker answers again; case {self._now.case.number} begins again")
                 self._begin(self._now.case.number, self._now.place)
         for answer in answers:
@@ -352,7 +377,9 @@ class BenchRun:
             now.take(judged, right)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
-        """Whether an answer is of the case on the display; one of the case before that comes late is counted."""
+        """Whether an answer is of the case on the display; one of the case before that comes
+        late is counted.
+        """
         half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
         if judged.middle_ns - half_ns < (now.begun_ns or 0) + self._last_row_ns:
             return False
@@ -394,9 +421,11 @@ def write_checks(path: Path, rows: list[Row], cases: int) -> None:
 
 
 def drift_of(path: Path) -> dict[str, Any] | None:
-    """The bench's drift over a campaign, by straight lines through the check cases of checks.csv; None for fewer than two.
+    """The bench's drift over a campaign, by straight lines through the check cases of checks.csv;
+    None for fewer than two.
 
-    `arcsec` (about x, y, z, cam) and `mag` are last minus first along that line, with their standard errors (None: two checks).
+    `arcsec` (about x, y, z, cam) and `mag` are last minus first along that line, with their
+    standard errors (None: two checks).
     """
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -411,7 +440,9 @@ def drift_of(path: Path) -> dict[str, Any] | None:
 
 
 def _line(at_s: FloatArray, values: list[float | None]) -> tuple[float, float | None] | None:
-    """The change of values along a straight line from the first to the last time, and its standard error."""
+    """The change of values along a straight line from the first to the last time, and its
+    standard error.
+    """
     known = np.array([value is not None for value in values])
     if known.sum() < 2:
         return None

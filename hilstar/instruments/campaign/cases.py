@@ -1,4 +1,6 @@
-"""A case: its attitude and bench file, from its number and its point in the design; and its row, from its answers."""
+"""A case: its attitude and bench file, from its number and its point in the design; and its row,
+from its answers.
+"""
 
 import dataclasses
 import hashlib
@@ -38,7 +40,8 @@ from hilstar.server.bench.scenario import Scenario, read_scenario
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
-ON_BENCH = ("sky", "render", "spacecraft", "rate_deg_s", "time_s", "scenario")  # what varies on a real bench
+# what varies on a real bench
+ON_BENCH = ("sky", "render", "spacecraft", "rate_deg_s", "time_s", "scenario")
 Kind = Literal["int64", "float64", "bool", "text"]
 
 DONE, FAILED = "done", "failed"
@@ -71,7 +74,9 @@ CENTROIDS = (
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case before its bench is made: its values by key, the seed of its noise, and the view of its first exposure."""
+    """A case before its bench is made: its values by key, the seed of its noise, and the view of
+    its first exposure.
+    """
 
     number: int
     values: dict[str, Any]
@@ -87,7 +92,9 @@ class _Log:
 
 
 class CaseMaker:
-    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for a fault of the plan."""
+    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for a
+    fault of the plan.
+    """
 
     def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
         self.plan, self.file = plan, file
@@ -116,7 +123,9 @@ class CaseMaker:
         return Case(number, values, int(seed), self._first(number, look, values))
 
     def bench(self, case: Case) -> BenchFile:
-        """The bench file with the case's values. Raises InputError where they do not go together."""
+        """The bench file with the case's values. Raises InputError where they do not go
+        together.
+        """
         file = changed_bench(self.file, self._tables, case.values)
         if self._log is not None:
             file = dated(file, self._log.scale, self._log.span_ns[0])
@@ -124,7 +133,9 @@ class CaseMaker:
         return _misaligned(file, np.array(turn_arcsec)) if any(turn_arcsec) else file
 
     def view(self, case: Case, frame: int, exposure_s: float) -> View:
-        """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along the log."""
+        """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along
+        the log.
+        """
         return self.after(case, round(frame * self.plan.step_s * NS_PER_S), exposure_s)
 
     def after(self, case: Case, step_ns: int, exposure_s: float = 0.0) -> View:
@@ -140,7 +151,9 @@ class CaseMaker:
         return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
-        """The faults of the case's scenario in an exposure, at the case's time or the log's since its beginning."""
+        """The faults of the case's scenario in an exposure, at the case's time or the log's
+        since its beginning.
+        """
         scenario = self.scenario(case)
         return None if scenario is None else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
 
@@ -154,7 +167,9 @@ class CaseMaker:
         return self._scenarios.get(str(case.values.get(SCENARIO, "")))
 
     def fault_end_s(self, case: Case, length_s: float) -> float | None:
-        """When the last fault of the case's scenario ends, after the case's begin; None outside its `length_s`."""
+        """When the last fault of the case's scenario ends, after the case's begin; None outside
+        its `length_s`.
+        """
         scenario = self.scenario(case)
         if scenario is None:
             return None
@@ -176,7 +191,9 @@ class CaseMaker:
 
 
 def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
-    """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): uniform over the sphere or the field's cap, and over the rolls."""
+    """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): uniform over the sphere or the
+    field's cap, and over the rolls.
+    """
     low_deg, high_deg = attitudes.roll_deg
     roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
     if attitudes.kind == "all-sky" or attitudes.radec_deg is None:
@@ -199,7 +216,9 @@ def _read_log(path: Path, file: BenchFile) -> _Log:
 
 
 def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
-    """The file with the display's true mounting turned from the assumed one by small angles (3,) about cam's axes."""
+    """The file with the display's true mounting turned from the assumed one by small angles (3,)
+    about cam's axes.
+    """
     config = file.config
     assumed = np.array(config.verify.true_q_cam_to_mon or config.collimator.q_cam_to_mon)
     true = normalise(multiply(assumed, from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD)))

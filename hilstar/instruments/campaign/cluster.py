@@ -1,4 +1,5 @@
-"""A campaign on a cluster: a Dask scheduler that somebody started, and its workers, which come and go.
+"""A campaign on a cluster: a Dask scheduler that somebody started, and its workers, which come and
+go.
 
 Each thread of a worker has a session, and a GL context, of its own.
 """
@@ -26,7 +27,8 @@ _here = threading.local()
 INSTALL = "install it: pip install 'hilstar[dask]'"
 PROTOCOLS = ("tcp", "tls", "ucx")
 GIVE_TLS = "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and workers have them"
-TASK_S = 1.0  # seconds of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
+# seconds of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
+TASK_S = 1.0
 SPARE_TASKS = 1  # that wait at a worker beside those that its threads work on
 POLL_S, LOOK_S = 0.25, 0.5
 CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
@@ -61,9 +63,11 @@ def _session(job: Job) -> Session:
 
 @dataclass(frozen=True, slots=True)
 class Scheduler:
-    """A scheduler's address ("tcp://HOST:PORT", "tls://HOST:PORT"), and TLS files under Dask's names.
+    """A scheduler's address ("tcp://HOST:PORT", "tls://HOST:PORT"), and TLS files under Dask's
+    names.
 
-    `tls_key` may be missing where the certificate's file has the key, and all three where Dask's own configuration has them.
+    `tls_key` may be missing where the certificate's file has the key, and all three where Dask's
+    own configuration has them.
     """
 
     address: str
@@ -74,8 +78,9 @@ class Scheduler:
     def check(self) -> str:
         """The address, with `localhost` as a number: a name could be resolved to anything.
 
-        Raises InputError for text that is no address, an address off loopback without TLS, and incomplete TLS. A scheduler
-        runs all code that it is sent: without certificates, anyone who reaches it runs code on every worker.
+        Raises InputError for text that is no address, an address off loopback without TLS, and
+        incomplete TLS. A scheduler runs all code that it is sent: without certificates, anyone who
+        reaches it runs code on every worker.
         """
         named, (protocol, _, host) = f"--scheduler {self.address}", self.address.partition("://")
         if protocol not in PROTOCOLS:
@@ -97,7 +102,9 @@ class Scheduler:
         return f"{protocol}://{endpoint.address.removeprefix('tcp://')}"
 
     def security(self) -> Any:
-        """Dask's security object. Raises InputError for files that are no certificates, and for tls:// without any."""
+        """Dask's security object. Raises InputError for files that are no certificates, and for
+        tls:// without any.
+        """
         from distributed.security import Security
 
         if not self.address.startswith("tls://"):
@@ -117,7 +124,9 @@ class Scheduler:
 
 @dataclass(slots=True)
 class _Worker:
-    """A worker: its threads, whether its identity is checked or refused, and its tasks, oldest first."""
+    """A worker: its threads, whether its identity is checked or refused, and its tasks, oldest
+    first.
+    """
 
     threads: int
     checked: bool = False
@@ -128,8 +137,8 @@ class _Worker:
 class Cluster(Closing):
     """The workers of a scheduler. Use it as a context manager.
 
-    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError as
-    `Scheduler.check` does, and MachineError where no scheduler answers.
+    A worker of another version, bench or renderer is refused with a line through `say` and gets no
+    case. Raises InputError as `Scheduler.check` does, and MachineError where no scheduler answers.
     """
 
     task_s = TASK_S
@@ -161,7 +170,8 @@ class Cluster(Closing):
                 why = f"nothing answers there; start one: dask scheduler {self._dask_words()}"
             raise MachineError(f"--scheduler {address}: {why}") from error
         listens: str = self._client.scheduler_info()["address"]
-        if not listens.startswith("tls://"):  # reached over loopback, and open to the network as well?
+        # reached over loopback, and open to the network as well?
+        if not listens.startswith("tls://"):
             with contextlib.suppress(InputError):
                 if not parse_endpoint(f"tcp://{listens.partition('://')[2]}").loopback:
                     self._say(
@@ -176,7 +186,9 @@ class Cluster(Closing):
         return "--host 127.0.0.1"
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
-        """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for too long."""
+        """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every
+        worker, is gone for too long.
+        """
         while True:
             if self._client.status == "closed":
                 raise self._gone()
@@ -216,7 +228,9 @@ class Cluster(Closing):
         )
 
     def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
-        """Drop a worker that is gone: a task that it worked on may be the cause, its other tasks are handed out again."""
+        """Drop a worker that is gone: a task that it worked on may be the cause, its other tasks
+        are handed out again.
+        """
         worker = self._workers.pop(address)
         gone = [future for future, at in self._examined.items() if at == address]
         for future in gone:
@@ -255,7 +269,8 @@ class Cluster(Closing):
                 said = future.result(timeout=FETCH_S)
                 why = difference(said, self._identity) if isinstance(said, Identity) else str(said)
             except Exception as error:  # an older hilstar without campaigns, or none at all
-                if future.status != "error":  # worker or scheduler is gone; a worker that is still there is asked again
+                # worker or scheduler is gone; a worker that is still there is asked again
+                if future.status != "error":
                     del self._workers[address]
                     continue
                 why = f"cannot run campaigns of this hilstar ({type(error).__name__}: {error}); install the same version there"
@@ -310,7 +325,9 @@ class Cluster(Closing):
 
 
 def _fetched(future: Any) -> Answered | None:
-    """A task's answer; None where it failed, or where its worker died before the answer was fetched."""
+    """A task's answer; None where it failed, or where its worker died before the answer was
+    fetched.
+    """
     if future.status != "finished":
         return None
     with contextlib.suppress(OSError, CancelledError):

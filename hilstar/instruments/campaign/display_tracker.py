@@ -1,4 +1,6 @@
-"""The virtual tracker before the display: each frame shown during an exposure, through the twin, to DN."""
+"""The virtual tracker before the display: each frame shown during an exposure, through the twin,
+to DN.
+"""
 
 from dataclasses import replace
 
@@ -24,12 +26,15 @@ from hilstar.tracker.detector import Detector
 
 
 class DisplayTracker:
-    """The bench's tracker before the bench's true display (`[verify] true_*`). Free it with `close`.
+    """The bench's tracker before the bench's true display (`[verify] true_*`). Free it with
+    `close`.
 
-    Frames follow one another at `[monitor] refresh_hz`, and each is held until the next. An exposure is the mean of the frames
-    that it spans, each at the attitude in the middle of its time. At rest one frame is drawn for all of them, unless they are
-    dithered in time or have satellites. Behind a rolling shutter the screen's scan-out, `hold_ms` and phase count as well.
-    The phase is random for a free tracker. Triggered, or without noise, the middle rows of screen and tracker begin together.
+    Frames follow one another at `[monitor] refresh_hz`, and each is held until the next. An
+    exposure is the mean of the frames that it spans, each at the attitude in the middle of its
+    time. At rest one frame is drawn for all of them, unless they are dithered in time or have
+    satellites. Behind a rolling shutter the screen's scan-out, `hold_ms` and phase count as well.
+    The phase is random for a free tracker. Triggered, or without noise, the middle rows of screen
+    and tracker begin together.
     """
 
     def __init__(self, file: BenchFile) -> None:
@@ -77,7 +82,9 @@ class DisplayTracker:
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
-        """One exposure of the display, without noise if there is no generator. Raises InputError as the detector does."""
+        """One exposure of the display, without noise if there is no generator. Raises InputError
+        as the detector does.
+        """
         exposure_s, view = view.exposure_s, rolled(view, self.config.tracker)
         if view.scan.scanout_s and exposure_s:
             shown, glow_e_per_s = self._rolling_e_per_s(view, rng)
@@ -114,7 +121,9 @@ class DisplayTracker:
         return np.zeros((0, 0, 0)) if total is None else total / count
 
     def _rolling_e_per_s(self, view: View, rng: np.random.Generator | None) -> tuple[FloatArray, FloatArray]:
-        """The mean light (primaries, H, W) of the display over each place's own exposure, and that of the glow (h, w)."""
+        """The mean light (primaries, H, W) of the display over each place's own exposure, and
+        that of the glow (h, w).
+        """
         period_s, free = 1 / self.config.monitor.refresh_hz, self.config.tracker.trigger == "free" and rng is not None
         phase_s = rng.uniform(0, period_s) if free and rng is not None else -view.exposure_s / 2
         light, glow = rolling_light(self._bench, self._optics.geometry, self._panel, view, phase_s)
@@ -127,7 +136,9 @@ class DisplayTracker:
 
 
 def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
-    """The keys that decide the bench's frames; of the tracker those of its light gathering and exposure."""
+    """The keys that decide the bench's frames; of the tracker those of its light gathering and
+    exposure.
+    """
     tracker = config.tracker
     gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.exposure_s
     open_part, drawn = tracker.detector.fill_factor, None if config.render.psf == GAUSSIAN else _optics_keys(config)

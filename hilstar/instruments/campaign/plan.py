@@ -1,7 +1,8 @@
 """The plan of a campaign: its file, the parameters that it varies, and its design.
 
-The file is TOML, read into checked and frozen tables. A parameter is a key of the bench file by its dotted name, or one of the
-case's own keys. The design gives each case a point of the unit cube, by the plan's sampling and seed alone.
+The file is TOML, read into checked and frozen tables. A parameter is a key of the bench file by its
+dotted name, or one of the case's own keys. The design gives each case a point of the unit cube, by
+the plan's sampling and seed alone.
 """
 
 import copy
@@ -41,7 +42,8 @@ MAX_VALUES = 10_000
 MAX_SEED = 2**63 - 1
 DEFAULT_ANSWERS, DEFAULT_TIMEOUT_S = 5, 10.0
 MAX_BENCH_CASES = 1_000_000
-BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")  # for through = "bench" alone
+# for through = "bench" alone
+BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")
 TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # for the others
 
 Sampling = Literal["grid", "latin-hypercube", "sobol"]
@@ -49,8 +51,9 @@ Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Ra = Annotated[float, Meta(ge=-360, le=360)]
 Dec = Annotated[float, Meta(ge=-90, le=90)]
 Roll = Annotated[float, Meta(ge=-360, le=720)]
-# Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam components; `across` is
-# about an axis in the image plane that each case draws. `misalignment_arcsec` turns the display's true mounting, cam axes.
+# Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam
+# components; `across` is about an axis in the image plane that each case draws.
+# `misalignment_arcsec` turns the display's true mounting, cam axes.
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
@@ -74,7 +77,9 @@ MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a who
 
 
 class Attitudes(Table, frozen=True):
-    """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`; `log` goes along a log."""
+    """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`;
+    `log` goes along a log.
+    """
 
     kind: Literal["all-sky", "field", "log"] = "all-sky"
     radec_deg: tuple[Ra, Dec] | None = None
@@ -98,7 +103,8 @@ TRACKER_PSF = "tracker"
 
 
 class Centroiding(Table, frozen=True):
-    """[centroids]: how `--solver centroids` finds stars, and which PSF `centroider = "psf"` is told.
+    """[centroids]: how `--solver centroids` finds stars, and which PSF `centroider = "psf"` is
+    told.
 
     `psf` is the tracker's own, the Gaussian nearest to it, or that of a file at `psf_focus_um`.
     """
@@ -115,7 +121,9 @@ class Centroiding(Table, frozen=True):
 
 
 class Require(Table, frozen=True):
-    """[[require]]: a limit of one figure, to be shown at `confidence`; `share` asks for the quantile of that share of cases."""
+    """[[require]]: a limit of one figure, to be shown at `confidence`; `share` asks for the
+    quantile of that share of cases.
+    """
 
     quantity: Quantity
     maximum: Number | None = None
@@ -297,7 +305,9 @@ class Condition(NamedTuple):
 
 
 def conditions_of(text: str) -> list[Condition]:
-    """The conditions of `condition = "KEY <= 0.5 and KEY > 0.1"`, none for an empty text. Raises InputError."""
+    """The conditions of `condition = "KEY <= 0.5 and KEY > 0.1"`, none for an empty text. Raises
+    InputError.
+    """
     found = []
     for part in text.split(" and ") if text.strip() else []:
         match = CONDITION.fullmatch(part)
@@ -316,7 +326,9 @@ def conditions_of(text: str) -> list[Condition]:
 
 
 def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]:
-    """The conditions on columns (name -> kind) of a campaign's table, by their names there. Raises InputError."""
+    """The conditions on columns (name -> kind) of a campaign's table, by their names there.
+    Raises InputError.
+    """
     found = []
     for key, comparison, value in conditions_of(text):
         name = f"vary.{key}" if f"vary.{key}" in columns else key
@@ -332,7 +344,9 @@ def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One varied key: its values in order, or its range. `whole` ones are rounded to whole numbers."""
+    """One varied key: its values in order, or its range. `whole` ones are rounded to whole
+    numbers.
+    """
 
     key: str
     values: tuple[Any, ...] = ()
@@ -352,7 +366,9 @@ class Parameter:
 
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
-    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError as the file does."""
+    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError
+    as the file does.
+    """
     tables = parse_toml(file.path, file.text)
     found = []
     for varied in plan.vary:
@@ -373,7 +389,9 @@ def grid_levels(plan: Plan) -> list[int]:
 
 
 def changed_bench(file: BenchFile, tables: dict[str, Any], values: dict[str, Any]) -> BenchFile:
-    """The bench file with some keys (dotted name -> value) changed. Raises InputError as the file itself would."""
+    """The bench file with some keys (dotted name -> value) changed. Raises InputError as the
+    file itself would.
+    """
     changes = {key: value for key, value in values.items() if key not in OWN_KEYS}
     if not changes:
         return file
@@ -424,7 +442,9 @@ def _now(names: list[str], config: Any) -> Any:
 
 
 def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> None:
-    """Set the key of dotted `names`. One number for a key of several (sigma along x and y) sets each of them."""
+    """Set the key of dotted `names`. One number for a key of several (sigma along x and y) sets
+    each of them.
+    """
     table: Any = tables
     for name in names[:-1]:
         inside = table.get(name) if isinstance(table, dict) else None
@@ -446,10 +466,11 @@ def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> N
 
 
 class Design:
-    """Points (n, dimensions) of the cases in [0, 1): the coordinates of the attitude, then one for each varied key.
+    """Points (n, dimensions) of the cases in [0, 1): the coordinates of the attitude, then one for
+    each varied key.
 
-    A grid's keys have `levels` values each, in order, the last key fastest, and repeat after the last combination. Raises
-    InputError for a Latin hypercube that does not fit into memory.
+    A grid's keys have `levels` values each, in order, the last key fastest, and repeat after the
+    last combination. Raises InputError for a Latin hypercube that does not fit into memory.
     """
 
     def __init__(self, sampling: Sampling, seed: int, cases: int, attitude_dimensions: int, levels: Sequence[int]) -> None:
@@ -481,7 +502,8 @@ class Design:
                 self._engine = qmc.Sobol(self.dimensions, scramble=True, bits=SOBOL_BITS, rng=rng)
             if begin > self._engine.num_generated:
                 self._engine.fast_forward(begin - self._engine.num_generated)
-            with warnings.catch_warnings():  # that the number of points is no power of two: the plan decides it
+            # that the number of points is no power of two: the plan decides it
+            with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 return np.asarray(self._engine.random(end - begin))
         points, own = np.empty((end - begin, self.dimensions)), self.attitude_dimensions

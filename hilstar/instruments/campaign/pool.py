@@ -16,7 +16,8 @@ from hilstar.instruments.campaign.session import Answered, Identity, Job, Sessio
 from hilstar.instruments.campaign.store import Journal
 
 FIRST_CASES, MAX_TASK_CASES = 1, 1000  # cases in a task
-# A task lasts at least so long for each worker there is: one driver and one scheduler keep up with 50 tasks a second.
+# A task lasts at least so long for each worker there is: one driver and one scheduler keep up with
+# 50 tasks a second.
 A_WORKER_S = 0.02
 TASK_S = 0.5  # seconds of work in a task: a kill loses about as much per worker
 SMOOTHING = 0.3
@@ -36,7 +37,9 @@ class Task:
 
 
 class Backlog:
-    """The missing cases of a journal, in tasks of about `target_s` that get shorter at the end: all workers end together."""
+    """The missing cases of a journal, in tasks of about `target_s` that get shorter at the end:
+    all workers end together.
+    """
 
     def __init__(self, design: Design, journal: Journal, target_s: float) -> None:
         self._design, self._target_s = design, target_s
@@ -85,7 +88,9 @@ class Backlog:
         self._waiting.append(task)
 
     def died(self, task: Task) -> int | None:
-        """Note that a worker died over a task: its cases come again one by one. Returns the case at fault once one is known."""
+        """Note that a worker died over a task: its cases come again one by one. Returns the case
+        at fault once one is known.
+        """
         if len(task) == 1:
             self._deaths[task.begin] = self._deaths.get(task.begin, 0) + 1
             if self._deaths[task.begin] >= MAX_DEATHS:
@@ -100,7 +105,8 @@ Lost = Callable[[Task, int | None], None]
 
 
 class Pool:
-    """`count` processes for a job, at most as many as fit into `memory_bytes` with this one. Use it as a context manager.
+    """`count` processes for a job, at most as many as fit into `memory_bytes` with this one. Use it
+    as a context manager.
 
     A process that dies is replaced, and its cases are run again.
     """
@@ -113,7 +119,8 @@ class Pool:
         self._starts_lost, self._peak_bytes = 0, 0
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
-        """Run all cases. `done` gets each task with its rows, `lost` a task whose worker died, and the case at fault if known.
+        """Run all cases. `done` gets each task with its rows, `lost` a task whose worker died, and
+        the case at fault if known.
 
         Raises InputError or MachineError where the workers cannot do the job.
         """
@@ -147,7 +154,9 @@ class Pool:
                     worker.give(task, task.begin, task.points)
 
     def _allowed(self) -> int:
-        """How many processes may run. With a memory budget it is one, until that one has reported its memory."""
+        """How many processes may run. With a memory budget it is one, until that one has
+        reported its memory.
+        """
         if self._memory_bytes is None:
             return self._count
         if not self._peak_bytes:

@@ -1,15 +1,22 @@
-"""Requirements of a plan against its cases: for each a figure, the bound that the cases support, and a verdict.
+"""Requirements of a plan against its cases: for each a figure, the bound that the cases support,
+and a verdict.
 
-Each figure has a one-sided limit on either side at the requirement's confidence c. A maximum is **met** where the upper limit
-is within it, **not met** where the lower one exceeds it, else **not shown**; a minimum the other way round. The limits:
+Each figure has a one-sided limit on either side at the requirement's confidence c. A maximum is
+**met** where the upper limit is within it, **not met** where the lower one exceeds it, else **not
+shown**; a minimum the other way round. The limits:
 
-- rates by Clopper & Pearson (1934). Answers of one case go together, so their number is divided by the design effect, the
-  variance between cases over the binomial one (Korn & Graubard 1998); where all or none are right, cases are counted;
-- quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case that never had an attitude
+- rates by Clopper & Pearson (1934). Answers of one case go together, so their number is divided by
+  the design effect, the
+  variance between cases over the binomial one (Korn & Graubard 1998); where all or none are right,
+  cases are counted;
+- quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case
+  that never had an attitude
   has an infinite time;
 - a bias by Student's t, across the boresight the larger of x and y;
-- a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap over blocks of cases;
-- field-of-view and pixel error by the bootstrap. What the noise alone could hide is added to their upper limit.
+- a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap
+  over blocks of cases;
+- field-of-view and pixel error by the bootstrap. What the noise alone could hide is added to their
+  upper limit.
 """
 
 import math
@@ -45,7 +52,9 @@ WAVE_COLUMNS = 2 * len(HARMONICS)
 
 @dataclass(frozen=True, slots=True)
 class RequirementVerdict:
-    """A requirement's verdict. `value` is the figure itself, None where it is not known, and `more` the cases still wanted."""
+    """A requirement's verdict. `value` is the figure itself, None where it is not known, and
+    `more` the cases still wanted.
+    """
 
     require: Require
     cases: int
@@ -70,7 +79,9 @@ class RequirementVerdict:
 
 @dataclass(frozen=True, slots=True)
 class _Figure:
-    """A figure with its one-sided limits; `rate` (count, of) is what decides how many cases are wanted."""
+    """A figure with its one-sided limits; `rate` (count, of) is what decides how many cases are
+    wanted.
+    """
 
     value: float
     low: float
@@ -81,7 +92,9 @@ class _Figure:
 
 
 class _TooFew(Exception):
-    """Why a figure is not known, with how many more cases could give it (None: cases alone cannot)."""
+    """Why a figure is not known, with how many more cases could give it (None: cases alone
+    cannot).
+    """
 
     def __init__(self, why: str, cases: int, more: int | None = None) -> None:
         super().__init__(why)
@@ -91,9 +104,11 @@ class _TooFew(Exception):
 def verdicts_of(
     requires: list[Require], cases: Columns, scale: Scale, seed: int, bench_arcsec: tuple[float, float] | None = None
 ) -> list[RequirementVerdict]:
-    """The verdict of each requirement over the cases. Raises InputError for a condition on a column that is not there.
+    """The verdict of each requirement over the cases. Raises InputError for a condition on a column
+    that is not there.
 
-    `bench_arcsec` is how far the bench's own attitude may be off, across and about: it is taken off an error's limit.
+    `bench_arcsec` is how far the bench's own attitude may be off, across and about: it is taken off
+    an error's limit.
     """
     cases = cases.some(np.arange(len(cases.numbers["frames"])) % -(-len(cases.numbers["frames"]) // MAX_FITTED_CASES) == 0)
     decomposed: dict[str, Decomposed | InputError] = {}
@@ -124,7 +139,9 @@ def verdicts_of(
 
 
 def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
-    """Which cases (n,) meet a condition. Raises InputError for a key that is neither varied nor a column."""
+    """Which cases (n,) meet a condition. Raises InputError for a key that is neither varied nor
+    a column.
+    """
     kinds = dict.fromkeys(cases.numbers, "float64") | dict.fromkeys(cases.texts, "text")
     chosen = np.ones(len(cases.numbers["frames"]), dtype=np.bool_)
     for name, comparison, value in checked_conditions(condition, kinds):
@@ -153,7 +170,9 @@ def _judged(require: Require, figure: _Figure, bench_arcsec: tuple[float, float]
 
 
 def _more(require: Require, figure: _Figure) -> int | None:
-    """How many more cases would decide, if the figure stays as it is; None where no number of cases would."""
+    """How many more cases would decide, if the figure stays as it is; None where no number of
+    cases would.
+    """
     limit, maximum, c = require.limit, require.minimum is None, require.confidence
     if figure.rate is not None:
         count, of = figure.rate
@@ -166,7 +185,8 @@ def _more(require: Require, figure: _Figure) -> int | None:
 
         if share == allowed or not decided(MAX_MORE):
             return None
-        few, enough = figure.cases, MAX_MORE  # by halves: a count's steps move the end by a case or two
+        # by halves: a count's steps move the end by a case or two
+        few, enough = figure.cases, MAX_MORE
         while enough - few > 1:
             middle = (few + enough) // 2
             few, enough = (few, middle) if decided(middle) else (middle, enough)
@@ -218,7 +238,9 @@ def _of_parts(found: Decomposed, axes: list[int], require: Require, rng: np.rand
 
 
 def clopper_pearson(count: float, of: float, confidence: float) -> tuple[float, float]:
-    """The one-sided limits of a rate of which `count` in `of` were seen, each at this confidence."""
+    """The one-sided limits of a rate of which `count` in `of` were seen, each at this
+    confidence.
+    """
     low = 0.0 if count <= 0 else float(stats.beta.ppf(1 - confidence, count, of - count + 1))
     high = 1.0 if count >= of else float(stats.beta.ppf(confidence, count + 1, of - count))
     return low, high
@@ -243,9 +265,12 @@ def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
 
 
 def quantile_limits(values: FloatArray, share: float, confidence: float) -> tuple[float, float]:
-    """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite where there are too few."""
+    """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite
+    where there are too few.
+    """
     ordered, n = np.sort(values), len(values)
-    upper = int(stats.binom.ppf(confidence, n, share))  # the smallest k with P(count <= k) >= confidence
+    # the smallest k with P(count <= k) >= confidence
+    upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
     lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
     return float(ordered[lower - 1]) if lower > 0 else -math.inf, float(ordered[upper]) if upper < n else math.inf
@@ -276,7 +301,8 @@ def _time(require: Require, cases: Columns) -> _Figure:
 def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> _Figure:
     standard, size = sigma / math.sqrt(n), np.abs(mean)
     upper = stats.t.ppf(confidence, n - 1)
-    lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)  # Bonferroni: of several axes any one may be the larger
+    # Bonferroni: of several axes any one may be the larger
+    lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)
     low = max(float((size - lower * standard).max()), 0.0)
     return _Figure(float(size.max()), low, float((size + upper * standard).max()), n, "Student's t")
 
@@ -311,7 +337,8 @@ def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Ge
     variance, n, method = float(square @ freedom / freedom.sum()), int(some.sum()), "chi-square, Gaussian"
     factor = 1.0 if require.share is None else float(stats.norm.ppf((1 + require.share) / 2))
     excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
-    if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):  # 14: the variance of that square, one degree of freedom a case
+    # 14: the variance of that square, one degree of freedom a case
+    if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):
         low, high = _sigma_limits(variance, float(freedom.sum()) * len(axes), require.confidence)
     else:
         low, high = np.sqrt(_drawn(square * freedom, freedom, rng, require.confidence)).tolist()

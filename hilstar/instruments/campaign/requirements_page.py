@@ -1,4 +1,6 @@
-"""The verdicts of a plan's requirements for their readers: requirements.csv, a chart, and one page that a person can sign."""
+"""The verdicts of a plan's requirements for their readers: requirements.csv, a chart, and one
+page that a person can sign.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -20,15 +22,19 @@ from hilstar.server.bench.certificate import bench_certificate, off_by
 
 COLUMNS = ("quantity", "axis", "condition", "limit", "bound", "confidence", "cases", "verdict")
 COLOURS = {MET: GREEN, NOT_MET: RED, NOT_SHOWN: ORANGE}
-DRAWN = ("noise", "nea", "fov-error", "pixel-error")  # one sigma across, which the chart's bins are too
+# one sigma across, which the chart's bins are too
+DRAWN = ("noise", "nea", "fov-error", "pixel-error")
 MAX_POINTS, MAX_BINS, MIN_IN_BIN = 4000, 10, 12
-MEDIAN_OF_SIGMA = float(np.sqrt(np.log(2)))  # the median of sqrt((x^2 + y^2) / 2), of Gaussian x and y of sigma 1
+# the median of sqrt((x^2 + y^2) / 2), of Gaussian x and y of sigma 1
+MEDIAN_OF_SIGMA = float(np.sqrt(np.log(2)))
 SIGN = ("Name", "Role", "Date", "Signature")
 SIGN_STYLE = "display:inline-block;width:45%;border-bottom:1px solid;margin:2.2em 4% 0 0"
 
 
 def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> list[RequirementVerdict]:
-    """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises InputError."""
+    """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises
+    InputError.
+    """
     cases, tracker = read_cases(table), file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
     certificate = bench_certificate(file) if plan.through == "bench" else None
@@ -103,7 +109,9 @@ def _badge(verdict: str) -> str:
 
 
 def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
-    """Error across the boresight against rate (or case, where no rate is varied), with the requirements of such errors."""
+    """Error across the boresight against rate (or case, where no rate is varied), with the
+    requirements of such errors.
+    """
     error, rate = _error_and_rate(cases)
     rated = bool(np.isfinite(rate).any() and np.ptp(rate[np.isfinite(rate)]) > 0)
     at = rate if rated else cases.numbers["case"]
@@ -117,7 +125,8 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
             axes.plot(at[some], error[some], ".", ms=3, color=MUTED, alpha=0.6, rasterized=True)
             order = known[np.argsort(at[known], kind="stable")]
             bins = np.array_split(order, max(1, min(MAX_BINS, len(order) // MIN_IN_BIN)))
-            sigma = [float(np.median(error[each])) / MEDIAN_OF_SIGMA for each in bins]  # wild answers do not move it
+            # wild answers do not move it
+            sigma = [float(np.median(error[each])) / MEDIAN_OF_SIGMA for each in bins]
             axes.plot([float(np.median(at[each])) for each in bins], sigma, "o-", color=BLUE)
             positive = at[known] > 0
             if rated and positive.all() and at[known].max() > 30 * at[known].min():
@@ -136,7 +145,9 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
 
 
 def _error_and_rate(cases: Columns) -> tuple[FloatArray, FloatArray]:
-    """Each case's error across the boresight about the median, arcsec, and its rate, deg/s (NaN: none is varied): (n,) each."""
+    """Each case's error across the boresight about the median, arcsec, and its rate, deg/s (NaN:
+    none is varied): (n,) each.
+    """
     x, y = (cases.numbers[f"error_{axis}_arcsec"] for axis in "xy")
     known = np.isfinite(x) & np.isfinite(y)
     if known.any():

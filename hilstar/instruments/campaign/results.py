@@ -1,14 +1,17 @@
 """The results of a campaign's table: the error budget of its cases, and what each parameter costs.
 
-**Budget.** The same decomposition as that of a run (`instruments/assess`), over cases that are independent of each other.
+**Budget.** The same decomposition as that of a run (`instruments/assess`), over cases that are
+independent of each other.
 
-**Costs.** Each measure (attitude error, centroid error, missing answers) is compared in bins of each parameter, with all others
-spread as the plan has them. A bin's level is the median of its cases, so that one field with two stars does not hide the effect
-in all others. Its standard error is half the distance between the order statistics sqrt(k) / 2 either side of the middle. (For
-missing answers the level is the mean.) A parameter's **cost** is the excess of the bins' rms over the best bin, in quadrature.
-Its **share** is the first-order index of Sobol (1993) of the cases' ranks: the variance of the bins' mean ranks over that of
-all, less what bins of that size have by chance. Attitude errors are taken about their median: a bias common to all cases is
-alignment, which no parameter costs.
+**Costs.** Each measure (attitude error, centroid error, missing answers) is compared in bins of
+each parameter, with all others spread as the plan has them. A bin's level is the median of its
+cases, so that one field with two stars does not hide the effect in all others. Its standard error
+is half the distance between the order statistics sqrt(k) / 2 either side of the middle. (For
+missing answers the level is the mean.) A parameter's **cost** is the excess of the bins' rms over
+the best bin, in quadrature. Its **share** is the first-order index of Sobol (1993) of the cases'
+ranks: the variance of the bins' mean ranks over that of all, less what bins of that size have by
+chance. Attitude errors are taken about their median: a bias common to all cases is alignment, which
+no parameter costs.
 """
 
 import math
@@ -38,7 +41,9 @@ VARY = "vary."
 SCATTER = "noise within a case"
 MAX_FITTED_CASES = 20_000  # cases in the fit of the budget, whose time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
-SURE = 4.0  # standard errors between the worst and the best bin; in 1 of 100 sets of 8 bins, noise alone has so many
+# standard errors between the worst and the best bin; in 1 of 100 sets of 8 bins, noise alone has so
+# many
+SURE = 4.0
 MAX_PANELS = 6
 WORDS = {
     "cross": "error across the boresight",
@@ -51,7 +56,9 @@ MAX_REASONS = 5
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns (n,) by name: numbers as float64 with NaN where there are none, and text. `cases` counts the whole table's."""
+    """Columns (n,) by name: numbers as float64 with NaN where there are none, and text. `cases`
+    counts the whole table's.
+    """
 
     cases: int
     numbers: dict[str, FloatArray]
@@ -101,7 +108,8 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
 
 
 def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tuple[dict[str, Any], Decomposed | None]:
-    """The budget of a campaign's cases by the keys of --json, and its parts, as `hilstar assess` has them.
+    """The budget of a campaign's cases by the keys of --json, and its parts, as `hilstar assess`
+    has them.
 
     A figure that too few answers determine is None, and a note says why.
     """
@@ -116,7 +124,8 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
         notes = parts.notes
     except InputError as refusal:
         notes = (str(refusal),)
-    scatter = cases.vectors("scatter_{}_arcsec", "xyz")  # between the frames of a case; none where cases have one
+    # between the frames of a case; none where cases have one
+    scatter = cases.vectors("scatter_{}_arcsec", "xyz")
     scatter = scatter[np.isfinite(scatter).all(axis=1)]
     return {
         "bias_arcsec": None if parts is None else parts.bias_arcsec.tolist(),
@@ -131,9 +140,12 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
 
 
 def attitudes_of(cases: Columns) -> tuple[FloatArray, FloatArray]:
-    """Commanded attitudes (n, 4), and reported ones, NaN where there is none: the case's mean error on the commanded one."""
+    """Commanded attitudes (n, 4), and reported ones, NaN where there is none: the case's mean
+    error on the commanded one.
+    """
     commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
-    if "lit_qw" in cases.numbers:  # on the bench a case in motion is where it was lit when the tracker looked
+    # on the bench a case in motion is where it was lit when the tracker looked
+    if "lit_qw" in cases.numbers:
         lit = cases.vectors("lit_q{}", "wxyz")
         commanded = np.where(np.isfinite(lit), lit, commanded)
     error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
@@ -157,7 +169,9 @@ def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[Fi
 
 
 def _centroids(cases: Columns) -> dict[str, float] | None:
-    """The centroider alone: mean error and one sigma, px, the share of stars found, and false finds per frame."""
+    """The centroider alone: mean error and one sigma, px, the share of stars found, and false
+    finds per frame.
+    """
     numbers = cases.numbers
     if "measured" not in numbers:
         return None
@@ -182,7 +196,9 @@ def _centroids(cases: Columns) -> dict[str, float] | None:
 
 @dataclass(frozen=True)
 class Measure:
-    """A figure of each case (n,), NaN where it has none. A bin's level is its median, with `mean` its mean."""
+    """A figure of each case (n,), NaN where it has none. A bin's level is its median, with
+    `mean` its mean.
+    """
 
     name: str
     unit: str
@@ -217,7 +233,9 @@ class Cost:
 
 
 def measures(cases: Columns) -> list[Measure]:
-    """The measures of the cases: attitude errors across and about the boresight, centroid errors, and missing answers."""
+    """The measures of the cases: attitude errors across and about the boresight, centroid
+    errors, and missing answers.
+    """
     numbers = cases.numbers
     errors = (numbers[f"error_{axis}_arcsec"] for axis in "xyz")
     x, y, z = (each - np.nanmedian(each) if np.isfinite(each).any() else each for each in errors)
@@ -283,7 +301,8 @@ def _share(values: FloatArray, index: IntArray, bins: int) -> float:
 
 
 def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple[float | str, ...], IntArray]:
-    """The places of a parameter's bins, and the bin of each good case; none where one of them has too few cases.
+    """The places of a parameter's bins, and the bin of each good case; none where one of them has
+    too few cases.
 
     Few distinct values are bins themselves.
     """
@@ -317,7 +336,9 @@ def _figure(value: float, cost: Cost) -> str:
 
 
 def draw_costs(path: Path, found: list[Cost]) -> None:
-    """A chart of one measure's costs, with a panel for each of the parameters that cost most. Raises InputError."""
+    """A chart of one measure's costs, with a panel for each of the parameters that cost most.
+    Raises InputError.
+    """
     shown = found[:MAX_PANELS]
     with chart(path, finding(shown), panels=len(shown), share_x=False) as axes:
         top = 1.15 * max(float((cost.level + cost.error).max()) for cost in shown) or 1.0
@@ -338,7 +359,8 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
 
 
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
-    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the JSON object of `hilstar campaign`.
+    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the JSON
+    object of `hilstar campaign`.
 
     Raises InputError where the table cannot be read, or a file not be written.
     """

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 
 class Campaign:
-    """A campaign that is checked and ready to run; nothing is written yet. Raises InputError or MachineError."""
+    """A campaign that is checked and ready to run; nothing is written yet. Raises InputError or
+    MachineError.
+    """
 
     def __init__(self, path: Path, directory: Path, solver: str, timeout_s: float, images: bool) -> None:
         require_parquet()
@@ -92,9 +94,11 @@ class Campaign:
         return About(plan, self.file.sha256, self.job.files_sha256, self.job.solver, self.job.images, identity)
 
     def run(self, directory: Directory, workers: "Pool | Cluster", on_done: Callable[[int], None]) -> None:
-        """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
+        """Run the missing cases, and write the table once none is missing. `on_done` gets the
+        number of finished cases.
 
-        Raises InputError where nothing can be written, and the workers' errors. The same call goes on from there.
+        Raises InputError where nothing can be written, and the workers' errors. The same call goes
+        on from there.
         """
         journal = directory.journal(self.cases)
         try:
@@ -119,7 +123,8 @@ class Campaign:
             journal.close()
 
     def show(self, directory: Directory, display: "Display", notices: Notices, on_done: Callable[[int], None]) -> bool:
-        """Show the missing cases on the bench, and write the tables once none is missing; False where a signal ended the run.
+        """Show the missing cases on the bench, and write the tables once none is missing; False
+        where a signal ended the run.
 
         Raises as `run` does. The same call goes on from there.
         """

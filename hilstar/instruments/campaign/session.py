@@ -1,7 +1,8 @@
-"""A worker's session: it checks that its rows would be the campaign's, and runs cases one after the other.
+"""A worker's session: it checks that its rows would be the campaign's, and runs cases one after the
+other.
 
-Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves all cases of a session, and
-changes with their bench files.
+Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves
+all cases of a session, and changes with their bench files.
 """
 
 import contextlib
@@ -81,7 +82,9 @@ def identity_of(gl_renderer: str) -> Identity:
 
 
 class Job(msgspec.Struct, frozen=True):
-    """The message that starts a worker: the plan and the bench as they were read, the solver, and the place of images."""
+    """The message that starts a worker: the plan and the bench as they were read, the solver,
+    and the place of images.
+    """
 
     plan_path: str
     plan_text: str
@@ -108,7 +111,9 @@ Imaging = Simulator | DisplayTracker  # a tracker that exposes, of the sky or of
 
 
 class Session:
-    """A worker's part of a campaign. Raises InputError where the plan or the bench cannot be used here, or differ."""
+    """A worker's part of a campaign. Raises InputError where the plan or the bench cannot be
+    used here, or differ.
+    """
 
     def __init__(self, job: Job) -> None:
         for name in OWN_THREADS:  # workers fill the cores
@@ -167,7 +172,8 @@ class Session:
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, exposure_s)
-            # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
+            # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and
+            # attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
             if isinstance(tracker, Simulator):
                 exposure = tracker.expose(view, rng, faults=self.maker.faults(case, view, tracker))
@@ -209,7 +215,9 @@ class Session:
 
 
 def files_sha256(plan: Plan, folder: Path) -> str:
-    """The digest of the files that a plan names beside its bench: its log, and its scenarios. Raises InputError."""
+    """The digest of the files that a plan names beside its bench: its log, and its scenarios.
+    Raises InputError.
+    """
     digest = hashlib.sha256()
     varied = [str(name) for each in plan.vary if each.key == SCENARIO for name in each.values or () if name]
     told = [] if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN) else [plan.centroids.psf]

@@ -1,7 +1,7 @@
 """Solvers: an image in, an attitude out.
 
-There are three: the centroider alone, whose stars the truth identifies; a Python function (`python:MODULE:FUNCTION`); and a
-command that gets an image and prints a quaternion.
+There are three: the centroider alone, whose stars the truth identifies; a Python function
+(`python:MODULE:FUNCTION`); and a command that gets an image and prints a quaternion.
 """
 
 import contextlib
@@ -54,7 +54,9 @@ CENTROIDS = "centroids"
 
 
 class SolverFault(Exception):
-    """A solver failed: it raised, ended with an error, took too long, or gave an answer that is no attitude."""
+    """A solver failed: it raised, ended with an error, took too long, or gave an answer that is
+    no attitude.
+    """
 
 
 SolvedTracker = Simulator | DisplayTracker | LiveTracker  # whose images are solved
@@ -62,10 +64,12 @@ SolvedTracker = Simulator | DisplayTracker | LiveTracker  # whose images are sol
 
 @dataclass(frozen=True, slots=True)
 class CentroidErrors:
-    """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus true, of matched stars.
+    """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus
+    true, of matched stars.
 
-    `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds belong to no star. Errors are
-    those of stars that are neither clipped, nor at the edge, nor crowded; `v_mag` (n,) are their magnitudes, `star` their rows.
+    `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds
+    belong to no star. Errors are those of stars that are neither clipped, nor at the edge, nor
+    crowded; `v_mag` (n,) are their magnitudes, `star` their rows.
     """
 
     stars: int
@@ -110,7 +114,8 @@ def checked_attitude(numbers: object, who: str) -> FloatArray:
 
 
 class CentroidSolver:
-    """Finds stars, and matches each star of the truth, brightest first, with the nearest find within 3 px.
+    """Finds stars, and matches each star of the truth, brightest first, with the nearest find
+    within 3 px.
 
     `folder` is that of the PSF's file, where `settings` name one.
     """
@@ -161,7 +166,9 @@ class CentroidSolver:
         return SolverAnswer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
 
     def _fitted(self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places) -> Places:
-        """Places (n,) of stars by the PSF that is told, from where a window found them; their spectra are known."""
+        """Places (n,) of stars by the PSF that is told, from where a window found them; their
+        spectra are known.
+        """
         psf, glass = self._told_by(tracker)
         pixels = np.rint(first[1]).astype(np.intp), np.rint(first[0]).astype(np.intp)
         reach = psf.footprint_px // 2 + 1
@@ -190,9 +197,11 @@ class CentroidSolver:
 
 
 class FunctionSolver:
-    """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the tracker's optics.
+    """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the
+    tracker's optics.
 
-    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. The module stands in `folder`.
+    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. The module stands in
+    `folder`.
     Raises InputError where there is no such function.
     """
 
@@ -204,7 +213,9 @@ class FunctionSolver:
             raise InputError(f"--solver {name}: {one_line(str(error))}; {FORM}") from error
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
-        """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""
+        """The function's answer. Raises SolverFault where it raises, takes too long, or its
+        answer is no attitude.
+        """
         try:
             with time_limit(self._timeout_s):
                 answer = self._function(given_image(exposure, tracker), tracker_facts(tracker))
@@ -218,7 +229,9 @@ class FunctionSolver:
 
 
 def given_image(exposure: Exposure, tracker: SolvedTracker) -> npt.NDArray[np.uint16]:
-    """The DN (height, width) that a solver gets, its own: of a mosaic as `[tracker.detector] solver_image` says."""
+    """The DN (height, width) that a solver gets, its own: of a mosaic as `[tracker.detector]
+    solver_image` says.
+    """
     return np.asarray(np.rint(software_image(exposure.dn, tracker.config.tracker.detector)), dtype=np.uint16)
 
 
@@ -240,7 +253,9 @@ def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError in the main thread after `seconds`; another thread cannot be interrupted."""
+    """Raise TimeoutError in the main thread after `seconds`; another thread cannot be
+    interrupted.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -258,11 +273,13 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 class CommandSolver:
-    """Runs a command for each image, without a shell: {image} is a FITS file of its DN alone, {png} a 16-bit PNG of them.
+    """Runs a command for each image, without a shell: {image} is a FITS file of its DN alone, {png}
+    a 16-bit PNG of them.
 
-    Other words in braces are the tracker's: {fov_deg}, {focal_length_px}, {width_px}, {height_px}. The last line of output with
-    four numbers, or with a JSON object that has "q", is q_icrs_to_cam, scalar first. Exit code 0 without such a line means no
-    attitude; any other code is a fault. Raises InputError for a template without an image.
+    Other words in braces are the tracker's: {fov_deg}, {focal_length_px}, {width_px}, {height_px}.
+    The last line of output with four numbers, or with a JSON object that has "q", is q_icrs_to_cam,
+    scalar first. Exit code 0 without such a line means no attitude; any other code is a fault.
+    Raises InputError for a template without an image.
     """
 
     def __init__(self, template: str, folder: Path, timeout_s: float) -> None:
@@ -278,14 +295,17 @@ class CommandSolver:
         self._folder, self._timeout_s = folder, timeout_s
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
-        """The command's answer. Raises SolverFault where it fails, takes too long, or its answer is no attitude."""
+        """The command's answer. Raises SolverFault where it fails, takes too long, or its answer
+        is no attitude.
+        """
         from astropy.io import fits
 
         facts = tracker_facts(tracker)
         with temporary_folder("solver") as folder:
             image, picture = folder / "image.fits", folder / "image.png"
             if any(IMAGE in word for word in self._words):
-                fits.PrimaryHDU(given_image(exposure, tracker)).writeto(image)  # the DN alone: no pointing, and no truth
+                # the DN alone: no pointing, and no truth
+                fits.PrimaryHDU(given_image(exposure, tracker)).writeto(image)
             if any(PICTURE in word for word in self._words):
                 write_dn_picture(picture, given_image(exposure, tracker))
             words = self._words
@@ -320,7 +340,9 @@ class CommandSolver:
 
 
 def printed_attitude(text: str) -> object | None:
-    """The quaternion in a program's output: its last line with four numbers, or what its JSON object has as "q"; or None."""
+    """The quaternion in a program's output: its last line with four numbers, or what its JSON
+    object has as "q"; or None.
+    """
     for line in reversed(text[-MAX_OUTPUT_CHARACTERS:].splitlines()):
         if line.lstrip().startswith("{"):
             with contextlib.suppress(ValueError, RecursionError):
@@ -337,7 +359,8 @@ def printed_attitude(text: str) -> object | None:
 
 
 def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float, plan_folder: Path = Path()) -> Solver:
-    """The solver that `text` names, with relative names in `folder`, those of the plan in `plan_folder`.
+    """The solver that `text` names, with relative names in `folder`, those of the plan in
+    `plan_folder`.
 
     Raises InputError for an unknown one.
     """

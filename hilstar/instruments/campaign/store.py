@@ -1,10 +1,13 @@
-"""A campaign's directory: the journal of rows as they come, and the Parquet table of all rows at the end.
+"""A campaign's directory: the journal of rows as they come, and the Parquet table of all rows at
+the end.
 
 The journal appends each row as one line with its checksum, to one file per block of cases. Laws:
 
-1. A row counts as done once its line is written whole. A line that a kill, a full disk or a crash cut off is dropped when
+1. A row counts as done once its line is written whole. A line that a kill, a full disk or a crash
+   cut off is dropped when
    the journal is opened again, and its case is run again.
-2. A block's file is renamed when all its cases are in it; such a file is not read again before the end.
+2. A block's file is renamed when all its cases are in it; such a file is not read again before the
+   end.
 3. One process writes at a time; it holds the lock of the campaign's directory.
 
 The table has one row per case, in their order. The same rows give the same bytes.
@@ -57,7 +60,9 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> "pa.Schem
 
 
 def write_table(path: Path, schema: "pa.Schema", blocks: Iterator[list[Row]]) -> None:
-    """Write blocks of rows, each as a row group, whole or not at all. Raises InputError where it cannot be written."""
+    """Write blocks of rows, each as a row group, whole or not at all. Raises InputError where it
+    cannot be written.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -97,7 +102,9 @@ def file_sha256(path: Path) -> str:
 
 
 class Journal:
-    """The rows of `cases` cases below `folder`. Raises InputError where it cannot be read or written."""
+    """The rows of `cases` cases below `folder`. Raises InputError where it cannot be read or
+    written.
+    """
 
     def __init__(self, folder: Path, cases: int) -> None:
         self.folder, self.cases = make_directory(folder), cases
@@ -143,7 +150,9 @@ class Journal:
         return new
 
     def rows(self, block: int) -> list[Row]:
-        """The rows of a full block in the order of their cases. Raises InputError where one is missing."""
+        """The rows of a full block in the order of their cases. Raises InputError where one is
+        missing.
+        """
         found = self._read(self._path(block, FULL))[0]
         if len(found) != len(self._block(block)):
             raise InputError(
@@ -176,7 +185,8 @@ class Journal:
         try:
             if block not in self._files:
                 self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-            while line:  # a full disk may take a part: that is a cut line, dropped at the next start
+            # a full disk may take a part: that is a cut line, dropped at the next start
+            while line:
                 line = line[os.write(self._files[block], line) :]
         except OSError as error:
             raise cannot_write(path, error, "make room, and run the same command again: it goes on") from error
@@ -247,7 +257,9 @@ class About(msgspec.Struct, frozen=True):
 
 
 class Directory:
-    """The directory of a campaign, locked against a second driver until `close`. Raises InputError where one has it."""
+    """The directory of a campaign, locked against a second driver until `close`. Raises
+    InputError where one has it.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = make_directory(path)
@@ -259,7 +271,9 @@ class Directory:
         return self.path / TABLE
 
     def claim(self, about: About) -> None:
-        """Claim the directory for this campaign. Raises InputError where it is another's, or holds another's files."""
+        """Claim the directory for this campaign. Raises InputError where it is another's, or
+        holds another's files.
+        """
         place = self.path / ABOUT
         if not place.exists():
             for name in (TABLE, JOURNAL):

@@ -1,4 +1,6 @@
-"""From a bench, and its readings where there are some, to the inputs of its budget and the model that they go through."""
+"""From a bench, and its readings where there are some, to the inputs of its budget and the model
+that they go through.
+"""
 
 import itertools
 import math
@@ -30,14 +32,16 @@ SEED = 5  # for the order of readings
 DOT_IMAGES = 4
 PLACES_IN_SQUARE = 7  # along each side
 READINGS_A_ROUND = 8  # between one black and white and the next
-LIBRARY_MAG = 0.013  # stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
+# stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
+LIBRARY_MAG = 0.013
 SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """An input and its slopes: on relative light at the model's levels (size, levels) and at stars (size, stars), places (size,
-    stars, 2), delay and lateness (size,), ms, and on what the sky adds to each star (size, 3, stars).
+    """An input and its slopes: on relative light at the model's levels (size, levels) and at stars
+    (size, stars), places (size, stars, 2), delay and lateness (size,), ms, and on what the sky adds
+    to each star (size, 3, stars).
     """
 
     input: Input
@@ -60,7 +64,9 @@ class Read:
 
 
 def read_bench(file: BenchFile, reader: Reader) -> Read:
-    """Read a bench for a certificate: its response, one pattern of dots, its delay. Raises InputError, MachineError."""
+    """Read a bench for a certificate: its response, one pattern of dots, its delay. Raises
+    InputError, MachineError.
+    """
     certify, rng = file.config.certify, np.random.default_rng(SEED)
     codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
@@ -70,7 +76,9 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
 
 
 def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generator) -> IntArray:
-    """Codes to read (n,), in even steps of their logarithm, the faintest all of them; black and white before every eight."""
+    """Codes to read (n,), in even steps of their logarithm, the faintest all of them; black and
+    white before every eight.
+    """
     count = min(levels, white)
     wanted = next(found for n in itertools.count(count) if len(found := np.unique(np.rint(np.geomspace(1, white, n)))) >= count)
     order = rng.permutation(np.repeat(wanted.astype(np.intp), repeats))
@@ -80,7 +88,9 @@ def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generato
 
 @dataclass(frozen=True, slots=True)
 class Assembled:
-    """Inputs, the model of all figures, each figure's (quantity, star or field, unit), and what was not assessed."""
+    """Inputs, the model of all figures, each figure's (quantity, star or field, unit), and what
+    was not assessed.
+    """
 
     inputs: list[Input]
     model: Model
@@ -94,7 +104,8 @@ def assemble(
 ) -> Assembled:
     """The budget of a bench. Raises InputError.
 
-    White was seen to change by `warm_up` in ten minutes, relative, and its checks' figures by `checked`; None: not looked at.
+    White was seen to change by `warm_up` in ten minutes, relative, and its checks' figures by
+    `checked`; None: not looked at.
     """
     figures = Figures(file, reference_stars(file))
     count, lights = len(figures.stars), len(figures.log_light)
@@ -193,7 +204,9 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
 
 
 def _of_delays(late_ms: FloatArray) -> Iterator[Effect]:
-    """The effects of edges (n,) that a photodiode saw: of each by itself, and of what correlates from one to the next."""
+    """The effects of edges (n,) that a photodiode saw: of each by itself, and of what correlates
+    from one to the next.
+    """
     count, order = len(late_ms), np.arange(len(late_ms), dtype=np.float64)
     lasts, source = in_time(order, late_ms - late_ms.mean(), np.ones((count, 1))), f"{count} edges of a photodiode"
     error = math.sqrt(lasts.noise_variance / count)
@@ -213,7 +226,9 @@ def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]
 
 
 def _of_structure(figures: Figures, read: Read, lasting: FloatArray, rough: FloatArray) -> Iterator[Effect]:
-    """The effects of what the residuals have left of structure, where they have it: in time, of codes, of light, of places."""
+    """The effects of what the residuals have left of structure, where they have it: in time, of
+    codes, of light, of places.
+    """
     light, even, place = read.light, read.even, read.place.at(figures.x_px, figures.y_px)
     if light.lasting.total:
         error, source = light.noise * math.sqrt(light.lasting.total), "readings that correlate from one to the next"
@@ -250,7 +265,9 @@ def _of_structure(figures: Figures, read: Read, lasting: FloatArray, rough: Floa
 
 
 def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: list[str]) -> Iterator[Effect]:
-    """The effects of a bench's calibration files and stated errors, and in `value` what the response has wrong."""
+    """The effects of a bench's calibration files and stated errors, and in `value` what the
+    response has wrong.
+    """
     monitor, certify, count = file.config.monitor, file.config.certify, len(figures.stars)
     name = monitor.calibration
     known = None if name in BUILT_IN else read_toml(file.folder / name)
@@ -282,7 +299,8 @@ def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: lis
         sides = zip((figures.y_px, figures.x_px), monitor.resolution_px[::-1], light_map.uniformity.shape, strict=True)
         rows, columns = (weights_of_grid(side, n)[np.rint(at).astype(np.intp)] for at, side, n in sides)
         weights = (rows[:, :, None] * columns[:, None]).reshape(count, -1)
-        slopes = field * np.linalg.qr(weights.T)[1]  # each field is known by itself, and stars share them
+        # each field is known by itself, and stars share them
+        slopes = field * np.linalg.qr(weights.T)[1]
         yield Effect(Input("evenness", "normal", f"fields of {name}", len(slopes), field, "relative"), even=slopes)
     yield from _of_geometry(file, figures, missing)
     yield from _stated_delay(file, missing)
@@ -293,7 +311,9 @@ def _by_freedom(dof: float) -> Distribution:
 
 
 def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
-    """The effects of a geometry file: the covariance of its fit over the screen, and that of an alignment."""
+    """The effects of a geometry file: the covariance of its fit over the screen, and that of an
+    alignment.
+    """
     name = file.config.collimator.geometry
     error = None if name is None else load_notes(file.folder / name).error
     if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
@@ -345,7 +365,9 @@ def _of_warm_up(file: BenchFile, count: int, seen: float | None, missing: list[s
 
 
 def _of_drift(figures: Figures, checked: dict[str, float] | None, missing: list[str]) -> Iterator[Effect]:
-    """Drift since the last check: anywhere within the largest change that was seen, of each quantity by itself."""
+    """Drift since the last check: anywhere within the largest change that was seen, of each
+    quantity by itself.
+    """
     if checked is None:
         missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
         return
@@ -391,7 +413,8 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
 
 
 def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
-    """The tracker itself, by whose lens and detector all is read, as [certify.tracker] states how well it is known.
+    """The tracker itself, by whose lens and detector all is read, as [certify.tracker] states how
+    well it is known.
 
     Its errors of direction and of evenness are taken as smooth: correlated over half of its field.
     """
@@ -420,7 +443,8 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
             " ([certify.tracker] evenness_expanded_relative is not written)"
         )
     elif even:
-        # Relative to the middle two places are off by a half each, in variance, where they are far apart.
+        # Relative to the middle two places are off by a half each, in variance, where they are far
+        # apart.
         from_middle = even / stated.k * (smooth[:, :count] - smooth[:, count:])
         vignetting = Input("tracker's evenness", "normal", source, len(at), even / stated.k, "relative")
         yield Effect(vignetting, even=from_middle)
@@ -435,7 +459,9 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
 
 
 def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
-    """What the sky and the codes add to each star: catalogue, spectrum, quantisation; they are in the star_ figures alone."""
+    """What the sky and the codes add to each star: catalogue, spectrum, quantisation; they are
+    in the star_ figures alone.
+    """
     stars = figures.stars
     count = len(stars)
 
@@ -462,7 +488,9 @@ def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[E
 
 
 def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The catalogue's errors of stars (n,) by their rows: of light in the tracker, mag, and of place along an axis, arcsec."""
+    """The catalogue's errors of stars (n,) by their rows: of light in the tracker, mag, and of
+    place along an axis, arcsec.
+    """
     sky = file.config.sky
     choice = catalogue_choice(file.config, file.folder)
     stars = choose_catalog(choice).taken(row)
@@ -478,7 +506,9 @@ def _rms(values: FloatArray) -> float:
 
 
 def spectrum_mag(file: BenchFile, b_v_mag: FloatArray) -> tuple[FloatArray, str]:
-    """The standard uncertainty of stars' light by the way from colour to spectrum (n,), mag, and its source."""
+    """The standard uncertainty of stars' light by the way from colour to spectrum (n,), mag, and
+    its source.
+    """
     if file.config.sky.spectrum != "blackbody" or file.config.sky.brightness != "dgs":
         return np.full(len(b_v_mag), LIBRARY_MAG), "real stars of one colour (study tradeoff: 0.026 mag at 95 %)"
     rates = []

@@ -1,9 +1,11 @@
-"""The budget: every input with its distribution, propagated to every figure by GUM and by its Supplement 1.
+"""The budget: every input with its distribution, propagated to every figure by GUM and by its
+Supplement 1.
 
-An input is a number of standardised variables that share one estimate of their spread. To first order (JCGM 100, 5.2) its
-contribution to a figure is the root of the squares of the figure's slopes by them, correlations included; degrees of freedom
-by Welch-Satterthwaite (G.4.1), coverage 95 % by Student's t. By Supplement 1 (JCGM 101, 7.9) trials of the whole model are
-drawn in batches until two digits of every figure stand, or the largest number of trials is reached.
+An input is a number of standardised variables that share one estimate of their spread. To first
+order (JCGM 100, 5.2) its contribution to a figure is the root of the squares of the figure's slopes
+by them, correlations included; degrees of freedom by Welch-Satterthwaite (G.4.1), coverage 95 % by
+Student's t. By Supplement 1 (JCGM 101, 7.9) trials of the whole model are drawn in batches until
+two digits of every figure stand, or the largest number of trials is reached.
 """
 
 import math
@@ -20,17 +22,22 @@ Distribution = Literal["normal", "Student t", "rectangular", "triangular"]
 COVERAGE = 0.95
 STEP = 1e-3  # in a standardised variable, for slopes
 BATCH = 5000
-DIFFER = 0.05  # relative to the expanded uncertainty: both ways are shown where an end of the interval differs by more
+# relative to the expanded uncertainty: both ways are shown where an end of the interval differs by
+# more
+DIFFER = 0.05
 SMALLEST = 1e-12
-FEW_DOF, FEW_SHARE = 10.0, 0.01  # a Student's t of few degrees of freedom shows from one per cent of the variance on
+# a Student's t of few degrees of freedom shows from one per cent of the variance on
+FEW_DOF, FEW_SHARE = 10.0, 0.01
 MAX_DOF = 1e6
 
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """An input of the budget: `size` standardised variables (mean 0, standard deviation 1) of one distribution.
+    """An input of the budget: `size` standardised variables (mean 0, standard deviation 1) of one
+    distribution.
 
-    `standard` and `unit` state its standard uncertainty for a reader, and `source` where it is from.
+    `standard` and `unit` state its standard uncertainty for a reader, and `source` where it is
+    from.
     """
 
     name: str
@@ -53,12 +60,15 @@ class Input:
         return np.asarray(normal)
 
 
-Model = Callable[[list[FloatArray]], FloatArray]  # variables of each input (b, size) to figures (b, figures)
+# variables of each input (b, size) to figures (b, figures)
+Model = Callable[[list[FloatArray]], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
 class Combined:
-    """Figures by first order: value, standard uncertainty, freedom, interval (figures,); contributions (figures, inputs)."""
+    """Figures by first order: value, standard uncertainty, freedom, interval (figures,);
+    contributions (figures, inputs).
+    """
 
     value: FloatArray
     standard: FloatArray
@@ -70,7 +80,9 @@ class Combined:
 
 @dataclass(frozen=True, slots=True)
 class BudgetTrials:
-    """Figures by trials: mean, standard deviation and the shortest-tailed interval (figures,), and whether two digits stand."""
+    """Figures by trials: mean, standard deviation and the shortest-tailed interval (figures,),
+    and whether two digits stand.
+    """
 
     mean: FloatArray
     standard: FloatArray
@@ -101,7 +113,9 @@ def first_order(model: Model, inputs: list[Input]) -> Combined:
 
 
 def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_trials: int) -> BudgetTrials:
-    """Draw trials until two digits of every standard uncertainty and interval stand, or `max_trials` are drawn."""
+    """Draw trials until two digits of every standard uncertainty and interval stand, or
+    `max_trials` are drawn.
+    """
     tails = (1 - COVERAGE) / 2, (1 + COVERAGE) / 2
     batches: list[FloatArray] = []
     settled = False
@@ -120,7 +134,9 @@ def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_t
 
 
 def why_they_differ(combined: Combined, drawn: BudgetTrials, inputs: list[Input], number: int) -> str:
-    """Why the intervals of a figure by both ways differ; "" where they agree within DIFFER of their half width."""
+    """Why the intervals of a figure by both ways differ; "" where they agree within DIFFER of
+    their half width.
+    """
     half = (combined.upper[number] - combined.lower[number]) / 2
     off = max(abs(combined.lower[number] - drawn.lower[number]), abs(combined.upper[number] - drawn.upper[number]))
     if half <= SMALLEST or off <= DIFFER * half:

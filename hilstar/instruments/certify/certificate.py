@@ -1,4 +1,6 @@
-"""From a budget to a certificate: figures with their intervals, conformity by the decision rule, files, dates, its number."""
+"""From a budget to a certificate: figures with their intervals, conformity by the decision rule,
+files, dates, its number.
+"""
 
 import datetime
 import math
@@ -64,7 +66,8 @@ def certify(
     checked: dict[str, float] | None = None,
     replaces: str | None = None,
 ) -> tuple[Certificate, bytes | None]:
-    """Certify a bench, by readings where there is a reader, else by its files; and the readings that checks refer to, as JSON.
+    """Certify a bench, by readings where there is a reader, else by its files; and the readings
+    that checks refer to, as JSON.
 
     `warm_up` and `checked` are as in `assemble`. Raises InputError, MachineError.
     """
@@ -223,7 +226,9 @@ def files_of(file: BenchFile) -> dict[str, str]:
 
 
 def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
-    """The monitor's mode by the bench file, and its identity: that which was read, else that of the calibration files."""
+    """The monitor's mode by the bench file, and its identity: that which was read, else that of
+    the calibration files.
+    """
     monitor = file.config.monitor
     named = [now] if now is not None else [each.identity for each in measured_on(file) if each.identity is not None]
     return {

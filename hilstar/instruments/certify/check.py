@@ -1,7 +1,9 @@
-"""The check in a minute: twelve patches, one pattern of dots and one delay, against the same readings of the certificate.
+"""The check in a minute: twelve patches, one pattern of dots and one delay, against the same
+readings of the certificate.
 
-Each figure is a difference with its uncertainty. It is out of tolerance where it exceeds its tolerance by more than noise
-explains, at a probability by which all figures of a check together raise a false alarm once in 10 000 checks (Bonferroni).
+Each figure is a difference with its uncertainty. It is out of tolerance where it exceeds its
+tolerance by more than noise explains, at a probability by which all figures of a check together
+raise a false alarm once in 10 000 checks (Bonferroni).
 """
 
 import csv
@@ -34,7 +36,8 @@ MAX_BYTES = 50_000_000
 CHECKS, CHART = "checks.csv", "checks"
 # Beyond noise, what a bench may move before its certificate is in doubt.
 TOLERANCES = {
-    "brightness": (0.25, "%"),  # with the noise's part of the threshold, half of the 1 % that is to be caught
+    # with the noise's part of the threshold, half of the 1 % that is to be caught
+    "brightness": (0.25, "%"),
     "gamma": (0.004, ""),
     "response_rest": (0.2, "%"),
     "black": (0.02, "% of white"),
@@ -50,7 +53,9 @@ TOLERANCES = {
 
 
 class CheckReadings(msgspec.Struct, frozen=True, kw_only=True):
-    """The readings of a check, as reference.json keeps those of the certificate: codes, light, dots, delays."""
+    """The readings of a check, as reference.json keeps those of the certificate: codes, light,
+    dots, delays.
+    """
 
     code: list[int]
     light: list[float]
@@ -68,7 +73,9 @@ class CheckReadings(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class CheckFigure:
-    """A difference from the certificate: its 95 % interval, its tolerance, and whether it is within it."""
+    """A difference from the certificate: its 95 % interval, its tolerance, and whether it is
+    within it.
+    """
 
     quantity: str
     value: float
@@ -116,7 +123,9 @@ def by_bench_file(file: BenchFile) -> CheckReadings:
 
 
 def read_reference(path: Path) -> CheckReadings | None:
-    """The readings of a certificate; None where there are none. Raises InputError for a file that has none."""
+    """The readings of a certificate; None where there are none. Raises InputError for a file
+    that has none.
+    """
     if not exists(path):
         return None
     try:
@@ -126,7 +135,9 @@ def read_reference(path: Path) -> CheckReadings | None:
 
 
 def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[CheckFigure]:
-    """The figures of a check against its reference. Raises InputError where they have too little in common."""
+    """The figures of a check against its reference. Raises InputError where they have too little
+    in common.
+    """
     found = [*_light(was, now), *_geometry(file, was, now)]
     psf_u = 100 * math.hypot(was.psf_u_px, now.psf_u_px) / was.psf_px
     found.append(("psf", 100 * (now.psf_px / was.psf_px - 1), psf_u, ALARMED_DOF, 0.0))
@@ -138,7 +149,9 @@ def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Che
 
 
 def _judged(quantity: str, value: float, u: float, dof: float, free: float, probability: float) -> CheckFigure:
-    """A figure with its threshold; with `free` numbers of freedom it is a root mean square, tested by F."""
+    """A figure with its threshold; with `free` numbers of freedom it is a root mean square,
+    tested by F.
+    """
     tolerance, unit = TOLERANCES[quantity]
     if free:  # a mean square of noise alone is u^2 times F's
         k = math.sqrt(fdtri(free, dof, 1 - probability))
@@ -158,7 +171,9 @@ Figure = tuple[str, float, float, float, float]
 
 
 def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
-    """Brightness, gamma, what is left of the response, and black: the change of each code's light."""
+    """Brightness, gamma, what is left of the response, and black: the change of each code's
+    light.
+    """
     codes = np.unique(was.code)
     sets = [(np.array(each.code), np.array(each.light)) for each in (was, now)]
     if not np.array_equal(codes, np.unique(now.code)):
@@ -196,7 +211,9 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
 
 
 def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Figure]:
-    """Evenness, scale, rotation, shift, and what is left of the geometry, by the dots that both have."""
+    """Evenness, scale, rotation, shift, and what is left of the geometry, by the dots that both
+    have.
+    """
     places = [{(x, y): k for k, (x, y) in enumerate(zip(each.x_px, each.y_px, strict=True))} for each in (was, now)]
     both = sorted(places[0].keys() & places[1].keys())
     dots = []
@@ -241,7 +258,9 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
 
 
 def record(folder: Path, made: datetime.datetime, since: str, figures: list[CheckFigure]) -> list[dict[str, str]]:
-    """Add a check to checks.csv and draw all of them; its rows. Raises InputError where they cannot be read or written."""
+    """Add a check to checks.csv and draw all of them; its rows. Raises InputError where they
+    cannot be read or written.
+    """
     path = folder / CHECKS
     columns = ["made", "certificate", *(field.name for field in fields(CheckFigure))]
     rows: list[dict[str, str]] = []
@@ -288,7 +307,9 @@ def checks_in(folder: Path) -> int:
 
 
 def largest_changes(folder: Path) -> dict[str, float] | None:
-    """The largest change of each quantity over all checks, in its unit; None without checks. Raises InputError."""
+    """The largest change of each quantity over all checks, in its unit; None without checks.
+    Raises InputError.
+    """
     path = folder / CHECKS
     if not exists(path):
         return None
@@ -302,7 +323,9 @@ def largest_changes(folder: Path) -> dict[str, float] | None:
 
 
 def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:
-    """Watch white until it is stable to 0.2 %, or for so long, and draw it. Raises InputError, MachineError."""
+    """Watch white until it is stable to 0.2 %, or for so long, and draw it. Raises InputError,
+    MachineError.
+    """
 
     def read() -> float:
         return float(reader.light(np.array([white], dtype=np.intp)).light[0])

@@ -1,12 +1,17 @@
-"""Readings to a bench's deviations from its file, with their covariances: light by code and place, places, delay.
+"""Readings to a bench's deviations from its file, with their covariances: light by code and place,
+places, delay.
 
-All fits are linear least squares without a prior, so that their intervals hold by Student's t: a smoother curve would be
-nearer to the truth on the whole, and not hold it where its bias is larger than its scatter. What their residuals have of
-structure (structure.py) counts beside their noise. Places are lens.py's.
+All fits are linear least squares without a prior, so that their intervals hold by Student's t: a
+smoother curve would be nearer to the truth on the whole, and not hold it where its bias is larger
+than its scatter. What their residuals have of structure (structure.py) counts beside their noise.
+Places are lens.py's.
 
-    light      read / expected at each code read, above black, joined by a cubic spline in log light; a drift in time.
-               Scatter relative to light and scatter in the dark are two estimates, each with its own freedom
-    evenness   log(light of a dot / expected) over the screen, Chebyshev polynomials, relative to the middle
+    light      read / expected at each code read, above black, joined by a cubic spline in log
+    light; a drift in time.
+               Scatter relative to light and scatter in the dark are two estimates, each with its
+               own freedom
+    evenness   log(light of a dot / expected) over the screen, Chebyshev polynomials, relative to
+    the middle
 
 A polynomial's degree rises from its first one as long as the next is better by an F test.
 """
@@ -35,21 +40,25 @@ DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows
 MIN_LEVELS = 4
 FAINT_SIGMAS = 5.0
-BRIGHT = 0.05  # relative to white: light by which the relative noise of a reading is known; black tells its floor
+# relative to white: light by which the relative noise of a reading is known; black tells its floor
+BRIGHT = 0.05
 MIN_DOF = 2
 ROUGH_P, ROUGH_CODES, MIN_ROUGH_CODES = 0.001, 5, 8
-MAX_ROUGH_STEP = 0.35  # between codes read, in log light: across a wider gap a smooth response is off by itself
+# between codes read, in log light: across a wider gap a smooth response is off by itself
+MAX_ROUGH_STEP = 0.35
 SAME_LIGHT = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class LightDeviation:
-    """True over expected light at the codes read: `value` (k,) over `log_light` (k,), log of light relative to white.
+    """True over expected light at the codes read: `value` (k,) over `log_light` (k,), log of light
+    relative to white.
 
-    `factors` (k, m) times its transpose is the covariance by `noise`, which is relative to light; `dark_factors` by the scatter
-    of dark readings, `dark` relative to white, `lasting_factors` by what correlates from one reading to the next, `lasting`
-    in sigmas of a reading; `common_factors` by what readings have in common. It holds for the first reading's moment, and
-    for the mean over `square_px` (left, top, side).
+    `factors` (k, m) times its transpose is the covariance by `noise`, which is relative to light;
+    `dark_factors` by the scatter of dark readings, `dark` relative to white, `lasting_factors` by
+    what correlates from one reading to the next, `lasting` in sigmas of a reading; `common_factors`
+    by what readings have in common. It holds for the first reading's moment, and for the mean over
+    `square_px` (left, top, side).
     """
 
     log_light: FloatArray
@@ -66,7 +75,9 @@ class LightDeviation:
     common_factors: FloatArray
 
     def weights(self, log_light: FloatArray) -> FloatArray:
-        """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes read it is held."""
+        """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes
+        read it is held.
+        """
         spline = CubicSpline(self.log_light, np.eye(len(self.log_light)), bc_type="natural")
         return np.asarray(spline(np.clip(log_light, self.log_light[0], self.log_light[-1])))
 
@@ -75,10 +86,12 @@ class LightDeviation:
         return np.asarray(self.weights(log_light) @ self.value - np.interp(log_light, self.log_light, self.value))
 
     def rough(self, log_light: FloatArray) -> FloatArray:
-        """How far single codes may be from the spline through those read, at lights (n,), one sigma; 0 where nothing tells it.
+        """How far single codes may be from the spline through those read, at lights (n,), one
+        sigma; 0 where nothing tells it.
 
-        Each code read is foretold by the others. Where they are further off than noise explains (F, one in a thousand), that
-        of the codes around a light holds for those between them that were not read.
+        Each code read is foretold by the others. Where they are further off than noise explains (F,
+        one in a thousand), that of the codes around a light holds for those between them that were
+        not read.
         """
         count = len(self.value)
         gaps = np.eye(count)
@@ -105,10 +118,11 @@ class LightDeviation:
 
 
 def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
-    """The deviation of a bench's light by readings. Raises InputError where they are too few, or have no light.
+    """The deviation of a bench's light by readings. Raises InputError where they are too few, or
+    have no light.
 
-    A reading is the light of its code and of black, times a drift; its noise goes with all light that it sees, and has a floor
-    where a black screen scatters by more than that.
+    A reading is the light of its code and of black, times a drift; its noise goes with all light
+    that it sees, and has a floor where a black screen scatters by more than that.
     """
     codes, place, count = np.unique(read.code, return_inverse=True, return_counts=True)
     hours = (read.t_s - read.t_s[0]) / 3600
@@ -123,7 +137,8 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     design[np.arange(len(read.code)), place] = 1.0
     if timed:
         design[:, -1] = hours * mean[place]
-    # Light and dark share no readings, so that their scatters are two estimates, and weights take nothing from their freedom.
+    # Light and dark share no readings, so that their scatters are two estimates, and weights take
+    # nothing from their freedom.
     lit = np.maximum(mean[place] - mean[0], 0.0)
     bright, dark = lit > BRIGHT * lit.max(), place == 0
     shape = np.ones(len(read.code))
@@ -182,7 +197,9 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Polynomials over the screen: coefficients (terms, columns), factors (terms, terms) of each column, their freedom."""
+    """Polynomials over the screen: coefficients (terms, columns), factors (terms, terms) of each
+    column, their freedom.
+    """
 
     degree: int
     resolution_px: tuple[int, int]
@@ -196,7 +213,9 @@ class Surface:
         return field_terms(x_px, y_px, self.resolution_px, self.degree)
 
     def bowed(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """How far the first column's surface and its own map of MAP fields, linear between them, are apart at pixels (n,)."""
+        """How far the first column's surface and its own map of MAP fields, linear between them,
+        are apart at pixels (n,).
+        """
         wide, high = self.resolution_px
         x, y = ((np.arange(n) + 0.5) * side / n - 0.5 for n, side in zip(MAP, self.resolution_px, strict=True))
         grid = (self.terms(*(part.ravel() for part in np.meshgrid(x, y))) @ self.value[:, 0]).reshape(MAP[::-1])
@@ -210,7 +229,9 @@ class Surface:
 def surface(
     x_px: FloatArray, y_px: FloatArray, values: FloatArray, degrees: tuple[int, ...], resolution_px: tuple[int, int]
 ) -> Surface:
-    """Fit a surface to values (n, columns) at pixels; wild ones do not count. Raises InputError for too few dots."""
+    """Fit a surface to values (n, columns) at pixels; wild ones do not count. Raises InputError
+    for too few dots.
+    """
     kept = np.isfinite(values).all(axis=1)
     best: Surface | None = None
     best_squares = 0.0
@@ -244,7 +265,9 @@ def surface(
 
 
 def place_errors(file: BenchFile, read: DotReadings) -> FloatArray:
-    """Where each dot is seen less where the bench file shows it (n, 2), arcsec along the image's x and y."""
+    """Where each dot is seen less where the bench file shows it (n, 2), arcsec along the image's
+    x and y.
+    """
     geometry = geometry_of(file)
     seen = geometry.tracker.rays(read.seen_x_px, read.seen_y_px)
     shown = geometry.monitor.rays(read.x_px, read.y_px)
@@ -252,7 +275,9 @@ def place_errors(file: BenchFile, read: DotReadings) -> FloatArray:
 
 
 def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
-    """log(light of dots / expected) over the screen; only its differences mean anything. Raises InputError."""
+    """log(light of dots / expected) over the screen; only its differences mean anything. Raises
+    InputError.
+    """
     size = file.config.monitor.resolution_px
     known = bench_calibration(file.config, file.folder).uniformity_map(size)
     at = np.rint(read.y_px).astype(np.intp), np.rint(read.x_px).astype(np.intp)
@@ -271,7 +296,9 @@ def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
 
 @dataclass(frozen=True, slots=True)
 class Evenness:
-    """The light over the screen: its surface, and what structure the dots have about it, which is the screen's own."""
+    """The light over the screen: its surface, and what structure the dots have about it, which
+    is the screen's own.
+    """
 
     fit: Surface
     cells: Cells
@@ -279,7 +306,9 @@ class Evenness:
     found: Structure
 
     def scatter(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
-        """What the structure adds to sums of log light: factors (k, sums) at pixels (n,), whose shares are (sums, n)."""
+        """What the structure adds to sums of log light: factors (k, sums) at pixels (n,), whose
+        shares are (sums, n).
+        """
         terms = self.fit.terms(x_px, y_px)
         by_cell = self.cells.means(self.solve.T) * self.cells.count[:, None]
         weights = shares @ terms @ by_cell.T

@@ -1,9 +1,11 @@
-"""Places of dots to a bench's deviations of place: a lens, its residuals' structure, and polynomials where no lens will do.
+"""Places of dots to a bench's deviations of place: a lens, its residuals' structure, and
+polynomials where no lens will do.
 
-The lens is fitted to directions as the bench file has them, so that it is the identity where the file is right; its rotation is
-the tracker's alignment. A screen and a lens are smooth: structure of the size of a dot's noise that such a lens leaves is an
-error of the dots, as from the pattern of the tracker's pixels. It stays in no place that is stated, and counts by what the fit
-takes up of it. Structure that is larger is of the bench: polynomials follow it.
+The lens is fitted to directions as the bench file has them, so that it is the identity where the
+file is right; its rotation is the tracker's alignment. A screen and a lens are smooth: structure of
+the size of a dot's noise that such a lens leaves is an error of the dots, as from the pattern of
+the tracker's pixels. It stays in no place that is stated, and counts by what the fit takes up of
+it. Structure that is larger is of the bench: polynomials follow it.
 """
 
 import math
@@ -27,9 +29,10 @@ WILD_SIGMAS = 6.0
 DERIVATIVE_STEP = 1e-4  # of a parameter's number
 HALF_TANGENT = 0.1  # scale of directions, so that decentring has numbers of order 1
 SAME = 1e-7  # relative size of a combination of parameters that no dot tells
-DOT_VARIANCE = 4.0  # relative to noise: larger structure is of the bench, and not an error of its dots
-# Of polynomials beside the lens's numbers. Planted lenses in another form, with tilts of 1 degree, are then within 0.0013
-# arcsec, with decentring of the fifth order; without that within 0.03.
+# relative to noise: larger structure is of the bench, and not an error of its dots
+DOT_VARIANCE = 4.0
+# Of polynomials beside the lens's numbers. Planted lenses in another form, with tilts of 1 degree,
+# are then within 0.0013 arcsec, with decentring of the fifth order; without that within 0.03.
 BESIDE_DEGREE = 3
 DEGREES = (7, 9, 11, 13)
 
@@ -38,8 +41,8 @@ DEGREES = (7, 9, 11, 13)
 class Places:
     """Deviations of place at some pixels (n,), arcsec along the image's x and y.
 
-    `value` (n, 2); `noise` (m, n, 2) and `structure` (k, n, 2) are standardised contributions of the dots' noise and of what is
-    correlated, each with its freedom.
+    `value` (n, 2); `noise` (m, n, 2) and `structure` (k, n, 2) are standardised contributions of
+    the dots' noise and of what is correlated, each with its freedom.
     """
 
     value: FloatArray
@@ -70,7 +73,8 @@ class LensFit:
         wanted = file_rays[:, :2] / file_rays[:, 2:]
         value = (_tangents(self.fit.geometry.monitor, self.flat, wanted) - wanted) * ARCSEC_PER_RAD
         terms = _terms(self.fit, self.flat, wanted, (x_px, y_px), self.degree)
-        terms = terms @ self.mix[: terms.shape[2]]  # the pattern of the tracker's pixels moves no star
+        # the pattern of the tracker's pixels moves no star
+        terms = terms @ self.mix[: terms.shape[2]]
         value += (terms @ self.coefficients).T
         # The basis is orthonormal over the dots, so that each coefficient has the noise of one dot.
         noise = math.sqrt(self.found.noise_variance) * terms.transpose(2, 1, 0)
@@ -78,7 +82,9 @@ class LensFit:
         return Places(value, noise, self.dof, structure, self.found)
 
     def _of_structure(self) -> FloatArray:
-        """What the dots' structure does to the coefficients: factors (terms, k) of its covariance."""
+        """What the dots' structure does to the coefficients: factors (terms, k) of its
+        covariance.
+        """
         covariance = np.zeros((len(self.coefficients), len(self.coefficients)))
         by_cell = [self.cells.means(axis) * self.cells.count[:, None] for axis in self.basis]
         for length, variance in zip(self.found.length, self.found.variance, strict=True):
@@ -94,7 +100,9 @@ class LensFit:
 
 
 def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFit:
-    """Fit the places of dots, whose deviations from the bench file are `seen_off` (n, 2), arcsec."""
+    """Fit the places of dots, whose deviations from the bench file are `seen_off` (n, 2),
+    arcsec.
+    """
     geometry = geometry_of(file)
     kept: BoolArray = np.asarray(np.isfinite(seen_off).all(axis=1))
     monitor = geometry.monitor
@@ -104,7 +112,8 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     found = _fitted(geometry, flat, wanted, read, kept)
     left = seen_off - (_tangents(found.geometry.monitor, flat, wanted) - wanted) * ARCSEC_PER_RAD
     for _ in range(3):
-        # About the polynomials, too: the lens alone may be off by more than noise, and a dot that it misses is not wild.
+        # About the polynomials, too: the lens alone may be off by more than noise, and a dot that
+        # it misses is not wild.
         rough = field_terms(read.x_px, read.y_px, monitor.resolution_px, DEGREES[0])
         off = left - rough @ np.linalg.lstsq(rough[kept], left[kept], rcond=None)[0]
         spread = MAD_TO_SIGMA * np.median(np.abs(off[kept]), axis=0)
@@ -113,7 +122,8 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
             break
         kept = within
     x, y = read.x_px[kept], read.y_px[kept]
-    # Where the fit shows the dots: waves at the places as read would hold each dot's own noise, and fit it.
+    # Where the fit shows the dots: waves at the places as read would hold each dot's own noise, and
+    # fit it.
     shown_px = geometry.tracker.places_px(*_tangents(found.geometry.monitor, flat, wanted[kept]).T)
     phases = _phases(*shown_px)
     fit = None
@@ -130,7 +140,8 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
         mix = across[told].T / size[told] / scale[:, None]
         dof = float(2 * len(x) - told.sum())
         fit = LensFit(geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof)
-        # By what the residuals show: the variance of a structure as long as the field is hardly known.
+        # By what the residuals show: the variance of a structure as long as the field is hardly
+        # known.
         if float((rest**2).sum()) / dof <= (1 + DOT_VARIANCE) * structure.noise_variance:
             break
     assert fit is not None
@@ -138,7 +149,9 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
 
 
 def _phases(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """What the pattern of the tracker's pixels does to centroids (2, n, 4): waves of one pixel, along each axis by itself."""
+    """What the pattern of the tracker's pixels does to centroids (2, n, 4): waves of one pixel,
+    along each axis by itself.
+    """
     waves = [np.stack([np.sin(2 * np.pi * at), np.cos(2 * np.pi * at)], axis=1) for at in (x_px, y_px)]
     nothing = np.zeros_like(waves[0])
     return np.stack([np.hstack([waves[0], nothing]), np.hstack([nothing, waves[1]])])
@@ -163,7 +176,9 @@ def _tangents(fitted: Camera, flat: Camera, wanted: FloatArray) -> FloatArray:
 
 
 def _terms(fit: fits.Fit, flat: Camera, wanted: FloatArray, at_px: tuple[FloatArray, FloatArray], degree: int) -> FloatArray:
-    """Slopes (2, n, terms) of places, arcsec, by the lens's numbers, or polynomials in their place where there is a degree."""
+    """Slopes (2, n, terms) of places, arcsec, by the lens's numbers, or polynomials in their
+    place where there is a degree.
+    """
     terms = field_terms(*at_px, flat.resolution_px, degree or BESIDE_DEGREE)
     nothing = np.zeros_like(terms)
     polynomials = np.stack([np.hstack([terms, nothing]), np.hstack([nothing, terms])])
@@ -186,7 +201,9 @@ def _terms(fit: fits.Fit, flat: Camera, wanted: FloatArray, at_px: tuple[FloatAr
 
 
 def _decentring(wanted: FloatArray) -> FloatArray:
-    """Decentring of the fifth order (2, n, 4) at directions (n, 2): a lens whose axis is not the screen's."""
+    """Decentring of the fifth order (2, n, 4) at directions (n, 2): a lens whose axis is not the
+    screen's.
+    """
     round_ = (wanted**2).sum(axis=1) / HALF_TANGENT**2
     place = wanted.T / HALF_TANGENT
     along = [round_ * place * each for each in place]

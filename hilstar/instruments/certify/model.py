@@ -1,8 +1,10 @@
-"""The model of a certificate: reference stars, and what a bench's deviations do to light, places, attitude and delay.
+"""The model of a certificate: reference stars, and what a bench's deviations do to light, places,
+attitude and delay.
 
-A star's light is the sum over its pixels, each with the deviation of its own level and place; its place is where the true
-lens shows the pixel that the bench draws it at. A field's attitude is the rotation nearest to all its stars' displacements
-(Wahba's problem, by SVD), which is what a tracker would report.
+A star's light is the sum over its pixels, each with the deviation of its own level and place; its
+place is where the true lens shows the pixel that the bench draws it at. A field's attitude is the
+rotation nearest to all its stars' displacements (Wahba's problem, by SVD), which is what a tracker
+would report.
 """
 
 import math
@@ -23,7 +25,8 @@ from hilstar.server.bench.build import bench_calibration, open_bench
 from hilstar.server.bench.frame import Bench, Frame
 
 ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are taken
-ALONE_SIGMAS, REACH_SIGMAS = 9.0, 4.0  # in sprites: stars nearer than this share pixels; a star's own pixels
+# in sprites: stars nearer than this share pixels; a star's own pixels
+ALONE_SIGMAS, REACH_SIGMAS = 9.0, 4.0
 EDGE_TRACKER_PX = 10.0
 STARS_A_THIRD = 4
 NO_LIGHT = 1e-6
@@ -33,9 +36,11 @@ THIRDS = ("left third", "middle third", "right third")
 
 @dataclass(frozen=True, slots=True)
 class ReferenceStar:
-    """A star of a reference field: its place on the monitor, its direction in cam, and its pixels with their shares of light.
+    """A star of a reference field: its place on the monitor, its direction in cam, and its pixels
+    with their shares of light.
 
-    `log_light` (p,) is that asked of its pixels, relative to white, `quantised_mag` how much too faint their codes make it.
+    `log_light` (p,) is that asked of its pixels, relative to white, `quantised_mag` how much too
+    faint their codes make it.
     """
 
     hip: int
@@ -53,7 +58,9 @@ class ReferenceStar:
 
 
 def reference_stars(file: BenchFile) -> list[ReferenceStar]:
-    """The stars of a bench's reference fields, drawn by the bench itself. Raises InputError where they are too few."""
+    """The stars of a bench's reference fields, drawn by the bench itself. Raises InputError
+    where they are too few.
+    """
     rng = np.random.default_rng(SEED)
     stars: list[ReferenceStar] = []
     attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
@@ -125,10 +132,12 @@ def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """A bench's deviations of one or many trials (b, ...): light at levels and at stars, places of stars, delay.
+    """A bench's deviations of one or many trials (b, ...): light at levels and at stars, places of
+    stars, delay.
 
-    `levels` (b, levels) is true over expected light at the model's `log_light`, `even` (b, stars) its log at stars' places;
-    `place_arcsec` (b, stars, 2); `delay_ms` (b,); `late_ms` (b,) is what the moment of light is late beyond the delay.
+    `levels` (b, levels) is true over expected light at the model's `log_light`, `even` (b, stars)
+    its log at stars' places; `place_arcsec` (b, stars, 2); `delay_ms` (b,); `late_ms` (b,) is what
+    the moment of light is late beyond the delay.
     """
 
     levels: FloatArray
@@ -139,7 +148,9 @@ class Deviations:
 
 
 class Figures:
-    """The figures of a bench's reference stars by its deviations, in a fixed order: `names` has quantity and place of each."""
+    """The figures of a bench's reference stars by its deviations, in a fixed order: `names` has
+    quantity and place of each.
+    """
 
     def __init__(self, file: BenchFile, stars: list[ReferenceStar]) -> None:
         self.stars, self.file = stars, file
@@ -161,23 +172,30 @@ class Figures:
         self.names.append(("latency", 0, "ms"))
 
     def turned(self, turns_arcsec: FloatArray) -> FloatArray:
-        """What turns of the bench (n, 3), arcsec about cam's axes, add to the stars' places (n, stars, 2)."""
+        """What turns of the bench (n, 3), arcsec about cam's axes, add to the stars' places (n,
+        stars, 2).
+        """
         u, v = self.tangent.T
         a, b, c = turns_arcsec.T[:, :, None]
         return np.stack([b - c * v - u * (a * v - b * u), c * u - a - v * (a * v - b * u)], axis=2)
 
     def of(self, off: Deviations) -> FloatArray:
-        """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes arcsec, latency ms."""
+        """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes
+        arcsec, latency ms.
+        """
         certify, monitor = self.file.config.certify, self.file.config.monitor
         flux = magnitude(np.maximum(off.levels @ self._shares.T, NO_LIGHT)) - MAG_PER_RELATIVE * off.even
         late_ms = off.delay_ms - monitor.panel_delay_ms + off.late_ms
         place = off.place_arcsec.copy()
-        place[..., 0] -= certify.rate_deg_s * 3.6 * late_ms[:, None]  # deg/s to arcsec/ms; what is late lags behind
+        # deg/s to arcsec/ms; what is late lags behind
+        place[..., 0] -= certify.rate_deg_s * 3.6 * late_ms[:, None]
         turned = [self._attitude(place[:, stars], stars) for stars in self._of_field]
         return np.concatenate([flux, place[..., 0], place[..., 1], *turned, off.delay_ms[:, None]], axis=1)
 
     def _attitude(self, place_arcsec: FloatArray, stars: IntArray) -> FloatArray:
-        """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported attitude."""
+        """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported
+        attitude.
+        """
         seen = np.ones((len(place_arcsec), len(stars), 3))
         seen[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
         seen /= np.linalg.norm(seen, axis=2, keepdims=True)

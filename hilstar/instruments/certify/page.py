@@ -1,4 +1,6 @@
-"""The page of a certificate, one file that needs no other and prints on A4: statement, conformity, budget, identity, files."""
+"""The page of a certificate, one file that needs no other and prints on A4: statement,
+conformity, budget, identity, files.
+"""
 
 import math
 from collections import defaultdict
@@ -27,7 +29,9 @@ RULES = {
 
 
 def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
-    """Write the page of a certificate whose JSON has this SHA-256. Raises InputError where it cannot be written."""
+    """Write the page of a certificate whose JSON has this SHA-256. Raises InputError where it
+    cannot be written.
+    """
     colour, verdict = VERDICTS[found.conforms]
     missed = [each for each in found.figures if each.conforms is False]
     why = f": {len(missed)} of {sum(each.conforms is not None for each in found.figures)} figures" if missed else ""
@@ -157,7 +161,8 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
                 continue
             each = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
             half = (each.upper - each.lower) / 2
-            places = max(1 - math.floor(math.log10(half)), 0) if half > 0 else 4  # two digits of the uncertainty
+            # two digits of the uncertainty
+            places = max(1 - math.floor(math.log10(half)), 0) if half > 0 else 4
             value = f"{round(each.value, places) + 0.0:+.{places}f}"
             text = f"{value} +- {half:.{places}f} {each.unit} (the worst of {len(members)})"
             lines.append((f"{quantity} {region or ''}".strip(), text))

@@ -1,7 +1,9 @@
-"""What a certificate or a check reads of a bench: patches of light, one pattern of dots, a photodiode's edges; and by what.
+"""What a certificate or a check reads of a bench: patches of light, one pattern of dots, a
+photodiode's edges; and by what.
 
-`VirtualReader` takes the figures straight from a truth file, with the noise that its `[certify.virtual]` states: it draws no
-image. `ImageReader` shows the patterns by a first-light image source and measures the tracker's images.
+`VirtualReader` takes the figures straight from a truth file, with the noise that its
+`[certify.virtual]` states: it draws no image. `ImageReader` shows the patterns by a first-light
+image source and measures the tracker's images.
 """
 
 import math
@@ -31,7 +33,8 @@ from hilstar.server.bench.build import bench_calibration, calibration_source, op
 from hilstar.server.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
-APART_TRACKER_PX = 12.0  # from dot to dot: a dot that moved by half of it would be taken for its neighbour
+# from dot to dot: a dot that moved by half of it would be taken for its neighbour
+APART_TRACKER_PX = 12.0
 EDGE_TRACKER_PX = 8.0
 MAX_DOTS = 4000
 MIN_DOTS = 60
@@ -44,11 +47,14 @@ NO_LIGHT_DN_PER_S = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class LightReadings:
-    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code (n,), at t_s (n,).
+    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code
+    (n,), at t_s (n,).
 
-    It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings have in common, as the
-    ratios of lattices, is in `common` (n, inputs), one sigma relative to light. `noise_shape` (n,) is each
-    reading's noise relative to its light, up to a factor that their scatter tells; None where all are alike.
+    It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings
+    have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma relative to
+    light. `noise_shape` (n,) is each
+    reading's noise relative to its light, up to a factor that their scatter tells; None where all
+    are alike.
     """
 
     code: IntArray
@@ -61,7 +67,9 @@ class LightReadings:
 
 @dataclass(frozen=True, slots=True)
 class DotReadings:
-    """Dots: places on the monitor and in the tracker's image (n,), px, and relative light (n,); `psf_px` is the PSF's sigma."""
+    """Dots: places on the monitor and in the tracker's image (n,), px, and relative light (n,);
+    `psf_px` is the PSF's sigma.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -78,7 +86,9 @@ def geometry_of(file: BenchFile) -> BenchGeometry:
 
 
 def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
-    """Monitor pixels (n,) of a lattice of dots that the tracker sees whole. Raises InputError where it sees too few."""
+    """Monitor pixels (n,) of a lattice of dots that the tracker sees whole. Raises InputError
+    where it sees too few.
+    """
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     width, height = geometry.monitor.resolution_px
     seen = math.prod(min(ratio * s, t) for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True))
@@ -100,7 +110,9 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
 
 
 def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -> FloatArray:
-    """Delays (n,) from the swap to the first row's light, ms, by a photodiode's recording. Raises InputError."""
+    """Delays (n,) from the swap to the first row's light, ms, by a photodiode's recording.
+    Raises InputError.
+    """
     if recording is None:
         return np.zeros(0)
     monitor = file.config.monitor
@@ -109,7 +121,8 @@ def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -
 
 
 class VirtualReader:
-    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError.
+    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own
+    noise. Raises InputError.
 
     `identity` says it in words.
     """
@@ -181,7 +194,9 @@ def white_of(file: BenchFile) -> float:
 
 
 def dot_settings(file: BenchFile) -> CentroidSettings:
-    """How dots are measured in the tracker's image: in a window no narrower than they are. Raises InputError."""
+    """How dots are measured in the tracker's image: in a window no narrower than they are.
+    Raises InputError.
+    """
     default = CentroidSettings(THRESHOLD_SIGMA, MIN_PIXELS)
     return replace(default, window_sigma_px=max(default.window_sigma_px, dot_sigma_px(file)))
 
@@ -209,7 +224,9 @@ class ImageReader:
         time.sleep(seconds)
 
     def light(self, codes: IntArray) -> LightReadings:
-        """Lattices of dots that do not saturate the tracker, read by the tracker as a photometer."""
+        """Lattices of dots that do not saturate the tracker, read by the tracker as a
+        photometer.
+        """
         sigma_px = float(np.mean(self._context.tracker_psf.width_px))
         grey = grey_response(self.file)
         meter = Photometer(self._context, sigma_px, Assumed({"w": grey.light}, grey.black), PAIRS)
@@ -272,7 +289,8 @@ class ImageReader:
 def _noise_shape(readings: Readings) -> FloatArray:
     """The noise (n,) of readings relative to their light, 1 where they are black.
 
-    A lattice of few dots collects less light in the same pixels than a dense one, and knows its light less well.
+    A lattice of few dots collects less light in the same pixels than a dense one, and knows its
+    light less well.
     """
     lit = np.flatnonzero([patch.code for patch in readings.patches])
     shape = np.ones(len(readings.patches))
@@ -281,7 +299,9 @@ def _noise_shape(readings: Readings) -> FloatArray:
 
 
 def _common(readings: Readings) -> FloatArray:
-    """What readings share, relative to their light above black: (n, causes), one standard error of each."""
+    """What readings share, relative to their light above black: (n, causes), one standard error
+    of each.
+    """
     codes = np.array([patch.code for patch in readings.patches])
     # What shifts black as well shifts no light above it.
     black = readings.common[codes == 0].mean(axis=0)

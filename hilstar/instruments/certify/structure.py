@@ -1,12 +1,15 @@
-"""What is left of structure in a fit's residuals: how much of their variance is correlated, in place or in time, and how far.
+"""What is left of structure in a fit's residuals: how much of their variance is correlated, in
+place or in time, and how far.
 
-A fit's residuals are noise, of each reading by itself, and perhaps a part whose correlation falls with distance: as
-exp(-d^2 / 2 L^2) in place, as exp(-t / T) in time. Ratio of the variances and length are those of a grid, each by its
-restricted likelihood (Patterson and Thompson 1971), which takes the fit's own terms out. All points of the grid count by
-their likelihood: a structure whose length is unsure is so in what it does. Where none is more likely, there is none.
+A fit's residuals are noise, of each reading by itself, and perhaps a part whose correlation falls
+with distance: as
+exp(-d^2 / 2 L^2) in place, as exp(-t / T) in time. Ratio of the variances and length are those of a
+grid, each by its restricted likelihood (Patterson and Thompson 1971), which takes the fit's own
+terms out. All points of the grid count by their likelihood: a structure whose length is unsure is
+so in what it does. Where none is more likely, there is none.
 
-In place readings are averaged over cells of a lattice, whose correlations are products of rows and columns, so that one grid
-of ratios costs no more than the squares of a few terms.
+In place readings are averaged over cells of a lattice, whose correlations are products of rows and
+columns, so that one grid of ratios costs no more than the squares of a few terms.
 """
 
 import math
@@ -17,21 +20,26 @@ from scipy.interpolate import RectBivariateSpline
 
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 
-RATIOS = np.geomspace(1e-3, 3e3, 20)  # of the structure's variance to that of the noise of one reading
+# of the structure's variance to that of the noise of one reading
+RATIOS = np.geomspace(1e-3, 3e3, 20)
 LENGTH_STEP = 1.6  # from one length to the next
 MAX_CELLS = 1000
-ENOUGH, MIN_CELLS = 0.97, 64  # share of cells that are filled in the rectangle by which structure is told; its least cells
+# share of cells that are filled in the rectangle by which structure is told; its least cells
+ENOUGH, MIN_CELLS = 0.97, 64
 MIN_FILLED = 0.5  # relative to a full cell: a cell with fewer readings is taken as empty
 TINY = 1e-300
 MIN_DOF = 3.0
-FINE_LENGTH, FINE_RATIO = 1.08, 1.12  # steps between which the likelihood, which is smooth, is interpolated
+# steps between which the likelihood, which is smooth, is interpolated
+FINE_LENGTH, FINE_RATIO = 1.08, 1.12
 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Variances in the square of the readings' unit: of the structure (lengths,) at each `length`, and of one reading's noise.
+    """Variances in the square of the readings' unit: of the structure (lengths,) at each `length`,
+    and of one reading's noise.
 
-    `dof` is the freedom of the structure's variance as a whole. Nothing but zeros where there is none.
+    `dof` is the freedom of the structure's variance as a whole. Nothing but zeros where there is
+    none.
     """
 
     length: FloatArray
@@ -52,7 +60,8 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Residuals in the basis in which their correlation is diagonal: values (m,) and terms (m, p), in one reading's noise.
+    """Residuals in the basis in which their correlation is diagonal: values (m,) and terms (m, p),
+    in one reading's noise.
 
     `square` and `dof` are what is known of the noise beside them.
     """
@@ -64,7 +73,9 @@ class Spread:
 
 
 def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> Structure:
-    """The structure by spreads at each length, each with its eigenvalues (m,) of correlation relative to the noise's."""
+    """The structure by spreads at each length, each with its eigenvalues (m,) of correlation
+    relative to the noise's.
+    """
     likelihood = np.zeros((len(lengths), len(RATIOS) + 1))
     noise = np.zeros_like(likelihood)
     ratios = np.append(0.0, RATIOS)
@@ -89,7 +100,8 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
     if nothing >= float(share.sum()):
         return Structure(lengths, np.zeros(len(lengths)), float(noise[0, 0]), math.inf)
     share /= share.sum()
-    # As of a variance by few readings, whose Student's t has the geometric mean for its scale, nearly.
+    # As of a variance by few readings, whose Student's t has the geometric mean for its scale,
+    # nearly.
     each = noise_of_some * finer[1]
     middle = float((share * np.log(each)).sum())
     dof = max(2 / max(float((share * (np.log(each) - middle) ** 2).sum()), TINY), MIN_DOF)
@@ -134,7 +146,9 @@ def lasting_root(t: FloatArray, found: Structure) -> FloatArray:
 
 
 class Cells:
-    """The cells of readings at places (n,) on a lattice, px: cell by reading, and how their means correlate."""
+    """The cells of readings at places (n,) on a lattice, px: cell by reading, and how their
+    means correlate.
+    """
 
     def __init__(self, x_px: FloatArray, y_px: FloatArray) -> None:
         group = max(math.ceil(math.sqrt(len(x_px) / MAX_CELLS)), 1)
@@ -168,7 +182,9 @@ class Cells:
         return np.asarray(sums / np.maximum(self.count, 1).reshape(-1, *[1] * (values.ndim - 1)))
 
     def basis(self, length_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The correlation of cells' means: eigenvalues (cells,), and the vectors of rows and of columns."""
+        """The correlation of cells' means: eigenvalues (cells,), and the vectors of rows and of
+        columns.
+        """
         parts = []
         for middle, side in zip(self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 6  # a mean over a cell: its own variance twice
@@ -194,7 +210,9 @@ class Cells:
 
 
 def in_place(x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: FloatArray) -> Structure:
-    """The structure in place of residuals (axes, n) at places (n,), whose fit has `terms` (axes, n, p) common to all axes."""
+    """The structure in place of residuals (axes, n) at places (n,), whose fit has `terms` (axes,
+    n, p) common to all axes.
+    """
     inside = _rectangle(x_px, y_px)
     cells, values, terms = Cells(x_px[inside], y_px[inside]), values[:, inside], terms[:, inside]
     means = [cells.means(each) for each in values]
@@ -204,7 +222,8 @@ def in_place(x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: Floa
     free = float(len(values) * (len(cells.index) - (cells.count > 0).sum()))
     empty = np.flatnonzero(~cells.filled)
     hidden = np.zeros((cells.size, len(empty)))
-    hidden[empty, np.arange(len(empty))] = 1.0  # a term of its own takes an empty cell out of the fit
+    # a term of its own takes an empty cell out of the fit
+    hidden[empty, np.arange(len(empty))] = 1.0
     spreads = []
     for length in (lengths := cells.lengths()):
         eigen, rows, columns = cells.basis(length)
@@ -222,7 +241,9 @@ def in_place(x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: Floa
 
 
 def _rectangle(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
-    """The readings (n,) within a rectangle of cells that are nearly all filled: the field may stand obliquely on the screen."""
+    """The readings (n,) within a rectangle of cells that are nearly all filled: the field may
+    stand obliquely on the screen.
+    """
     cells = Cells(x_px, y_px)
     filled = cells.filled.reshape(len(cells.middle[0]), len(cells.middle[1]))
     low, high = [0, 0], list(filled.shape)

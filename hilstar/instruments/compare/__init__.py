@@ -1,4 +1,6 @@
-"""For your own tests: two skies compared star by star, so that a golden frame holds on another driver."""
+"""For your own tests: two skies compared star by star, so that a golden frame holds on another
+driver.
+"""
 
 from __future__ import annotations  # docs/python-api.md shows annotations as they are written
 
@@ -30,10 +32,11 @@ def assert_same_sky(
     centroid_px: float = CENTROID_PX,
     truth: Truth | str | Path | None = None,
 ) -> SkyComparison:
-    """Assert that every star of two skies has the same flux (magnitudes) and place (px). Skies are those of `compare`.
+    """Assert that every star of two skies has the same flux (magnitudes) and place (px). Skies are
+    those of `compare`.
 
-    Raises AssertionError with the common difference of all stars and a line for each star that differs otherwise (at most 20).
-    Raises InputError as `compare` does.
+    Raises AssertionError with the common difference of all stars and a line for each star that
+    differs otherwise (at most 20). Raises InputError as `compare` does.
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:
@@ -49,12 +52,15 @@ def compare(
     centroid_px: float = CENTROID_PX,
     truth: Truth | str | Path | None = None,
 ) -> SkyComparison:
-    """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of `hilstar frame`.
+    """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of
+    `hilstar frame`.
 
-    Light of three channels (3, height, width) is compared as a sum and by channel, and with light of one as a sum.
+    Light of three channels (3, height, width) is compared as a sum and by channel, and with light
+    of one as a sum.
 
-    Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else by the Frames' own.
-    Raises InputError for limits that are not above 0, images of different size or without a star, and files of another kind.
+    Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else
+    by the Frames' own. Raises InputError for limits that are not above 0, images of different size
+    or without a star, and files of another kind.
     """
     images = _image(frame), _image(golden)
     same = images[0].ndim == images[1].ndim

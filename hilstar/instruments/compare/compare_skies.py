@@ -1,7 +1,8 @@
-"""Two images of one sky compared star by star, within the limits of a change of driver; and the files they come from.
+"""Two images of one sky compared star by star, within the limits of a change of driver; and the
+files they come from.
 
-Stars are found in the golden image and fitted in both (see star_fit). Where rounding of the light around a star limits the
-fit, that star's limits are wider.
+Stars are found in the golden image and fitted in both (see star_fit). Where rounding of the light
+around a star limits the fit, that star's limits are wider.
 """
 
 import math
@@ -22,12 +23,16 @@ from hilstar.instruments.compare.sky_comparison import Limits, SkyComparison, St
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import Psf
 
-# Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe against float64.
+# Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe
+# against float64.
 PIXEL_ERROR = 2e-7
-MIN_IN_VIEW = 0.01  # smallest share of a star's light on the image; the wing of a star off the image has no centroid
-MAX_ERROR = 0.25  # a star whose relative error by rounding of brighter light is larger is not compared
+# smallest share of a star's light on the image; the wing of a star off the image has no centroid
+MIN_IN_VIEW = 0.01
+# a star whose relative error by rounding of brighter light is larger is not compared
+MAX_ERROR = 0.25
 MISSING_SHARE = 0.01  # share of its flux: a star 5 mag fainter is gone
-MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003  # a shift of this is first order within 1e-5 of the star's flux
+# a shift of this is first order within 1e-5 of the star's flux
+MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003
 MAX_MOVE_SIGMAS = 3.0  # a star that moved farther is missing here and extra there
 UNIT, CHANNELS = "electron/s", "rgb"
 MAX_E_PER_S = 1e30  # whose square is still a number
@@ -43,10 +48,12 @@ def compare_skies(
     truth: star_fit.Truth | None = None,
     frame_truth: star_fit.Truth | None = None,
 ) -> SkyComparison:
-    """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
+    """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE),
+    `truth` the golden one's.
 
-    Of cubes (3, height, width) the sum of the channels, and then each. Raises InputError for images of different size or
-    with a pixel that is not finite, for a golden one without a star, and for a `truth` of another sky.
+    Of cubes (3, height, width) the sum of the channels, and then each. Raises InputError for images
+    of different size or with a pixel that is not finite, for a golden one without a star, and for a
+    `truth` of another sky.
     """
     check_skies(frame, golden)
     if frame.ndim == 3:
@@ -90,7 +97,9 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
 
 
 def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[star_fit.Seeds, int]:
-    """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
+    """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many
+    stars do not.
+    """
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
     seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
     seeds = star_fit.Seeds(star_fit.refined(golden, seeds.places_px, psf), seeds.hip)
@@ -102,7 +111,9 @@ def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[st
 
 
 class _SkyFit:
-    """All stars of one image, fitted at `places_px`: fluxes, places, and the light (height, width) that they do not explain."""
+    """All stars of one image, fitted at `places_px`: fluxes, places, and the light (height,
+    width) that they do not explain.
+    """
 
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
@@ -148,8 +159,8 @@ def _differences(seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Li
 def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[FloatArray, FloatArray]:
     """Places (n, 2), px, and fluxes of stars in light that no star of either fit explains.
 
-    A changed star is not exactly a Gaussian: its residual is under half of its change. A star off the image may be as bright as
-    any on it, and its wing wrong by that star's rounding.
+    A changed star is not exactly a Gaussian: its residual is under half of its change. A star off
+    the image may be as bright as any on it, and its wing wrong by that star's rounding.
     """
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
     floor = star_fit.RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
@@ -165,7 +176,8 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
 
 
 def read_frame_fits(path: Path) -> FloatArray:
-    """The linear image (height, width), or of three channels (3, height, width), electrons/s, of a FITS of `hilstar frame`.
+    """The linear image (height, width), or of three channels (3, height, width), electrons/s, of a
+    FITS of `hilstar frame`.
 
     Raises InputError for another file.
     """
@@ -187,7 +199,9 @@ def read_frame_fits(path: Path) -> FloatArray:
 
 
 def read_truth_csv(path: Path) -> star_fit.Truth:
-    """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of TRUTH_COLUMNS filled."""
+    """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of
+    TRUTH_COLUMNS filled.
+    """
     wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
     rows = []
     names = []

@@ -1,4 +1,6 @@
-"""What `hilstar compare -o DIR` writes: a table of all stars, and a chart of errors against magnitude."""
+"""What `hilstar compare -o DIR` writes: a table of all stars, and a chart of errors against
+magnitude.
+"""
 
 import math
 from pathlib import Path
@@ -20,7 +22,8 @@ MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
 STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
 COLUMNS = (
     *("kind", "hip", "x_px", "y_px", "flux_e_per_s", "flux_error_mag", "dx_px", "dy_px", "centroid_error_px"),
-    *("flux_limit_mag", "centroid_limit_px", "differs"),  # 1 where the star differs from what is common to all
+    # 1 where the star differs from what is common to all
+    *("flux_limit_mag", "centroid_limit_px", "differs"),
 )
 
 
@@ -80,7 +83,9 @@ class ChartPanel:
         return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
 
     def label(self, kind: str, drawn: int) -> str:
-        """How many stars are of a kind. Missing and extra ones are all counted, as on the terminal and in the table."""
+        """How many stars are of a kind. Missing and extra ones are all counted, as on the
+        terminal and in the table.
+        """
         count = len(self.comparison.of(kind)) if kind in self.rows else drawn
         common = count - drawn
         return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
@@ -114,7 +119,8 @@ class ChartPanel:
 
 
 def write_report(directory: Path, comparison: SkyComparison) -> None:
-    """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and SVG.
+    """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and
+    SVG.
 
     Raises InputError where one cannot be written.
     """

@@ -1,7 +1,9 @@
-"""How two skies differ: each star, the change common to most stars (shift, turn, scale, dimming), and the verdict.
+"""How two skies differ: each star, the change common to most stars (shift, turn, scale, dimming),
+and the verdict.
 
-The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not matter. Missing stars are
-matched with extra ones first: after a shift by more than a star's width no star is in its place.
+The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not
+matter. Missing stars are matched with extra ones first: after a shift by more than a star's width
+no star is in its place.
 """
 
 import math
@@ -18,25 +20,31 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.units import magnitude
 
 MORE_STARS = 0.1  # share of all stars that a motion with more parameters has to explain in addition
-ROUNDS = 40  # rounds of reweighted least squares, which converge to the minimum sum of absolute residuals
+# rounds of reweighted least squares, which converge to the minimum sum of absolute residuals
+ROUNDS = 40
 FINEST_PX = 1e-4  # smaller residuals all weigh the same
 MIN_SHARE = 0.5  # share of the median star's displacement that a motion must explain
 
 # Displacements (n, 2), px, of places (n, 2), px from the middle of the image.
 Motion = Callable[[FloatArray], FloatArray]
-# A tenth or less of the smallest fault that must be seen (0.01 mag, 0.02 px); 500 times the largest difference between two
-# correct drivers (2e-6 mag, 1.5e-6 px), for a star that no brighter one overlaps. tests/unit/instruments/compare measures both.
+# A tenth or less of the smallest fault that must be seen (0.01 mag, 0.02 px); 500 times the largest
+# difference between two correct drivers (2e-6 mag, 1.5e-6 px), for a star that no brighter one
+# overlaps. tests/unit/instruments/compare measures both.
 FLUX_MAG = 1e-3
 CENTROID_PX = 1e-3
 MIN_STARS, MIN_STAR_SHARE = 4, 0.5  # that must differ alike
-MAX_VOTERS, VOTE_PX, PAIR_PX = 80, 2.0, 3.0  # the brightest missing and extra ones; displacements closer than this are one
+# the brightest missing and extra ones; displacements closer than this are one
+MAX_VOTERS, VOTE_PX, PAIR_PX = 80, 2.0, 3.0
 PAIR_ROUNDS = 3
 CHANNEL_KEYS = ("stars", "flux_error_mag", "centroid_error_px", "missing", "extra", "same")
-EDGE_PX = 5.0  # a star so near to the edge, or beyond it, may come into view or leave it by a common shift
+# a star so near to the edge, or beyond it, may come into view or leave it by a common shift
+EDGE_PX = 5.0
 
 
 def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) -> Motion | None:
-    """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the middle; None for none."""
+    """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the
+    middle; None for none.
+    """
     before, limit = np.hypot(*moves.T), np.median(limits_px)
     if np.median(before) <= limit:
         return None
@@ -53,7 +61,9 @@ def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) 
 
 
 def rank_for(stars: int) -> int:
-    """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and scale, 3 a homography."""
+    """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and
+    scale, 3 a homography.
+    """
     return 3 if stars >= 16 else 2 if stars >= 6 else 1
 
 
@@ -66,7 +76,9 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
         columns = [(ones, zeros), (zeros, ones)]
     elif rank == 2:
         columns = [(ones, zeros), (zeros, ones), (x, y), (-y, x)]
-    else:  # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in its eight numbers
+    else:
+        # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in
+        # its eight numbers
         columns = [(ones, zeros), (zeros, ones), (x, zeros), (y, zeros), (zeros, x), (zeros, y)]
         columns += [(-u * x, -v * x), (-u * y, -v * y)]
     design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
@@ -102,7 +114,9 @@ def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> Fl
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """By how much a star may differ: magnitudes and pixels. Raises InputError where one is not above 0."""
+    """By how much a star may differ: magnitudes and pixels. Raises InputError where one is not
+    above 0.
+    """
 
     flux_mag: float = FLUX_MAG
     centroid_px: float = CENTROID_PX
@@ -115,10 +129,11 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class StarDifference:
-    """One star of the golden image (an extra one: of the other image), and the other image minus the golden one.
+    """One star of the golden image (an extra one: of the other image), and the other image minus
+    the golden one.
 
-    `flux_error_mag` is positive where the star is too faint, infinite where it is missing, minus infinity where it is extra;
-    `hip` has every star of a blend, a body by its name.
+    `flux_error_mag` is positive where the star is too faint, infinite where it is missing, minus
+    infinity where it is extra; `hip` has every star of a blend, a body by its name.
     """
 
     hip: tuple[int | str, ...]
@@ -168,11 +183,12 @@ class StarDifference:
 
 @dataclass(frozen=True, slots=True)
 class CommonChange:
-    """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes (positive: too faint).
+    """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes
+    (positive: too faint).
 
     A figure is 0 where the stars do not have it in common.
-    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image has. Stars that the shift
-    brought into view or took out of it are in neither.
+    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image
+    has. Stars that the shift brought into view or took out of it are in neither.
     """
 
     shift_px: tuple[float, float]
@@ -213,7 +229,9 @@ class CommonChange:
 
 
 def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> CommonChange | None:
-    """What most stars of images of `size_px` (width, height) differ by; None where that is nothing."""
+    """What most stars of images of `size_px` (width, height) differ by; None where that is
+    nothing.
+    """
     both = [star for star in stars if star.kind in ("same", "changed")]
     missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
     pairs = dict(_pairs(missing, extra))
@@ -228,7 +246,8 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     moves = np.array([(star.dx_px, star.dy_px) for star in both])
     limit_px = np.array([star.limits.centroid_px for star in both])
     motion = common_motion(places, moves, limit_px)
-    # The median flux error, where it exceeds the limit and makes up more than half of the median star's error.
+    # The median flux error, where it exceeds the limit and makes up more than half of the median
+    # star's error.
     errors_mag = np.array([star.flux_error_mag for star in both])
     flux_mag = float(np.median(errors_mag))
     limit_mag = np.median([star.limits.flux_mag for star in both])
@@ -250,7 +269,8 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
         move = model(place) if star.kind == "missing" else -model(place)
         if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
             left.append(star)
-    # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than its limit.
+    # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than
+    # its limit.
     limit, reach = float(np.median(limit_px)), float(np.hypot(*middle))
     shift, right, down = model(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     (xx, yx), (xy, yy) = right - shift, down - shift
@@ -301,10 +321,11 @@ def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
 
 @dataclass(frozen=True, slots=True)
 class SkyComparison:
-    """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light of their own in view.
+    """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light
+    of their own in view.
 
-    `common` is the difference that most stars share, None without one. Of light of several channels this is their sum, and
-    `channels` has each by its name.
+    `common` is the difference that most stars share, None without one. Of light of several channels
+    this is their sum, and `channels` has each by its name.
     """
 
     stars: list[StarDifference]
@@ -319,12 +340,16 @@ class SkyComparison:
 
     @property
     def bad(self) -> list[StarDifference]:
-        """The stars beyond their limits, worst first; of those missing and extra the brightest first."""
+        """The stars beyond their limits, worst first; of those missing and extra the brightest
+        first.
+        """
         return _worst_first(self.of("changed", "missing", "extra"))
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that are beyond their limits once the common difference is subtracted, worst first."""
+        """The stars that are beyond their limits once the common difference is subtracted, worst
+        first.
+        """
         return self.bad if self.common is None else _worst_first(self.common.differing)
 
     @property
@@ -339,7 +364,9 @@ class SkyComparison:
 
     @property
     def widened(self) -> int:
-        """How many stars have limits of their own, because of the light around them or the image's edge."""
+        """How many stars have limits of their own, because of the light around them or the
+        image's edge.
+        """
         return sum(star.limits != self.limits for star in self.of("same", "changed"))
 
     @property
@@ -379,7 +406,9 @@ class SkyComparison:
 
 
 def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:
-    """A line for each star that differs beyond the common difference, `max_lines` of them; `rest` says where more are."""
+    """A line for each star that differs beyond the common difference, `max_lines` of them;
+    `rest` says where more are.
+    """
     if not comparison.bad and (other := _other_channel(comparison)):
         return star_lines(comparison.channels[other], max_lines, rest)
     stars = comparison.differing

@@ -1,9 +1,11 @@
-"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light causes no error.
+"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light
+causes no error.
 
-Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
-shifts of all stars are one linear least-squares problem. A star that is dimmed by any amount is measured exactly, a shifted one
-to first order in its shift. Light that no star explains stays in the residual. The stars to fit come from a truth table or are
-found in the image; near ones are one blend.
+Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along
+x and y. Fluxes and shifts of all stars are one linear least-squares problem. A star that is dimmed
+by any amount is measured exactly, a shifted one to first order in its shift. Light that no star
+explains stays in the residual. The stars to fit come from a truth table or are found in the image;
+near ones are one blend.
 """
 
 import math
@@ -23,17 +25,24 @@ from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.optics.psf import GaussianPsf, Psf
 
-# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu), which are no stars.
+# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see
+# tests/gpu), which are no stars.
 RIPPLE_SHARE = 1e-5
 SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
 SIGMA_STEPS = 12
-MAX_SIGMA_STEP = 0.3  # largest relative step of sigma: Newton's step from a poor start stays positive
+# largest relative step of sigma: Newton's step from a poor start stays positive
+MAX_SIGMA_STEP = 0.3
 MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
-MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
-BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last may be this far outside
-COLUMNS = (("share", "share"), ("share", "slope"), ("slope", "share"))  # along y and x: light, derivative by x, by y
-RIDGE = 1e-12  # ridge on unit columns: two equal columns share the light, where the solver would otherwise fail
-# Two stars nearer than this are one blend: apart they would be known 10 times worse than alone (at 0.4 px; 5 at 0.85 px).
+# a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
+MAX_OFFSET_PX = 1.0
+# ... and one whose brightest pixel is the image's first or last may be this far outside
+BEYOND_SIGMAS = 4.0
+# along y and x: light, derivative by x, by y
+COLUMNS = (("share", "share"), ("share", "slope"), ("slope", "share"))
+# ridge on unit columns: two equal columns share the light, where the solver would otherwise fail
+RIDGE = 1e-12
+# Two stars nearer than this are one blend: apart they would be known 10 times worse than alone (at
+# 0.4 px; 5 at 0.85 px).
 BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
 KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have
 
@@ -42,7 +51,8 @@ Truth = npt.NDArray[np.void]
 
 
 class StarTemplates:
-    """Stars of flux 1 at `places_px` (n, 2) on an image of `shape` (height, width), each with its derivatives along x and y.
+    """Stars of flux 1 at `places_px` (n, 2) on an image of `shape` (height, width), each with its
+    derivatives along x and y.
 
     A star's share of light that falls on the image is in `in_view` (n,).
     """
@@ -67,7 +77,9 @@ class StarTemplates:
 
     @cached_property
     def normal(self) -> csc_array:
-        """The columns' products with one another (3 n, 3 n): along x times along y, for the stars that overlap."""
+        """The columns' products with one another (3 n, 3 n): along x times along y, for the
+        stars that overlap.
+        """
         size, width = len(self.places_px), self._x.share.shape[1]
         middles = np.column_stack([self._x.middle, self._y.middle])
         near = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
@@ -89,7 +101,9 @@ class StarTemplates:
         return splu(csc_array(unit + RIDGE * eye_array(len(self._scale), format="csc")))
 
     def fit(self, image: FloatArray) -> FloatArray:
-        """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over all pixels."""
+        """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over
+        all pixels.
+        """
         if not len(self.places_px):
             return np.zeros((0, 3))
         wanted = np.asarray(self._columns.T @ image.ravel())
@@ -100,7 +114,9 @@ class StarTemplates:
         return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
 
     def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
-        """Errors of flux and of place, px, (n,): a pixel is off by `pixel_error` of the flux of all stars that reach it."""
+        """Errors of flux and of place, px, (n,): a pixel is off by `pixel_error` of the flux of
+        all stars that reach it.
+        """
         size = len(flux)
         blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()
@@ -116,9 +132,11 @@ class StarTemplates:
 
 
 class _Profiles:
-    """Stars along one axis (n, k): shares of light and their derivative by the place, both 0 off the image.
+    """Stars along one axis (n, k): shares of light and their derivative by the place, both 0 off
+    the image.
 
-    `middle` (n,) is each star's middle pixel, `clipped` (n, k) the pixels, those off the image moved to its edge.
+    `middle` (n,) is each star's middle pixel, `clipped` (n, k) the pixels, those off the image
+    moved to its edge.
     """
 
     def __init__(self, place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> None:
@@ -131,7 +149,9 @@ class _Profiles:
         self.clipped = np.clip(pixel, 0, size_px - 1)
 
     def overlaps(self, star: IntArray, other: IntArray) -> FloatArray:
-        """Products (m, 2, 2) of share and slope of the stars `star` (m,) with share and slope of `other` (m,)."""
+        """Products (m, 2, 2) of share and slope of the stars `star` (m,) with share and slope of
+        `other` (m,).
+        """
         width = self.share.shape[1]
         both = np.stack([self.share, self.slope], axis=1)
         # The pixel of the other star that is each pixel of this one; beyond its profile are zeros.
@@ -158,8 +178,11 @@ def around(image: FloatArray, psf: Psf) -> FloatArray:
 
 
 def star_psf(image: FloatArray) -> GaussianPsf:
-    """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's correlation of neighbours."""
-    # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is subtracted.
+    """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's
+    correlation of neighbours.
+    """
+    # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own
+    # 1/12 px^2 is subtracted.
     power = np.vdot(image, image)
     correlations = (np.vdot(image[:, 1:], image[:, :-1]) / power, np.vdot(image[1:], image[:-1]) / power)
     x, y = (math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04)) for part in correlations)
@@ -179,7 +202,9 @@ def star_psf(image: FloatArray) -> GaussianPsf:
 
 
 def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
-    """The brightest places with neither a star nor the image's edge in their footprint; all of them if there is none."""
+    """The brightest places with neither a star nor the image's edge in their footprint; all of
+    them if there is none.
+    """
     bright = places_px[: 4 * SIGMA_STARS]
     distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
     edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
@@ -206,7 +231,9 @@ def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray
 
 
 def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
-    """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known well: all stars at once."""
+    """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known
+    well: all stars at once.
+    """
     start, shape = places_px, (image.shape[0], image.shape[1])
     last = np.array([shape[1] - 1, shape[0] - 1])
     outwards = BEYOND_SIGMAS * np.array(psf.width_px)
@@ -228,7 +255,9 @@ def shifts_px(fitted: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Seeds:
-    """Stars to be fitted: places (n, 2), px, and the HIP numbers of each (a body's name), none where no table has it."""
+    """Stars to be fitted: places (n, 2), px, and the HIP numbers of each (a body's name), none
+    where no table has it.
+    """
 
     places_px: FloatArray
     hip: list[tuple[int | str, ...]]
@@ -244,7 +273,9 @@ class Seeds:
 
 
 def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
-    """The table's stars, and the image's where the table has none. Raises InputError for a table of another sky."""
+    """The table's stars, and the image's where the table has none. Raises InputError for a table
+    of another sky.
+    """
     found = bright_pixels(golden, RIPPLE_SHARE * around(golden, psf))
     if truth is None:
         return nameless_seeds(found, psf)
@@ -274,7 +305,9 @@ def blend_distance_px(psf: Psf) -> float:
 
 
 def describes(truth: Truth, image: FloatArray) -> bool:
-    """Whether a table (TRUTH_DTYPE) has at least half of the brightest stars of a linear image (height, width)."""
+    """Whether a table (TRUTH_DTYPE) has at least half of the brightest stars of a linear image
+    (height, width).
+    """
     psf = star_psf(image)
     return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf))
 

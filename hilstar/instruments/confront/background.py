@@ -1,7 +1,8 @@
-"""The background of a photograph, smooth over the field, and the noise about it; sources above both.
+"""The background of a photograph, smooth over the field, and the noise about it; sources above
+both.
 
-With several photographs also the detector's fixed pattern: what pixels, columns and rows have in common in different parts of
-the sky.
+With several photographs also the detector's fixed pattern: what pixels, columns and rows have in
+common in different parts of the sky.
 """
 
 import math
@@ -24,7 +25,8 @@ NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
 
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
-    """One sigma of the pixels' response, as a share of the light, and of offsets of pixels, of columns and of rows, DN.
+    """One sigma of the pixels' response, as a share of the light, and of offsets of pixels, of
+    columns and of rows, DN.
 
     `squares` has the square of each, without what noise adds, and `errors` one sigma of these.
     """
@@ -58,10 +60,12 @@ NO_PATTERN = FixedPattern()
 
 
 def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]]) -> FixedPattern | None:
-    """The pattern by products of each two of several photographs, whose noise has mean 0; None with fewer than two.
+    """The pattern by products of each two of several photographs, whose noise has mean 0; None with
+    fewer than two.
 
-    Each gives its pixels less their smooth level, that level above the pedestal, DN, and which pixels count (height, width).
-    Response and offsets are told apart by levels that differ; all is response where they do not.
+    Each gives its pixels less their smooth level, that level above the pedestal, DN, and which
+    pixels count (height, width). Response and offsets are told apart by levels that differ; all is
+    response where they do not.
     """
     pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
     for off, level, use in photographs:
@@ -99,7 +103,8 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
 def _lines_alone(
     column: tuple[float, float], row: tuple[float, float], both: float, size: tuple[int, int]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Squares of columns and rows, with their errors, without the share that pixels' own patterns leave in their means.
+    """Squares of columns and rows, with their errors, without the share that pixels' own patterns
+    leave in their means.
 
     `both` is the square of pixels and columns together, `size` (height, width).
     """
@@ -146,7 +151,9 @@ BRIGHT_BLOCK, NOISY_BLOCK = 0.5, 1.2  # sigmas over its neighbours' median, and 
 
 @dataclass(frozen=True, slots=True)
 class SkyLevel:
-    """Level and noise (height, width) of a photograph between its stars, DN, and whether a pixel is a star's."""
+    """Level and noise (height, width) of a photograph between its stars, DN, and whether a pixel
+    is a star's.
+    """
 
     level: FloatArray
     noise: FloatArray
@@ -158,7 +165,9 @@ class SkyLevel:
 
 
 def sky_level(dn: FloatArray, step: float) -> SkyLevel:
-    """The background of an image (height, width) in steps of `step`: means of blocks without their stars, smooth between."""
+    """The background of an image (height, width) in steps of `step`: means of blocks without
+    their stars, smooth between.
+    """
     height, width = dn.shape
     side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
     rows, columns = max(height // side, 1), max(width // side, 1)
@@ -182,7 +191,9 @@ def sky_level(dn: FloatArray, step: float) -> SkyLevel:
 
 
 def is_round(dn: FloatArray) -> bool:
-    """Whether an image is that of an all-sky lens: sky in a circle, and nothing in corners beyond it, level to its edge."""
+    """Whether an image is that of an all-sky lens: sky in a circle, and nothing in corners
+    beyond it, level to its edge.
+    """
     height, width = dn.shape
     y, x = np.mgrid[:height, :width]
     radius = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2) / (min(height, width) / 2)
@@ -222,10 +233,12 @@ MAX_MASK_PX = 80  # half of what is left out about a long source
 
 @dataclass(frozen=True, slots=True)
 class FoundSources:
-    """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length and width of each, px.
+    """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length
+    and width of each, px.
 
-    Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half of the peak. `single` says
-    that one pixel has all of the light: it is the detector's, or a cosmic ray.
+    Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half
+    of the peak. `single` says that one pixel has all of the light: it is the detector's, or a
+    cosmic ray.
     """
 
     x_px: FloatArray
@@ -272,7 +285,9 @@ def find_sources(sigmas: FloatArray) -> FoundSources:
 
 
 def source_mask(sources: FoundSources, sigmas: FloatArray, grow_px: int) -> BoolArray:
-    """Pixels of an image (height, width) within some pixels of a source, or of an end of a long one."""
+    """Pixels of an image (height, width) within some pixels of a source, or of an end of a long
+    one.
+    """
     height, width = sigmas.shape
     spots = sigmas > THRESHOLD
     rows = np.clip(np.rint(sources.y_px).astype(np.intp), 0, height - 1)
@@ -292,7 +307,9 @@ def _kernel(shape: tuple[int, ...]) -> FloatArray:
 
 
 def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
-    """Whether the highest pixel about a place has no light beside it: less than a star of 0.35 px of sigma leaves there."""
+    """Whether the highest pixel about a place has no light beside it: less than a star of 0.35
+    px of sigma leaves there.
+    """
     padded = np.pad(sigmas, 3)
     reach = np.arange(-1, 2)
     rows, columns = (np.rint(place).astype(np.intp)[:, None] + reach + 3 for place in (y_px, x_px))

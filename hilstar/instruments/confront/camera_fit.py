@@ -1,7 +1,8 @@
-"""The camera behind photographs: attitude and refraction of each, focal length, principal point and distortion of all.
+"""The camera behind photographs: attitude and refraction of each, focal length, principal point and
+distortion of all.
 
-Robust least squares of places. A larger lens, and refraction, are taken where stars that were held out of the fit ask for
-them.
+Robust least squares of places. A larger lens, and refraction, are taken where stars that were held
+out of the fit ask for them.
 """
 
 import math
@@ -25,14 +26,17 @@ DIFFERENCE = 1e-4  # step of a number, for its derivative
 HUBER = 2.0
 FOLDS = 5
 EDGE_PX = 10.0  # beyond an image's edges, to which its lens is used
-GAIN = 0.985  # a larger model is taken where it brings the held-out error below this share of the smaller one's
+# a larger model is taken where it brings the held-out error below this share of the smaller one's
+GAIN = 0.985
 # name -> step that makes a number of order 1
 STEPS = {"log_focal": 1e-3, "centre_x": 10.0, "centre_y": 10.0, "k1": 0.1, "k2": 1.0, "p1": 1e-3, "p2": 1e-3}
 # sigma of a number's prior, in its steps: so wide that it decides only what stars leave open
 PRIOR = {"log_focal": 1e3, "centre_x": 10.0, "centre_y": 10.0, "k1": 10.0, "k2": 10.0, "p1": 10.0, "p2": 10.0}
 LENS_NAMES = ("k1", "k2", "p1", "p2")
 ZENITH_PRIOR = 1.5  # sigma of the tangent of a zenith distance
-FOLDED = 0.3  # error of a place by a lens that folds, of that by the largest that does not: such a lens is what is there
+# error of a place by a lens that folds, of that by the largest that does not: such a lens is what
+# is there
+FOLDED = 0.3
 MODELS: dict[str, tuple[str, ...]] = {
     "pinhole": ("log_focal",),
     "k1": ("log_focal", "k1"),
@@ -46,7 +50,9 @@ ATTITUDE_STEP_RAD = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Stars of one photograph: where they were seen, px, with one sigma (n,), and their directions (n, 3), ICRS."""
+    """Stars of one photograph: where they were seen, px, with one sigma (n,), and their
+    directions (n, 3), ICRS.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -60,7 +66,8 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """Attitude of a photograph, and its zenith in cam as tangents (x, y) from the boresight; None where none is fitted.
+    """Attitude of a photograph, and its zenith in cam as tangents (x, y) from the boresight; None
+    where none is fitted.
 
     With `air` zenith and refraction are known.
     """
@@ -96,7 +103,9 @@ class Pointing:
 
 
 def refracted(cam: FloatArray, zenith: FloatArray) -> FloatArray:
-    """Directions (n, 3) in cam, bent towards zeniths (n, 2) or (1, 2), which are tangents from the boresight."""
+    """Directions (n, 3) in cam, bent towards zeniths (n, 2) or (1, 2), which are tangents from
+    the boresight.
+    """
     up = np.column_stack([zenith, np.ones(len(zenith))])
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     cosine = np.maximum((cam * up).sum(axis=1), MIN_COS_ZENITH)
@@ -106,7 +115,8 @@ def refracted(cam: FloatArray, zenith: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class CameraFit:
-    """The camera and the pointings; `sigma` of its figures by name, and the rms error of held-out stars by model, px an axis.
+    """The camera and the pointings; `sigma` of its figures by name, and the rms error of held-out
+    stars by model, px an axis.
 
     `floor_px` is the error of a place beyond its own noise.
     """
@@ -128,7 +138,9 @@ class CameraFit:
 
 
 def with_values(camera: Camera, values: dict[str, float]) -> Camera:
-    """The camera changed by a model's values: its focal length and principal point from its own, its lens anew."""
+    """The camera changed by a model's values: its focal length and principal point from its own,
+    its lens anew.
+    """
     lens = camera.lens
     if set(LENS_NAMES) & set(values):
         old = camera.lens or Lens()
@@ -145,7 +157,9 @@ def with_values(camera: Camera, values: dict[str, float]) -> Camera:
 
 
 class _CameraLoss:
-    """The residuals of places in sigmas by a camera's numbers, each photograph's turn, and its zenith where that is fitted."""
+    """The residuals of places in sigmas by a camera's numbers, each photograph's turn, and its
+    zenith where that is fitted.
+    """
 
     def __init__(
         self,
@@ -181,7 +195,8 @@ class _CameraLoss:
         """The camera, each photograph's turn (m, 4), and the fitted zeniths (z, 2) of numbers."""
         own, last = len(self.names), len(self.names) + 3 * len(self.pointings)
         camera = with_values(self.base, {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)})
-        # the image's middle stays where it is when the principal point moves: else the loss is one long valley
+        # the image's middle stays where it is when the principal point moves: else the loss is one
+        # long valley
         dx, dy = (a - b for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True))
         follow = np.array([dy, -dx, 0.0]) / camera.focal_length_px
         turns = from_rotation_vectors(ATTITUDE_STEP_RAD * numbers[own:last].reshape(-1, 3) + follow)
@@ -207,7 +222,9 @@ class _CameraLoss:
         return np.asarray(np.clip(np.nan_to_num(np.concatenate(parts), nan=1e4), -1e4, 1e4))
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
-        """Derivatives by differences: a photograph's own numbers move its own places alone, all photographs' at once."""
+        """Derivatives by differences: a photograph's own numbers move its own places alone, all
+        photographs' at once.
+        """
         own, stars, photographs = len(self.names), len(self.owner), len(self.pointings)
         found = np.zeros((len(off), len(numbers)))
 
@@ -235,7 +252,8 @@ class _CameraLoss:
 def fit_model(
     base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], names: tuple[str, ...], floor_px: float
 ) -> tuple[Camera, tuple[Pointing, ...], FloatArray]:
-    """The camera and pointings that fit places best, and the covariance of the camera's numbers, in the order of `names`.
+    """The camera and pointings that fit places best, and the covariance of the camera's numbers, in
+    the order of `names`.
 
     `base` is the camera about which the numbers count. A pointing with a zenith has it fitted.
     """
@@ -251,7 +269,8 @@ def minimised(
     numbers: FloatArray,
     least_gain: float = MIN_GAIN,
 ) -> tuple[FloatArray, FloatArray]:
-    """The numbers with the smallest Huber loss (Levenberg and Marquardt, reweighted), and the normal matrix there.
+    """The numbers with the smallest Huber loss (Levenberg and Marquardt, reweighted), and the
+    normal matrix there.
 
     `slopes` are the derivatives of residuals, which it is given too.
     """
@@ -282,7 +301,9 @@ def minimised(
 
 
 def own_floor_px(residuals: Sequence[FloatArray], photographs: Sequence[Places], numbers: int) -> float:
-    """The error of a place along an axis beyond its own noise, px, by the residuals' spread without their tails."""
+    """The error of a place along an axis beyond its own noise, px, by the residuals' spread
+    without their tails.
+    """
     off = np.concatenate(residuals).ravel()
     sigma = np.repeat(np.concatenate([one.sigma_px for one in photographs]), 2)
     scale = math.sqrt(len(off) / max(len(off) - numbers, 1))
@@ -297,9 +318,11 @@ def own_floor_px(residuals: Sequence[FloatArray], photographs: Sequence[Places],
 def fit_camera(
     base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], *, fixed: bool, last: bool
 ) -> CameraFit:
-    """The camera of photographs, least model that held-out stars ask for; `fixed`: the pointings alone.
+    """The camera of photographs, least model that held-out stars ask for; `fixed`: the pointings
+    alone.
 
-    Refraction may be fitted. Where better places are to come, and it is not the `last`, the largest model serves without it.
+    Refraction may be fitted. Where better places are to come, and it is not the `last`, the largest
+    model serves without it.
     """
     bare = tuple(pointings)
     count = sum(len(one.x_px) for one in photographs)
@@ -338,7 +361,8 @@ def fit_camera(
 def _largest(
     base: Camera, pointings: tuple[Pointing, ...], photographs: Sequence[Places], models: dict[str, tuple[str, ...]]
 ) -> tuple[str, Camera, tuple[Pointing, ...], float]:
-    """The largest model that does not fold within the image, its fit, and the error of a place by it, so that all weigh alike.
+    """The largest model that does not fold within the image, its fit, and the error of a place by
+    it, so that all weigh alike.
 
     Raises InputError where the smallest fits far worse than those that fold.
     """
@@ -347,7 +371,8 @@ def _largest(
         camera, turned, floor = _settled(base, pointings, photographs, models[name])
         if _bounded(camera) is not None:
             break
-        folding_px = min(folding_px, floor)  # too many terms for so few stars, or a lens of another kind
+        # too many terms for so few stars, or a lens of another kind
+        folding_px = min(folding_px, floor)
     if folding_px < FOLDED * floor:
         raise InputError(
             "the stars ask for a distortion that folds within the image: two directions share a pixel near its corners; give"
@@ -363,7 +388,9 @@ def k1_camera(base: Camera, pointings: Sequence[Pointing], photographs: Sequence
 
 
 def _bounded(camera: Camera) -> Camera | None:
-    """The camera without directions far outside, which its polynomials fold into the image; None if it folds inside."""
+    """The camera without directions far outside, which its polynomials fold into the image; None
+    if it folds inside.
+    """
     try:
         return bounded(camera, EDGE_PX)
     except InputError:
@@ -387,9 +414,12 @@ def _settled(
 def _held_out(
     camera: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], names: tuple[str, ...], floor_px: float
 ) -> float:
-    """Rms error of stars that were held out, px an axis, weighed by their errors, each counted up to HUBER + 1 sigmas."""
+    """Rms error of stars that were held out, px an axis, weighed by their errors, each counted
+    up to HUBER + 1 sigmas.
+    """
     squares = weights = 0.0
-    camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)  # from which folds are near
+    # from which folds are near
+    camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)
     for fold in range(FOLDS):
         out = [np.arange(len(one.x_px)) % FOLDS == fold for one in photographs]
         kept = [one.at(~mask) for one, mask in zip(photographs, out, strict=True)]
@@ -406,7 +436,8 @@ def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: f
     def off(trial: Pointing) -> FloatArray:
         return CameraFit(camera, (trial,), "").residuals_px([places])[0] / np.hypot(places.sigma_px, floor_px)[:, None]
 
-    # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it is known but for its sign
+    # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it
+    # is known but for its sign
     (cx, cy), zero = camera.principal_point_px, np.zeros(len(places.x_px))
     u, v, one = places.x_px - cx, places.y_px - cy, zero + 1
     columns = [(one, zero), (zero, one), (v, -u), (u, v), (u, -v), (v, u)]

@@ -1,6 +1,8 @@
-"""What the scatter of stars about the prediction is made of, each part with how it was told apart from the others.
+"""What the scatter of stars about the prediction is made of, each part with how it was told apart
+from the others.
 
-Parts of the detector and of colour are fitted to residuals, and what as many random columns would take is taken off again.
+Parts of the detector and of colour are fitted to residuals, and what as many random columns would
+take is taken off again.
 """
 
 import math
@@ -23,7 +25,9 @@ LAW = "scintillation by law"
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the scatter: rms in the whole's unit, NaN where it is not known, and how it was told."""
+    """A part of the scatter: rms in the whole's unit, NaN where it is not known, and how it was
+    told.
+    """
 
     name: str
     rms: float
@@ -32,7 +36,9 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """The scatter of clean stars to V = 6.5 in all photographs, mag and px an axis, and what it is made of."""
+    """The scatter of clean stars to V = 6.5 in all photographs, mag and px an axis, and what it
+    is made of.
+    """
 
     rms_mag: float
     rms_px: float
@@ -133,7 +139,9 @@ def _blends(session: Session, every: Sequence[tuple[Verdict, StarRow]]) -> Part:
 
 
 def _response(session: Session) -> tuple[float, float]:
-    """What the pixels' response leaves of a bright star: a share of its light, and px an axis of its place."""
+    """What the pixels' response leaves of a bright star: a share of its light, and px an axis of
+    its place.
+    """
     (x, y), reach = np.array(session.psf.size_px) / 2, np.arange(-HALF, HALF + 1.0)[None]
     middle = np.array([x]), np.array([y]), np.array([np.nan])
     light = session.psf.on_pixels(reach, reach, session.psf.core(*middle))[0][0]
@@ -142,7 +150,9 @@ def _response(session: Session) -> tuple[float, float]:
 
 
 def _scintillation(session: Session, every: Sequence[tuple[Verdict, StarRow]], off_mag: FloatArray, noise: FloatArray) -> Part:
-    """What changes from one photograph of a star to another beyond noise; with no star twice, Young's law."""
+    """What changes from one photograph of a star to another beyond noise; with no star twice,
+    Young's law.
+    """
     star = np.unique([row.star for _, row in every], return_inverse=True)[1]
     seen = np.bincount(star)[star]
     twice = seen > 1

@@ -1,4 +1,6 @@
-"""The bench file that photographs give of a tracker, and the files that it names; and such a file read back."""
+"""The bench file that photographs give of a tracker, and the files that it names; and such a
+file read back.
+"""
 
 import json
 import math
@@ -30,7 +32,8 @@ from hilstar.sky.spectrum import Curve
 GRID = 4  # field points along each side of the PSF file
 PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
-SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95  # a 24 inch screen, for a bench whose file has no monitor
+# a 24 inch screen, for a bench whose file has no monitor
+SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95
 PLACEHOLDER = "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm = 1000.0\n"
 UNDATED = '[sky]\nepoch_utc = "2000-01-01T00:00:00Z"\n'
 NAMES = ("tracker.toml", "tracker_distortion.toml", "tracker_qe.csv", "tracker_psf.fits")
@@ -50,7 +53,9 @@ PATH_KEYS |= {"true_calibration", "true_geometry"}
 
 
 def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
-    """A bench file, or one that has [tracker] alone, and whether it has a monitor. Raises InputError."""
+    """A bench file, or one that has [tracker] alone, and whether it has a monitor. Raises
+    InputError.
+    """
     text = read_text(path, "give the path of a bench file, or of one that has [tracker] alone", MAX_TOML_BYTES)
     tables = parse_toml(path, text)
     has_screen = "monitor" in tables or "collimator" in tables
@@ -60,7 +65,9 @@ def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
 
 
 def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
-    """Write the camera of a session as a bench file and the files it names. Raises InputError where they cannot be written."""
+    """Write the camera of a session as a bench file and the files it names. Raises InputError
+    where they cannot be written.
+    """
     camera, pixels = session.camera.camera, session.pixels
     tracker = session.file.config.tracker
     lens = camera.lens or Lens()
@@ -71,7 +78,8 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     write_whole(folder / NAMES[1], "\n".join(lines) + "\n")
     times, exposure_s = _write_efficiency(folder / NAMES[2], session)
     _write_psf(folder / NAMES[3], session)
-    pitch_um = tracker.pixel_pitch_um * tracker.resolution_px[0] / camera.resolution_px[0]  # twice that of a mosaic's plane
+    # twice that of a mosaic's plane
+    pitch_um = tracker.pixel_pitch_um * tracker.resolution_px[0] / camera.resolution_px[0]
     table: dict[str, Any] = {
         "aperture_mm": tracker.aperture_mm,
         "focal_length_mm": camera.focal_length_px * pitch_um * 1e-3,
@@ -141,11 +149,14 @@ def _dated_sky(session: Session, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:
-    """The keys of [tracker.detector]; a gain that neither photographs nor the `given` keys tell is none of them."""
+    """The keys of [tracker.detector]; a gain that neither photographs nor the `given` keys tell
+    is none of them.
+    """
     pixels, full_dn = session.pixels, session.shots[0].photo.full_dn
     gain = pixels.gain_e_per_dn
     full_e = (full_dn - pixels.pedestal_dn) * gain
-    # a file's levels may be steps of several DN, whose rounding is noise to a detector of steps of one
+    # a file's levels may be steps of several DN, whose rounding is noise to a detector of steps of
+    # one
     rounding_e = math.sqrt(max(pixels.step_dn**2 - 1, 0) / 12) * gain
     bits = math.ceil(math.log2(full_dn + 1))
     detector: dict[str, Any] = {
@@ -178,7 +189,9 @@ def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _toml(table: dict[str, Any], name: str = "") -> Iterable[str]:
-    """Lines of a table and those in it; JSON and TOML write numbers, truth values, lists and plain text alike."""
+    """Lines of a table and those in it; JSON and TOML write numbers, truth values, lists and
+    plain text alike.
+    """
     if name:
         yield f"\n[{name}]"
     yield from (f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict))
@@ -188,7 +201,9 @@ def _toml(table: dict[str, Any], name: str = "") -> Iterable[str]:
 
 
 def _write_efficiency(path: Path, session: Session) -> tuple[float, float]:
-    """Write the quantum efficiency that gives the light that was seen; how much longer the exposure has to be, and it, s."""
+    """Write the quantum efficiency that gives the light that was seen; how much longer the
+    exposure has to be, and it, s.
+    """
     tracker = session.file.config.tracker
     optics = bench_optics(tracker, session.file.folder)
     curve = corrected(optics.quantum_efficiency, session.light.correction)
@@ -246,7 +261,9 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
 
 
 def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
-    """The PSF of a bench file and its vignetting: the numbers that confront wrote, else fitted to the file's images."""
+    """The PSF of a bench file and its vignetting: the numbers that confront wrote, else fitted
+    to the file's images.
+    """
     tracker = file.config.tracker
     size = tracker.resolution_px
     psf = tracker_psf(tracker, file.folder)
@@ -264,7 +281,8 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
             wing_share, wing_sigma = numbers["wing"]
             a, b = numbers["vignetting"]
             return StarPsf(np.array(numbers["covariance"]), numbers["colour"], wing_share, wing_sigma, size), (a, b)
-        except (msgspec.MsgspecError, LookupError, TypeError, ValueError):  # somebody changed it: the images count
+        except (msgspec.MsgspecError, LookupError, TypeError, ValueError):
+            # somebody changed it: the images count
             pass
     focus = int(np.abs(glass.focuses_um - tracker.optics.focus_um).argmin())
     images = glass.images[:, :, focus].mean(axis=1)
@@ -275,7 +293,9 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
 
 
 def _fitted(images: FloatArray, per_px: int, places_px: FloatArray, size_px: tuple[int, int]) -> StarPsf:
-    """The PSF that fits images (n, side, side) of `per_px` samples a pixel, each at its place: as stars of 1e6 DN."""
+    """The PSF that fits images (n, side, side) of `per_px` samples a pixel, each at its place:
+    as stars of 1e6 DN.
+    """
     stamps = np.zeros((len(images), STAMP_PX, STAMP_PX))
     middle = images.shape[-1] // 2
     offsets = np.rint((np.arange(images.shape[-1]) - middle) / per_px).astype(np.intp)

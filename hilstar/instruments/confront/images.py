@@ -1,4 +1,6 @@
-"""Photographs as they were taken: FITS, TIFF, PNG and JPEG, mono or a raw Bayer mosaic by planes, with their time if known."""
+"""Photographs as they were taken: FITS, TIFF, PNG and JPEG, mono or a raw Bayer mosaic by
+planes, with their time if known.
+"""
 
 import math
 import re
@@ -24,7 +26,8 @@ MAP_KEYS = {"CENTAZ", "CENTEL"}  # in DASC's maps of azimuth and elevation
 EXIF_IFD, EXIF_DATE, EXIF_OFFSET, EXIF_EXPOSURE = 0x8769, 0x9003, 0x9011, 0x829A
 NAMED_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:_]?(\d\d)[-:_]?(\d\d)")
 MIN_SIDE_PX = 64
-BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05  # an RGB picture's brightest pixels, and how far channels of a grey one may differ there
+# an RGB picture's brightest pixels, and how far channels of a grey one may differ there
+BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05
 SATURATED_PIXELS = 3  # so many at the largest value, and none near below it, is a clipped level
 MAX_SATURATED_SHARE = 0.05
 
@@ -33,8 +36,8 @@ MAX_SATURATED_SHARE = 0.05
 class Photograph:
     """An image (height, width) in DN of its file, and what its file says of it.
 
-    Levels are multiples of `step_dn`, and `full_dn` is the level of saturation. `t_ns` is the UTC of the middle of the exposure
-    since 1970. `plane` names a colour of a mosaic.
+    Levels are multiples of `step_dn`, and `full_dn` is the level of saturation. `t_ns` is the UTC
+    of the middle of the exposure since 1970. `plane` names a colour of a mosaic.
     """
 
     path: Path
@@ -66,7 +69,9 @@ def paged(array: FloatArray) -> FloatArray:
 
 
 def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: int | None = None) -> list[Photograph]:
-    """The image of a file, or the planes of a mosaic, of this (width, height). Raises InputError: what and what to do."""
+    """The image of a file, or the planes of a mosaic, of this (width, height). Raises
+    InputError: what and what to do.
+    """
     data = read_bytes(path, ADVICE, MAX_BYTES)
     read = _fits if is_fits(data) else _picture
     pixels, facts = read(path, data, resolution_px)
@@ -121,7 +126,9 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
 
 
 def _levels(path: Path, dn: FloatArray) -> tuple[float, float]:
-    """The step between levels, and where they end. Raises InputError for an image without any structure, or full of light."""
+    """The step between levels, and where they end. Raises InputError for an image without any
+    structure, or full of light.
+    """
     values = np.unique(dn)
     top = float(values[-1])
     at_top = dn >= top

@@ -1,4 +1,6 @@
-"""Photographs against what `simulate` predicts of them with the fitted camera: pixels, sources, stars that are missing."""
+"""Photographs against what `simulate` predicts of them with the fitted camera: pixels, sources,
+stars that are missing.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -28,9 +30,11 @@ from hilstar.sky.stars import make_stars, unit_vectors_icrs
 ALL_STARS_MAG = 25.0
 LISTED_SNR = 8.0  # from which a source that nothing explains counts
 EXPECTED_SNR = 15.0  # expected of a star that is missing where no source is
-NEFF_PX = 4 * math.pi  # pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
+# pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
+NEFF_PX = 4 * math.pi
 SAME_LIGHT = 0.15  # a star explains a source where it has so much of its light
-SATELLITE_RAD = math.radians(0.2)  # elements are off by 1 to 3 km a day, which is 0.2 degrees at 400 km
+# elements are off by 1 to 3 km a day, which is 0.2 degrees at 400 km
+SATELLITE_RAD = math.radians(0.2)
 PLANET_RAD = math.radians(3 / 60)
 EDGE_PX = 3.0  # a star so far outside an image has light on it
 HALO_PX = 15.0  # about a saturated star, sources are its own light
@@ -39,8 +43,9 @@ CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
 HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
 MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
-# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). Over the last magnitude before it, its
-# own stars grow by 0.477, 0.458 and 0.434 dex a magnitude for |sin b| under 0.2, 0.2 to 0.5 and 0.5 to 1.
+# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). Over the last
+# magnitude before it, its own stars grow by 0.477, 0.458 and 0.434 dex a magnitude for |sin b|
+# under 0.2, 0.2 to 0.5 and 0.5 to 1.
 GALACTIC_POLE = np.array([-0.867666, -0.198076, 0.455984])
 COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), (0.484, -0.067)
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
@@ -58,7 +63,9 @@ class SourceRow:
 
 @dataclass(frozen=True, slots=True)
 class StarRow:
-    """One star of a photograph: place and DN seen (NaN where it is missing) and predicted, and flags."""
+    """One star of a photograph: place and DN seen (NaN where it is missing) and predicted, and
+    flags.
+    """
 
     star: int
     hip: int
@@ -101,7 +108,9 @@ class DatedBy:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How one photograph agrees: figures, tables, and images (height, width): DN predicted, and residuals in sigmas."""
+    """How one photograph agrees: figures, tables, and images (height, width): DN predicted, and
+    residuals in sigmas.
+    """
 
     shot: Shot
     number: int
@@ -132,7 +141,9 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Fainter:
-    """Stars that a photograph reaches beyond its catalogue: V to which that is complete and V of LISTED_SNR, and how many."""
+    """Stars that a photograph reaches beyond its catalogue: V to which that is complete and V of
+    LISTED_SNR, and how many.
+    """
 
     complete_v_mag: float
     reached_v_mag: float
@@ -178,20 +189,24 @@ class Judge:
         self._simulator.close()
 
     def _defects(self) -> tuple[BoolArray, BoolArray]:
-        """Pixels (height, width) that are bright, or dark, in nearly all of several photographs whose stars moved."""
+        """Pixels (height, width) that are bright, or dark, in nearly all of several photographs
+        whose stars moved.
+        """
         session = self.session
         shape = session.shots[0].photo.dn.shape
         counts = np.zeros((2, *shape), dtype=np.int16)
         for shot in session.shots:
             off = (shot.photo.dn - shot.level.level) / np.sqrt(session.pixels.variance_dn2(shot.level.level))
-            around = ndimage.uniform_filter(off, 3) * 9 - off  # what the eight about it have: a star's light is there too
+            # what the eight about it have: a star's light is there too
+            around = ndimage.uniform_filter(off, 3) * 9 - off
             alone = around < HOT_LIGHT * np.abs(off) + 3 * math.sqrt(8)
             counts[0] += (off > HOT_SIGMAS) & alone
             counts[1] += off < -HOT_SIGMAS
         least = max(1, math.ceil(HOT_SHARE * len(session.shots)))
         axes = np.array([to_matrix(one.q_icrs_to_cam)[2] for one in session.camera.pointings])
         moved_px = np.ptp(axes, axis=0).max() * session.camera.camera.focal_length_px
-        if moved_px < MOVED_PX:  # stars too may have one pixel, in each photograph: what no neighbour shares at all
+        # stars too may have one pixel, in each photograph: what no neighbour shares at all
+        if moved_px < MOVED_PX:
             counts[0] *= around < 0.1 * np.abs(off) + 2 * math.sqrt(8)
         return counts[0] >= least, counts[1] >= least
 
@@ -233,7 +248,9 @@ class Judge:
         )
 
     def _light_dn(self, number: int) -> FloatArray:
-        """The stars' light (height, width), DN, by `simulate`'s own code, behind the air of this photograph."""
+        """The stars' light (height, width), DN, by `simulate`'s own code, behind the air of this
+        photograph.
+        """
         session, stars, simulator, shot = self.session, self._stars, self._simulator, self.session.shots[number]
         pointing = session.camera.pointings[number]
         air, rate = shot.sky.air, stars.electrons_per_s
@@ -247,7 +264,8 @@ class Judge:
             ordered[stars.row] = column
         simulator.stars = make_stars(stars.catalog, *by_row)
         exposure = simulator.expose(simulator.view(pointing.q_icrs_to_cam, STILL), None)
-        # the file's quantum efficiency and exposure stand for one zero point, this photograph's air for another
+        # the file's quantum efficiency and exposure stand for one zero point, this photograph's air
+        # for another
         offsets = session.light.offsets_mag
         air_mag = offsets[number] - (self._own_mag if session.fixed else offsets.mean())
         return np.asarray(exposure.mean_e / session.pixels.gain_e_per_dn * 10 ** (-0.4 * air_mag))
@@ -290,13 +308,16 @@ class Judge:
             inside = 2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
             if star in seen or not inside or near(x, y) or sources.query([x, y])[0] <= 2 * MATCH_PX:
                 continue
-            box = np.s_[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]  # its light may be part of a larger source
+            # its light may be part of a larger source
+            box = np.s_[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
             if (shot.photo.dn[box] - shot.level.level[box]).sum() < expected.dn[place[star]] / 2:
                 rows.append(row(star, (math.nan,) * 4, ("missing",)))
         return rows
 
     def _sources(self, number: int, light_sigma: FloatArray, expected: Expected) -> list[SourceRow]:
-        """Every source with its explanation: a planet, a trail, a star, the detector, or a bright star's light."""
+        """Every source with its explanation: a planet, a trail, a star, the detector, or a
+        bright star's light.
+        """
         session, shot = self.session, self.session.shots[number]
         sources, sky = shot.sources, shot.sky
         tree = cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
@@ -340,7 +361,9 @@ class Judge:
         return {n: (float(a), float(b)) for n, a, b in zip(seen, x, y, strict=True) if math.isfinite(a) and math.isfinite(b)}
 
     def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
-        """Places of satellites in the middle of the exposure, by the bench's list; none without a list, a site and a date."""
+        """Places of satellites in the middle of the exposure, by the bench's list; none without
+        a list, a site and a date.
+        """
         file, photo = self.session.file, self.session.shots[number].photo
         config, camera = file.config, self.session.camera
         if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
@@ -365,7 +388,9 @@ class Judge:
         return np.asarray(~(lit | self.hot | self.dead))
 
     def _fainter(self, number: int, expected: Expected) -> Fainter:
-        """How many sources are stars beyond Hipparcos, by its own stars in the image and the slope of star counts."""
+        """How many sources are stars beyond Hipparcos, by its own stars in the image and the
+        slope of star counts.
+        """
         shot = self.session.shots[number]
         sine = abs(float(self.session.camera.pointings[number].boresight @ GALACTIC_POLE))
         complete = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * sine
@@ -379,7 +404,9 @@ class Judge:
         return Fainter(complete, reached, max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0)
 
     def _dated(self, number: int) -> DatedBy | None:
-        """How far off the date is by the stars that move fastest over the image; None without stars."""
+        """How far off the date is by the stars that move fastest over the image; None without
+        stars.
+        """
         shot, session = self.session.shots[number], self.session
         use = np.flatnonzero(shot.clean)
         if not len(use):
@@ -409,7 +436,9 @@ def _saturated(shot: Shot) -> Callable[[float, float], bool]:
 
 
 def _dim_regions(rows: Sequence[StarRow], size_px: tuple[int, int]) -> tuple[list[str], Callable[[StarRow], bool]]:
-    """Parts of the image whose stars are missing or dim, in words, and whether a star is in one of them."""
+    """Parts of the image whose stars are missing or dim, in words, and whether a star is in one
+    of them.
+    """
     width, height = size_px
     cells: dict[tuple[int, int], list[StarRow]] = {}
 

@@ -1,7 +1,9 @@
-"""The light of photographs: zero point, colour, vignetting and linearity by stars; gain, pedestal and noise by pixels.
+"""The light of photographs: zero point, colour, vignetting and linearity by stars; gain, pedestal
+and noise by pixels.
 
-Magnitudes are compared with what hilstar computes of each star's spectrum through the tracker's curves. A residual is a
-star's instrument magnitude less the fitted one: positive where the photograph has less light.
+Magnitudes are compared with what hilstar computes of each star's spectrum through the tracker's
+curves. A residual is a star's instrument magnitude less the fitted one: positive where the
+photograph has less light.
 """
 
 import math
@@ -15,8 +17,8 @@ from hilstar.basics.units import MAD_TO_SIGMA
 from hilstar.instruments.confront.star_psf import MEAN_BV_MAG
 
 MAG = 2.5 / math.log(10)
-# A quantum efficiency is corrected by exp(tilt x + bow x^2), x = ln(wavelength / 550 nm): the largest of both, the stars that
-# each takes, and the spread of B-V that they need.
+# A quantum efficiency is corrected by exp(tilt x + bow x^2), x = ln(wavelength / 550 nm): the
+# largest of both, the stars that each takes, and the spread of B-V that they need.
 MAX_CORRECTION, STARS_FOR_CORRECTION, MIN_COLOURS_MAG = np.array([10.0, 30.0]), (15, 30), 0.2
 CORRECTION_PRIOR = np.array([3.0, 10.0])
 CORRECTION_ROUNDS, CORRECTION_STEP, CORRECTION_FLOOR_MAG, CORRECTION_HUBER = 8, 0.05, 0.05, 1.5
@@ -26,10 +28,12 @@ BRIGHT_V_MAG = 6.5  # to which rms errors are stated
 TRUSTED_SNR = 20.0
 PATTERN_CLIP, ROUNDS = 3.5, 8
 MIN_STARS = 8
-MIN_MASSES, CLOUD_MAG = 0.3, 0.01  # air masses that tell extinction, and by how much skies differ beside it
+# air masses that tell extinction, and by how much skies differ beside it
+MIN_MASSES, CLOUD_MAG = 0.3, 0.01
 
 
-LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0  # by how much a power differs from 1 where a tone curve is stated
+# by how much a power differs from 1 where a tone curve is stated
+LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0
 
 Correction = tuple[float, float]
 Magnitudes = Callable[[Correction], FloatArray]
@@ -37,9 +41,11 @@ Magnitudes = Callable[[Correction], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class StarLight:
-    """Stars (n,) of all photographs: which one, flux with one sigma, DN, V, B-V, the square of the radius, and whether clean.
+    """Stars (n,) of all photographs: which one, flux with one sigma, DN, V, B-V, the square of the
+    radius, and whether clean.
 
-    The radius is in half diagonals from the principal point. `plane` is 1, 2, 3 for red, green and blue of a mosaic, else 0.
+    The radius is in half diagonals from the principal point. `plane` is 1, 2, 3 for red, green and
+    blue of a mosaic, else 0.
     """
 
     image: IntArray
@@ -64,13 +70,17 @@ class StarLight:
 
 @dataclass(frozen=True, slots=True)
 class LightFit:
-    """Zero points (images,) of DN, mag, about the tracker's own magnitudes, vignetting (mag at r^2, r^4 = 1).
+    """Zero points (images,) of DN, mag, about the tracker's own magnitudes, vignetting (mag at r^2,
+    r^4 = 1).
 
-    `correction` is that of the quantum efficiency: tilt and bow. `zero_point_mag` and `colour_term` are
-    about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the power `linearity`. `sigma` has
-    one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset. `masses` are each
-    photograph's air masses where known, and `extinction_mag` what offsets grow by with one, beyond the site's own table.
-    `colours` (images,) are what a plane of a mosaic adds, mag a magnitude of B-V, and `colour_terms` those of planes about V.
+    `correction` is that of the quantum efficiency: tilt and bow. `zero_point_mag` and `colour_term`
+    are
+    about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the
+    power `linearity`. `sigma` has one sigma of figures by name. `mag` (n,) is what each star should
+    have, without the photograph's offset. `masses` are each photograph's air masses where known,
+    and `extinction_mag` what offsets grow by with one, beyond the site's own table. `colours`
+    (images,) are what a plane of a mosaic adds, mag a magnitude of B-V, and `colour_terms` those of
+    planes about V.
     """
 
     offsets_mag: FloatArray
@@ -95,7 +105,8 @@ class LightFit:
 def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: LightFit | None = None) -> LightFit:
     """The light of stars; `magnitudes` are theirs (n,) through a quantum efficiency of a tilt.
 
-    With `held` the camera is that one's, and each photograph's offset (the air, the exposure) alone is fitted.
+    With `held` the camera is that one's, and each photograph's offset (the air, the exposure) alone
+    is fitted.
     """
     if held is not None:
         return _offsets_alone(stars, images, magnitudes(NO_CORRECTION), held)
@@ -141,10 +152,11 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
 
 
 def with_extinction(light: LightFit, stars: StarLight, masses: Sequence[float | None], *, known: bool) -> LightFit:
-    """The light with the slope of the photographs' offsets over their air masses, where these span MIN_MASSES.
+    """The light with the slope of the photographs' offsets over their air masses, where these span
+    MIN_MASSES.
 
-    A photograph's offset counts by its stars' scatter and by CLOUD_MAG, by which skies differ. With a `known` extinction the
-    slope is what is left of it.
+    A photograph's offset counts by its stars' scatter and by CLOUD_MAG, by which skies differ. With
+    a `known` extinction the slope is what is left of it.
     """
     found = replace(light, masses=tuple(masses))
     x = np.array([np.nan if one is None else one for one in masses])
@@ -162,7 +174,9 @@ def with_extinction(light: LightFit, stars: StarLight, masses: Sequence[float | 
 
 
 def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
-    """Clean stars that should have TRUSTED_SNR by their V: of fainter ones only those are found that came out bright."""
+    """Clean stars that should have TRUSTED_SNR by their V: of fainter ones only those are found
+    that came out bright.
+    """
     clean = stars.clean & (stars.dn > 0)
     bright = clean & (stars.dn > TRUSTED_SNR * stars.sigma_dn)
     if not bright.any():
@@ -182,7 +196,9 @@ def _correction(stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use
     plain = plain[use]
 
     def loss(values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Huber's loss and a weak prior; the residuals in sigmas, and the other columns' coefficients."""
+        """Huber's loss and a weak prior; the residuals in sigmas, and the other columns'
+        coefficients.
+        """
         off, kept = target - magnitudes(_pair(values))[use], np.ones(len(target))
         for _ in range(CORRECTION_ROUNDS):
             rows = plain * (np.sqrt(kept) / weight)[:, None]
@@ -228,7 +244,8 @@ def _about_v(
     """The power of the light that DN follow, and about V the colour term and zero points."""
     bv = np.nan_to_num(stars.bv_mag)
     both = _robust(np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use)
-    # a zero point at V = 0 of a line with a free slope lies far from the stars: that of slope 1 is stated
+    # a zero point at V = 0 of a line with a free slope lies far from the stars: that of slope 1 is
+    # stated
     plain = _robust(np.column_stack([bv, ones, *vignetting]), stars.instrument_mag - stars.v_mag, stars.sigma_mag, use)
     return replace(
         both, values=np.concatenate([both.values[:1], plain.values]), sigma=np.concatenate([both.sigma[:1], plain.sigma])

@@ -1,9 +1,9 @@
 """The attitude of a photograph of which only the field of view is known, to 20 %.
 
-Triangles of bright stars, told apart by the ratios of their sides: those of the brightest stars in circles all over the sky
-against those of the brightest sources in circles all over the image. A candidate counts where the other bright stars of the
-field lie on sources too, by more than chance allows. The camera is a pinhole here; a lens of some per cent is within the
-tolerance.
+Triangles of bright stars, told apart by the ratios of their sides: those of the brightest stars in
+circles all over the sky against those of the brightest sources in circles all over the image. A
+candidate counts where the other bright stars of the field lie on sources too, by more than chance
+allows. The camera is a pinhole here; a lens of some per cent is within the tolerance.
 """
 
 import itertools
@@ -21,20 +21,25 @@ from hilstar.basics.rotation import from_matrix
 # Half steps of 5 % about each hypothesis cover +-22 %.
 HYPOTHESES = (1.0, 1.1, 0.91, 1.2, 0.83)
 STEP = 0.055
-MAX_RATIO_OFF = 0.004  # a triangle's sides relative to its longest: a distortion of 0.1 over 6 deg is 0.001
+# a triangle's sides relative to its longest: a distortion of 0.1 over 6 deg is 0.001
+MAX_RATIO_OFF = 0.004
 STARS_A_CIRCLE, SOURCES_A_CIRCLE = 9, 9  # whose triangles are compared
 CIRCLE = 0.5  # radius, of the field's smaller side
 MIN_SIDE = 0.15  # shortest side of a triangle, of the circle's diameter
 MAX_SOURCES = 60  # brightest sources that may prove an attitude
 NEAR = 0.006  # a share of the image's diagonal: within it a star and a source are one
-# Chance is that of as many random places on the image; with 1e5 candidates at most, 1e-9 leaves 1e-4 for a false attitude.
+# Chance is that of as many random places on the image; with 1e5 candidates at most, 1e-9 leaves
+# 1e-4 for a false attitude.
 MAX_CHANCE = 1e-9
 MAX_CANDIDATES = 20_000  # for one hypothesis
 MIN_MATCHED = 5
-# The triangles of one sky serve others of about its date: an arcminute changes a ratio by less than a tenth of its tolerance.
+# The triangles of one sky serve others of about its date: an arcminute changes a ratio by less than
+# a tenth of its tolerance.
 KEPT_STARS, KEPT_RAD = 1000, 3e-4
-STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])  # scales the triangles' keys, so that one distance is every tolerance
-Triangles = tuple[IntArray, FloatArray, cKDTree]  # triples (t, 3), which way round they go (t,), and their stretched keys
+# scales the triangles' keys, so that one distance is every tolerance
+STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])
+# triples (t, 3), which way round they go (t,), and their stretched keys
+Triangles = tuple[IntArray, FloatArray, cKDTree]
 _KEPT: dict[float, tuple[FloatArray, Triangles]] = {}
 
 
@@ -70,9 +75,11 @@ class SourceField:
 def solve_lost(
     field: SourceField, focal_length_px: float, vectors: FloatArray, near: FloatArray | None = None
 ) -> SolvedField | None:
-    """The attitude of a field whose focal length is known to 20 %; `vectors` (n, 3) are stars, ICRS, brightest first.
+    """The attitude of a field whose focal length is known to 20 %; `vectors` (n, 3) are stars,
+    ICRS, brightest first.
 
-    With a direction `near` (3,) of the boresight, known to a field or so, only stars about it are looked at.
+    With a direction `near` (3,) of the boresight, known to a field or so, only stars about it are
+    looked at.
     """
     if len(field.places_px) < MIN_MATCHED:
         return None
@@ -130,7 +137,9 @@ def _triangles_of_sky(
 
 
 def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Triples ordered by the side opposite each corner, longest first; log of the longest side and two ratios; handedness."""
+    """Triples ordered by the side opposite each corner, longest first; log of the longest side
+    and two ratios; handedness.
+    """
     corners = vectors[triples]
     sides = 2 * np.arcsin(np.linalg.norm(corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]], axis=2) / 2)
     order = np.argsort(-sides, axis=1)
@@ -144,7 +153,9 @@ def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray,
 
 
 def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
-    """Triples of the brightest sources in circles over the image, those of the brightest ones first."""
+    """Triples of the brightest sources in circles over the image, those of the brightest ones
+    first.
+    """
     radius = CIRCLE * min(field.width_px, field.height_px)
     ways = [
         np.arange(-(size / 2 - radius), size / 2 - radius + 1, max(radius / 2, 1.0))
@@ -233,7 +244,9 @@ class _Proof:
 
 
 def nearest_once(tree: cKDTree, places_px: FloatArray, radius_px: float) -> tuple[IntArray, IntArray]:
-    """Which places (n, 2), brightest first, have a source of a tree within a radius, each source once, and that source."""
+    """Which places (n, 2), brightest first, have a source of a tree within a radius, each source
+    once, and that source.
+    """
     off, source = map(np.asarray, tree.query(places_px, distance_upper_bound=radius_px))
     here = np.flatnonzero(np.isfinite(off))
     here = here[np.sort(np.unique(source[here], return_index=True)[1])]
@@ -241,7 +254,9 @@ def nearest_once(tree: cKDTree, places_px: FloatArray, radius_px: float) -> tupl
 
 
 def turned(cam: FloatArray, icrs: FloatArray) -> FloatArray:
-    """The rotation (3, 3) from ICRS to cam that fits pairs of unit vectors (n, 3) best (Markley 1988)."""
+    """The rotation (3, 3) from ICRS to cam that fits pairs of unit vectors (n, 3) best (Markley
+    1988).
+    """
     u, _, vt = np.linalg.svd(cam.T @ icrs)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 

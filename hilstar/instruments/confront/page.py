@@ -1,4 +1,6 @@
-"""The page of a confrontation: each photograph, its prediction and residual to blink between, and charts; one file."""
+"""The page of a confrontation: each photograph, its prediction and residual to blink between,
+and charts; one file.
+"""
 
 import base64
 import io
@@ -30,7 +32,9 @@ STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """A photograph, its prediction and its residual as JPEG, and the map of squared residuals (rows, columns)."""
+    """A photograph, its prediction and its residual as JPEG, and the map of squared residuals
+    (rows, columns).
+    """
 
     views: tuple[bytes, ...]
     chi2_map: FloatArray

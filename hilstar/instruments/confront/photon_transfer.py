@@ -1,4 +1,5 @@
-"""The detector behind photographs by their background: gain, pedestal and read noise, by photon transfer.
+"""The detector behind photographs by their background: gain, pedestal and read noise, by photon
+transfer.
 
 Shot noise goes as the light, and the pixels' response (PRNU) as its square: both are noise about
 the neighbours in one photograph, and only what several photographs have in common tells them apart,
@@ -32,7 +33,8 @@ READ_NOISE_SHARE = 0.5  # one sigma of a read noise that is assumed, as a share 
 
 @dataclass(frozen=True, slots=True)
 class PixelFit:
-    """What pixels tell of the detector: gain, pedestal, read noise, with one sigma where known, and the points (n, 2) of it.
+    """What pixels tell of the detector: gain, pedestal, read noise, with one sigma where known, and
+    the points (n, 2) of it.
 
     Points are the background's level and its variance, DN, DN^2. `notes` say what was assumed.
     `gain_told` is whether the gain is the photographs' own; else it is the bench file's.
@@ -63,7 +65,8 @@ class PixelFit:
 
 
 def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> FloatArray:
-    """Levels and variances (n, 2) of blocks of an image, by differences of neighbours, without pixels of stars.
+    """Levels and variances (n, 2) of blocks of an image, by differences of neighbours, without
+    pixels of stars.
 
     A shading within a block counts for nothing: the smooth level is taken off first.
     """
@@ -161,7 +164,8 @@ def _by_levels(
     *,
     several: bool,
 ) -> PixelFit | None:
-    """The gain by the slope of the variance over levels that differ; None where they do not tell it.
+    """The gain by the slope of the variance over levels that differ; None where they do not tell
+    it.
 
     In one photograph the pixels' response is unknown: a square is fitted beside the slope.
     """
@@ -321,7 +325,8 @@ def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
 
 
 def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
-    """The level without light, and its sigma, by skies of different brightness; None where they cannot tell.
+    """The level without light, and its sigma, by skies of different brightness; None where they
+    cannot tell.
 
     `levels` (blocks,) of each photograph at `places` (blocks, 2). A sky's light is one shade over
     the image, common to all photographs, times a slope of its own. Sigma is by leaving out a

@@ -1,4 +1,6 @@
-"""What a confrontation found: its figures for --json, its verdicts in words, and what is beyond the limits of --strict."""
+"""What a confrontation found: its figures for --json, its verdicts in words, and what is beyond
+the limits of --strict.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,7 +24,9 @@ UNSURE_YEARS = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Confronted:
-    """What came of it: the session, a verdict of each photograph, the split of the scatter, and lines of words."""
+    """What came of it: the session, a verdict of each photograph, the split of the scatter, and
+    lines of words.
+    """
 
     session: Session
     verdicts: tuple[Verdict, ...]
@@ -123,7 +127,9 @@ def _image_figures(session: Session, verdict: Verdict) -> dict[str, Any]:
 
 
 def extinction_of(session: Session) -> float | None:
-    """Extinction in the tracker's light, mag an air mass, where photographs told it: of sunlight, with a site."""
+    """Extinction in the tracker's light, mag an air mass, where photographs told it: of
+    sunlight, with a site.
+    """
     slope = session.light.extinction_mag
     if slope is None or session.air is None:
         return slope
@@ -131,7 +137,9 @@ def extinction_of(session: Session) -> float | None:
 
 
 def sky_v_mag(session: Session, number: int) -> float | None:
-    """V of the sky between the stars, mag/arcsec^2, by the zero point of stars; None where it is not above the pedestal."""
+    """V of the sky between the stars, mag/arcsec^2, by the zero point of stars; None where it is
+    not above the pedestal.
+    """
     pixels, camera = session.pixels, session.camera.camera
     dn = float(np.median(session.shots[number].level.level)) - pixels.pedestal_dn
     if dn <= 0:

@@ -24,7 +24,8 @@ from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import tracker_camera
 
 OUTPUTS = ("index.html", "stars.csv", "sources.csv", *NAMES)
-MEMORY_PX = 20_000_000  # photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
+# photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
+MEMORY_PX = 20_000_000
 STAR_COLUMNS = (
     "image",
     "hip",
@@ -50,7 +51,9 @@ def confront(
     fixed: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Confronted:
-    """Confront photographs with a bench's tracker and write DIR's files. Raises InputError: what is wrong, and what to do."""
+    """Confront photographs with a bench's tracker and write DIR's files. Raises InputError: what
+    is wrong, and what to do.
+    """
     file, has_screen = read_tracker_file(bench)
     photos: list[Photograph] = []
     for path in images:
@@ -104,7 +107,9 @@ def confront(
 
 
 def _base(file: BenchFile, photos: Sequence[Photograph]) -> Camera:
-    """The camera as the bench file guesses it, of these photographs' size: a mosaic's planes have half of the pixels."""
+    """The camera as the bench file guesses it, of these photographs' size: a mosaic's planes
+    have half of the pixels.
+    """
     camera = tracker_camera(file.config.tracker, file.folder)
     size = photos[0].size_px
     if any(photo.size_px != size for photo in photos):

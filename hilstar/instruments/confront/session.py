@@ -1,4 +1,6 @@
-"""From photographs to one camera: attitudes, stars by a PSF, geometry and light of all photographs together."""
+"""From photographs to one camera: attitudes, stars by a PSF, geometry and light of all
+photographs together.
+"""
 
 import math
 from collections.abc import Sequence
@@ -69,8 +71,10 @@ from hilstar.tracker.settings import DetectorSettings
 
 MATCH_PX = 2.5
 FIRST_PX = 0.15  # error of a source's place before it is measured
-BEYOND, FURTHER, MAX_ROUNDS = 1.25, 1.05, 12  # a match's radius: where it is continued, and while it grows so
-BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
+# a match's radius: where it is continued, and while it grows so
+BEYOND, FURTHER, MAX_ROUNDS = 1.25, 1.05, 12
+# a neighbour so near, and not so much fainter, spoils a star's place and flux
+BLEND_PX, BLEND_MAG = 6.0, 3.0
 PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 9.0
 BRIGHTEST = 10  # sources that tell a photograph's focus and rest
@@ -86,9 +90,11 @@ MAX_TONE_STEP, MIN_POWER = 0.4, 0.1
 
 @dataclass(slots=True)
 class Shot:
-    """One photograph on its way: its background and sources, its sky, its pointing, and the stars on it.
+    """One photograph on its way: its background and sources, its sky, its pointing, and the stars
+    on it.
 
-    `star` (n,) are rows of `sky`, with the `measured` figures of each and whether it is `clean`: alone, and not saturated.
+    `star` (n,) are rows of `sky`, with the `measured` figures of each and whether it is `clean`:
+    alone, and not saturated.
     """
 
     photo: Photograph
@@ -135,7 +141,9 @@ class Session:
     air: SiteAir | None = None
 
     def sky_mag(self) -> float:
-        """What the sky's light of V = 0 has on the tracker, mag, as stars have theirs (see `LightFit.mag`)."""
+        """What the sky's light of V = 0 has on the tracker, mag, as stars have theirs (see
+        `LightFit.mag`).
+        """
         config, folder = self.file.config, self.file.folder
         optics = bench_optics(config.tracker, folder)
         corrected_by = NO_CORRECTION if self.fixed else self.light.correction
@@ -145,7 +153,9 @@ class Session:
         return float(magnitude(np.array([glow / ARCSEC_PER_RAD**2]))[0])
 
     def plane_mag(self, number: int, columns: FloatArray) -> FloatArray:
-        """By how much stars of V, B-V and V-I (3, n) are fainter to a plane of a mosaic than to the tracker as a whole, mag."""
+        """By how much stars of V, B-V and V-I (3, n) are fainter to a plane of a mosaic than to
+        the tracker as a whole, mag.
+        """
         colour = self.light.colours[number] * (np.nan_to_num(columns[1], nan=MEAN_BV_MAG) - MEAN_BV_MAG)
         return np.asarray(colour + _channel_mag(self.file, self.shots[number].photo.plane, columns))
 
@@ -160,7 +170,9 @@ class Session:
 
 
 def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArray | None) -> Shot:
-    """A photograph with its attitude. Raises InputError where it has none: what is seen, and what to do."""
+    """A photograph with its attitude. Raises InputError where it has none: what is seen, and
+    what to do.
+    """
     level = _level(photo, photo.step_dn)
     sources = find_sources(level.above(photo.dn))
     sky = dated_sky(file, photo.t_ns)
@@ -243,7 +255,8 @@ def run_session(
     *,
     fixed: "FixedCamera | None" = None,
 ) -> Session:
-    """Everything about photographs of one camera; with `fixed` that camera, to which only attitudes and offsets are fitted.
+    """Everything about photographs of one camera; with `fixed` that camera, to which only attitudes
+    and offsets are fitted.
 
     Raises InputError for a photograph without an attitude.
     """
@@ -286,7 +299,9 @@ class FixedCamera:
 
 
 def _linear(shot: Shot, photo: Photograph, power: float) -> Shot:
-    """The shot with levels that go as light: those of the file to the power 1 / `power`, full scale as it is."""
+    """The shot with levels that go as light: those of the file to the power 1 / `power`, full
+    scale as it is.
+    """
     full = photo.full_dn
     dn = full * (np.maximum(photo.dn, 0) / full) ** (1 / power)
     middle = float(np.median(photo.dn)) / full
@@ -313,7 +328,9 @@ def _fitted(
     power: float = 1.0,
     before: CameraFit | None = None,
 ) -> Session:
-    """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
+    """The session of shots whose levels were made linear by a power; with the camera `before`,
+    of their light alone.
+    """
     pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
     first = [_seen_at(s, s.matched.star, s.matched.source) for s in shots]
     if before is None and fixed is None:
@@ -360,9 +377,11 @@ def _seen_at(shot: Shot, star: IntArray, source: IntArray) -> Places:
 def _outward(
     base: Camera, pointings: list[Pointing], shots: Sequence[Shot], first: list[Places]
 ) -> tuple[list[Places], list[Pointing]]:
-    """First places and pointings, further from the middle than a pinhole's first match where the lens has a strong distortion.
+    """First places and pointings, further from the middle than a pinhole's first match where the
+    lens has a strong distortion.
 
-    Stars are matched a little further out by the k1 of those matched before, until no more are found.
+    Stars are matched a little further out by the k1 of those matched before, until no more are
+    found.
     """
     places, now = first, list(pointings)
     for _ in range(MAX_ROUNDS):
@@ -396,7 +415,9 @@ def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> 
 
 
 def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
-    """What stars have to the channel of a plane (r, g1, g2, b) more than to all, mag; 0 where the bench has one channel."""
+    """What stars have to the channel of a plane (r, g1, g2, b) more than to all, mag; 0 where
+    the bench has one channel.
+    """
     channels = bench_channels(file.config.tracker, file.folder)
     if not plane or len(channels) < 3:
         return np.zeros(columns.shape[1])
@@ -447,7 +468,9 @@ def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
 
 
 def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
-    """Which stars of the catalogue are sources of the shot, and which of them stand alone and are not saturated."""
+    """Which stars of the catalogue are sources of the shot, and which of them stand alone and
+    are not saturated.
+    """
     width, height = shot.photo.size_px
     x, y = pointing.places_px(camera, shot.sky.vectors)
     with np.errstate(invalid="ignore"):
@@ -542,7 +565,9 @@ def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
 
 
 class _Magnitudes:
-    """Magnitudes of the session's stars by hilstar's own spectra, through a corrected quantum efficiency."""
+    """Magnitudes of the session's stars by hilstar's own spectra, through a corrected quantum
+    efficiency.
+    """
 
     def __init__(self, file: BenchFile, columns: FloatArray) -> None:
         self._file, self._columns = file, list(columns)

@@ -1,4 +1,6 @@
-"""The catalogue's sky on the day of a photograph, brightest stars first; the planets on that day."""
+"""The catalogue's sky on the day of a photograph, brightest stars first; the planets on that
+day.
+"""
 
 import warnings
 from dataclasses import dataclass
@@ -21,17 +23,20 @@ from hilstar.sky.star_table import choose_catalog
 from hilstar.sky.stars import AirAbove, aberrate, unit_vectors_icrs
 
 AU_KM, DAY_S = 149_597_870.7, 86_400.0
-PLANETS = ("Mercury", "Venus", "", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")  # ERFA's numbers from 1; 3 is the Earth
-DOUBLES, VARIABLES = (b"C", b"G", b"O", b"V", b"X"), (b"P", b"U")  # flags of CDS I/239's H59 and H52
+# ERFA's numbers from 1; 3 is the Earth
+PLANETS = ("Mercury", "Venus", "", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
+# flags of CDS I/239's H59 and H52
+DOUBLES, VARIABLES = (b"C", b"G", b"O", b"V", b"X"), (b"P", b"U")
 DAY_NS = 86_400 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class DatedSky:
-    """Stars (n,) as seen from the Earth on a day, brightest first: unit vectors (n, 3), ICRS, by row of the catalogue.
+    """Stars (n,) as seen from the Earth on a day, brightest first: unit vectors (n, 3), ICRS, by
+    row of the catalogue.
 
-    `velocity_km_s` is the observer's; None where no date is known, and then stars are those of the bench's epoch without
-    aberration.
+    `velocity_km_s` is the observer's; None where no date is known, and then stars are those of the
+    bench's epoch without aberration.
     """
 
     catalog: Catalog
@@ -65,7 +70,9 @@ class DatedSky:
         return np.stack([self.catalog.v_mag[row], self.catalog.bv_mag[row], self.catalog.vi_mag[row]])
 
     def within(self, star: IntArray) -> tuple[FloatArray, BoolArray, BoolArray]:
-        """Of some stars (k,): the error of V, mag, and whether they are known doubles or variables."""
+        """Of some stars (k,): the error of V, mag, and whether they are known doubles or
+        variables.
+        """
         some = self.catalog.taken(self.order[star])
         sigma = np.nan_to_num(sigma_v_mag(errors_of(some), some.bv_mag), nan=0.05)
         return sigma, np.isin(some.multiple, DOUBLES), np.isin(some.variable, VARIABLES)
@@ -77,7 +84,9 @@ class DatedSky:
 
 
 def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
-    """The sky of a UTC, of a bench's catalogue. Raises InputError for a catalogue that cannot be read."""
+    """The sky of a UTC, of a bench's catalogue. Raises InputError for a catalogue that cannot be
+    read.
+    """
     sky = file.config.sky
     catalog = choose_catalog(catalogue_choice(file.config, file.folder))
     epoch = sky.epoch_jyear if t_ns is None else jyear(t_ns)
@@ -94,20 +103,27 @@ def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
 
 @lru_cache(maxsize=64)
 def _earth(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """The Earth's place from the Sun and the barycentre, au, and its velocity, au a day (ERFA's epv00)."""
+    """The Earth's place from the Sun and the barycentre, au, and its velocity, au a day (ERFA's
+    epv00).
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # years beyond 1900 to 2100: 0.01 arcsec of aberration
+        # years beyond 1900 to 2100: 0.01 arcsec of aberration
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
         about_sun, about_centre = erfa.epv00(UNIX_JD, t_ns / DAY_NS)
     return tuple(about_sun["p"]), tuple(about_centre["p"]), tuple(about_centre["v"])
 
 
 def earth_velocity_km_s(t_ns: int) -> FloatArray:
-    """The Earth's velocity about the barycentre (3,), ICRS; 0.5 km/s of its turning are left out: 0.3 arcsec."""
+    """The Earth's velocity about the barycentre (3,), ICRS; 0.5 km/s of its turning are left
+    out: 0.3 arcsec.
+    """
     return np.array(_earth(t_ns)[2]) * AU_KM / DAY_S
 
 
 def planets_seen(t_ns: int) -> dict[str, FloatArray]:
-    """Unit vectors (3,) to the planets and the Moon from the Earth's centre, ICRS: within 1 arcmin, the Moon 1 deg."""
+    """Unit vectors (3,) to the planets and the Moon from the Earth's centre, ICRS: within 1
+    arcmin, the Moon 1 deg.
+    """
     earth = np.array(_earth(t_ns)[0])
     found = {}
     with warnings.catch_warnings():

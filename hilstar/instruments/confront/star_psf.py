@@ -1,7 +1,9 @@
-"""The point spread function of photographs: a core that changes over the field and with colour, and wings; and stars by it.
+"""The point spread function of photographs: a core that changes over the field and with colour, and
+wings; and stars by it.
 
-The core is an elliptical Gaussian whose covariance is a polynomial of the place, times a factor of B-V (a lens focuses one
-colour). The wings are a round Gaussian with a share of the light. Both are integrated over pixels.
+The core is an elliptical Gaussian whose covariance is a polynomial of the place, times a factor of
+B-V (a lens focuses one colour). The wings are a round Gaussian with a share of the light. Both are
+integrated over pixels.
 """
 
 import math
@@ -16,22 +18,26 @@ from hilstar.instruments.confront.camera_fit import minimised
 
 STAMP_PX = 11
 HALF = STAMP_PX // 2
-GAUSS3 = np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]), np.array([5 / 18, 8 / 18, 5 / 18])  # nodes within a pixel
+# nodes within a pixel
+GAUSS3 = np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]), np.array([5 / 18, 8 / 18, 5 / 18])
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
 PLACE_STEPS, SHAPE_ROUNDS = 8, 2
 PLACE_DONE_PX = 1e-3
 SHAPE_GAIN = 0.1  # a step of the PSF's numbers that lowers the loss by less is the last
 WING_SIGMA_PX = 0.8, 6.0
-MODEL_ERROR = 0.01  # share of a pixel's light by which the model may be wrong: so no bright star outvotes all others
+# share of a pixel's light by which the model may be wrong: so no bright star outvotes all others
+MODEL_ERROR = 0.01
 STARS_FOR = ((40, 6), (12, 2), (0, 1))  # stars that a number of terms of the field takes
 
 
 @dataclass(frozen=True, slots=True)
 class StarPsf:
-    """`covariance` (3, terms) of xx, yy and xy, px^2, `colour` its relative change per magnitude of B-V, and the wings.
+    """`covariance` (3, terms) of xx, yy and xy, px^2, `colour` its relative change per magnitude of
+    B-V, and the wings.
 
-    Terms are 1, r^2, u, v, u^2 - v^2, u v of the place (u, v) from the image's middle in half diagonals.
+    Terms are 1, r^2, u, v, u^2 - v^2, u v of the place (u, v) from the image's middle in half
+    diagonals.
     """
 
     covariance: FloatArray
@@ -51,7 +57,9 @@ class StarPsf:
         return found
 
     def fwhm_px(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all made round."""
+        """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all
+        made round.
+        """
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
         narrow, wide = (core[:, 0] + core[:, 1]) / 2 + 1 / 12, np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
         radius = np.linspace(0, 12, 1201)
@@ -60,7 +68,8 @@ class StarPsf:
         return np.asarray(2 * radius[(light > light[:, :1] / 2).sum(axis=1) - 1])
 
     def on_pixels(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Shares of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars, (n, rows, columns).
+        """Shares of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars, (n,
+        rows, columns).
 
         With them their derivatives by the star's x and y.
         """
@@ -69,7 +78,9 @@ class StarPsf:
         return both[0], both[1], both[2]
 
     def by_shape(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the wings' share and sigma."""
+        """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the
+        wings' share and sigma.
+        """
         share, narrow = self.wing_share, _gaussian(dx, dy, core, shape=True)
         wide = _gaussian(dx, dy, self._wing(len(core)), shape=True)
         by_wing = share * 2 * self.wing_sigma_px * (wide[3] + wide[4])
@@ -80,7 +91,9 @@ class StarPsf:
         return np.broadcast_to([self.wing_sigma_px**2, self.wing_sigma_px**2, 0.0], (count, 3))
 
     def samples(self, x_px: float, y_px: float, per_px: int, half_px: int) -> FloatArray:
-        """The light itself on a grid of `per_px` samples a pixel, (side, side), without the pixel; sums to 1."""
+        """The light itself on a grid of `per_px` samples a pixel, (side, side), without the
+        pixel; sums to 1.
+        """
         at = np.arange(-half_px * per_px, half_px * per_px + 1) / per_px
         xx, yy, xy = self.core(np.array([x_px]), np.array([y_px]), np.array([MEAN_BV_MAG]))[0]
         x, y = np.meshgrid(at, at)
@@ -99,9 +112,11 @@ def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) ->
 
 
 def _gaussian(dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: bool = False) -> FloatArray:
-    """Integrals (3, n, rows, columns) of Gaussians over pixels and their derivatives by the centre's x and y.
+    """Integrals (3, n, rows, columns) of Gaussians over pixels and their derivatives by the
+    centre's x and y.
 
-    By nine points in each pixel: good to 1e-3 from 0.35 px of sigma. With `shape` there are six, also by xx, yy and xy.
+    By nine points in each pixel: good to 1e-3 from 0.35 px of sigma. With `shape` there are six,
+    also by xx, yy and xy.
     """
     xx, yy, xy = (covariance[:, k, None, None] for k in range(3))
     det = xx * yy - xy * xy
@@ -128,7 +143,8 @@ def _gaussian(dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: boo
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """Squares of pixels about stars: values over the background and variances (n, k, k), DN; (column, row) of each middle.
+    """Squares of pixels about stars: values over the background and variances (n, k, k), DN;
+    (column, row) of each middle.
 
     `variance` is infinite where a pixel does not count. `bv_mag` (n,) is each star's colour.
     """
@@ -156,7 +172,9 @@ def join(parts: Sequence[Stamps]) -> Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Stars by the PSF: place, px, and flux, DN, with one sigma of place and flux, and reduced chi^2, (n,)."""
+    """Stars by the PSF: place, px, and flux, DN, with one sigma of place and flux, and reduced
+    chi^2, (n,).
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -167,7 +185,9 @@ class Measured:
 
 
 def cut_stamps(above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray) -> Stamps:
-    """Stamps of an image above its background about places (n,), and the variance of its pixels without the stars'."""
+    """Stamps of an image above its background about places (n,), and the variance of its pixels
+    without the stars'.
+    """
     height, width = above.shape
     reach = np.arange(-HALF, HALF + 1)
     column, row = np.rint(x_px), np.rint(y_px)
@@ -178,7 +198,9 @@ def cut_stamps(above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: 
 
 
 def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, gain_e_per_dn: float) -> Measured:
-    """Stars by least squares of place, flux and a level, from starting places; photon noise by `gain_e_per_dn`."""
+    """Stars by least squares of place, flux and a level, from starting places; photon noise by
+    `gain_e_per_dn`.
+    """
     x, y = x_px.copy(), y_px.copy()
     reach = np.arange(-HALF, HALF + 1)
     core = psf.core(x, y, stamps.bv_mag)
@@ -187,7 +209,8 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
     for number in range(PLACE_STEPS):
         dx, dy = stamps.column[:, None] + reach - x[:, None], stamps.row[:, None] + reach - y[:, None]
         shape, by_x, by_y = psf.on_pixels(dx, dy, core)
-        if number:  # photon noise of the model, not of what was seen: else faint stars come out too faint
+        # photon noise of the model, not of what was seen: else faint stars come out too faint
+        if number:
             star = np.maximum(flux, 0)[:, None, None] * shape
             weight = 1 / (stamps.variance + star / gain_e_per_dn + (MODEL_ERROR * star) ** 2)
         flux = np.maximum(flux, 1e-3) if number else _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
@@ -237,7 +260,9 @@ def fit_psf(stamps: Stamps, x_px: FloatArray, y_px: FloatArray, size_px: tuple[i
 
 
 def _first_width(stamps: Stamps) -> float:
-    """A variance, px^2, from how much of a star's light its highest pixel and the eight about it have."""
+    """A variance, px^2, from how much of a star's light its highest pixel and the eight about it
+    have.
+    """
     middle = stamps.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
     peak = np.median(middle.max(axis=(1, 2)) / np.maximum(middle.sum(axis=(1, 2)), 1e-9))
     return float(np.clip(1 / (2 * math.pi * np.clip(peak, 0.02, 0.6)), 0.15, 9.0))

@@ -1,4 +1,6 @@
-"""The answering end of a tracker's link: packets or JSON over ZeroMQ, UDP or a serial line, and garbage on request."""
+"""The answering end of a tracker's link: packets or JSON over ZeroMQ, UDP or a serial line, and
+garbage on request.
+"""
 
 from typing import Any
 
@@ -57,7 +59,8 @@ def answer_packet(answer: Answer, sequence: int) -> AnswerPacket:
 
 
 class AnswerLink(Closing):
-    """Sends answers in a format of FORMATS to a target (see `open_sender`); `babble` makes garbage before each.
+    """Sends answers in a format of FORMATS to a target (see `open_sender`); `babble` makes garbage
+    before each.
 
     Raises InputError where the target cannot be opened.
     """

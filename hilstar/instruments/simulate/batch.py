@@ -34,9 +34,11 @@ from hilstar.server.bench.scenario import Scenario, Timetable
 def log_views(
     samples: list[AttitudeSample], frame_count: int | None, exposure_s: float, max_rate_rad_s: float = math.inf
 ) -> list[View]:
-    """The exposures along a log: in the middle of each its attitude, and the mean rate over the exposure.
+    """The exposures along a log: in the middle of each its attitude, and the mean rate over the
+    exposure.
 
-    One at each sample, or `frame_count` of them evenly from the first to the last. Within half an exposure of the log's
+    One at each sample, or `frame_count` of them evenly from the first to the last. Within half an
+    exposure of the log's
     ends the rate is that of the part inside.
     """
     timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
@@ -70,7 +72,9 @@ class LogFaults:
     max_rate_rad_s: float = math.inf
 
     def pieces(self, simulator: Simulator, views: list[View]) -> list[tuple[ExposurePiece, ...]]:
-        """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that cannot be drawn."""
+        """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that
+        cannot be drawn.
+        """
         timetable = Timetable(
             self.scenario, simulator_view(simulator, self.scenario).prepare, simulator.config.tracker.exposure_s
         )
@@ -87,7 +91,9 @@ class LogFaults:
 
 
 def faulty_exposure(simulator: Simulator, view: View, scenario: Scenario, run_ns: int) -> FaultyExposure:
-    """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError (see `FaultView.prepare`)."""
+    """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError
+    (see `FaultView.prepare`).
+    """
     seen_by = simulator_view(simulator, scenario)
     timetable = Timetable(scenario, seen_by.prepare, simulator.config.tracker.exposure_s)
     return FaultyExposure(seen_by, pieces_of(view, run_ns, timetable))
@@ -101,7 +107,9 @@ def simulate_views(
     on_done: Callable[[int], None],
     faults: LogFaults | None = None,
 ) -> None:
-    """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
+    """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds
+    (seed, number).
+    """
     with Simulator(file) as first:  # an error in the bench file is reported once, here
         pieces: list[tuple[ExposurePiece, ...]] = [()] * len(views) if faults is None else faults.pieces(first, views)
     make_directory(directory)

@@ -1,4 +1,5 @@
-"""The budget of a bench's light: the magnitudes that its monitor, sprites and quantisation can show, and the error of each.
+"""The budget of a bench's light: the magnitudes that its monitor, sprites and quantisation can
+show, and the error of each.
 
 Every error is measured: single stars at a grid of sub-pixel phases through the bench's own method.
 """
@@ -41,10 +42,11 @@ MIN_ERROR = 1e-6  # the smallest error that the chart draws
 
 @dataclass(frozen=True, slots=True)
 class MagnitudeRow:
-    """One magnitude: rms and maximum errors over phases, mag and monitor pixels; None where a star shows nothing.
+    """One magnitude: rms and maximum errors over phases, mag and monitor pixels; None where a star
+    shows nothing.
 
-    `centroid_rms_px` and `centroid_max_px` are distances as the budget's centroider finds them; `axis_rms_px` has each kind's
-    error along an axis.
+    `centroid_rms_px` and `centroid_max_px` are distances as the budget's centroider finds them;
+    `axis_rms_px` has each kind's error along an axis.
     """
 
     v_mag: float
@@ -67,13 +69,15 @@ class NotDrawn:
 
 @dataclass(frozen=True, slots=True)
 class LightBudget:
-    """The range of stars that a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
+    """The range of stars that a bench can show; its fields are the keys of the JSON object of
+    `hilstar budget`.
 
-    Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the screen is darkest
-    (`clips_v_mag`), on a corner of four pixels (`clips_v_mag_at_best`), and shows nothing from `nothing_v_mag` on. `within`
-    has the magnitudes below full scale over which the worst star stays within each limit. Places in `rows` are as `centroider`
-    finds them, those of the worst of its kind if that is `all`; `centroid_rms_px` has the error along an axis that each kind
-    finds COMPARED_MAG below full scale.
+    Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the
+    screen is darkest (`clips_v_mag`), on a corner of four pixels (`clips_v_mag_at_best`), and shows
+    nothing from `nothing_v_mag` on. `within` has the magnitudes below full scale over which the
+    worst star stays within each limit. Places in `rows` are as `centroider` finds them, those of
+    the worst of its kind if that is `all`; `centroid_rms_px` has the error along an axis that each
+    kind finds COMPARED_MAG below full scale.
     """
 
     method: str
@@ -96,7 +100,8 @@ class LightBudget:
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
-    """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its blur.
+    """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its
+    blur.
 
     None takes the bench's own. Raises InputError for a bench without stars.
     """
@@ -107,11 +112,13 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     zero_mag = zero_point_mag(bench)
     white /= solar_drive(bench)
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
-    # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the frames.
+    # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the
+    # frames.
     dark = bench.faintest_shown_e_per_s / solar_drive(bench) or bench.calibration.response.half_step * white
     nothing = zero_mag + magnitude(dark)
     half = np.array([-0.5, 0.5])
-    corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
+    # a star on the corner of four pixels
+    corner_share = float(bench.psf.shares(half, half[:, None]).max())
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
     primaries = None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
@@ -140,7 +147,9 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
 
 
 def out_of_gamut(bench: Bench) -> float | None:
-    """The share of a bench's stars whose colour its primaries cannot show; None where they are not driven apart."""
+    """The share of a bench's stars whose colour its primaries cannot show; None where they are
+    not driven apart.
+    """
     colours, count = bench.colours, len(bench.stars.rates_e_per_s)
     if colours is None:
         return None
@@ -150,7 +159,9 @@ def out_of_gamut(bench: Bench) -> float | None:
 
 
 def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[str, Any]]:
-    """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in each `channel` of several."""
+    """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in
+    each `channel` of several.
+    """
     every = {"all": all_channels(list(channels.values())), **(channels if len(channels) > 1 else {})}
     return [
         {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)} for nm in ends_nm for name, one in every.items()
@@ -158,7 +169,8 @@ def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[s
 
 
 def zero_point_mag(bench: Bench) -> float:
-    """V of a star of the Sun's colour that gives one electron a second, by the bench's own stars of about that colour.
+    """V of a star of the Sun's colour that gives one electron a second, by the bench's own stars of
+    about that colour.
 
     Raises InputError where it has none.
     """
@@ -167,7 +179,9 @@ def zero_point_mag(bench: Bench) -> float:
 
 
 def _like_the_sun(bench: Bench) -> IntArray:
-    """The stars of its colour, or else the nearest to it: where there are stars, none of these is far from it."""
+    """The stars of its colour, or else the nearest to it: where there are stars, none of these
+    is far from it.
+    """
     distance = np.abs(bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)] - SOLAR_BV)
     return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
 
@@ -178,14 +192,18 @@ def solar_drive(bench: Bench) -> float:
 
 
 def not_drawn(bench: Bench) -> NotDrawn:
-    """The bench's stars that are not drawn; bodies, whose light is that of all stars many times over, do not count."""
+    """The bench's stars that are not drawn; bodies, whose light is that of all stars many times
+    over, do not count.
+    """
     rates = bench.stars.rates_e_per_s
     missing = rates[(bench.stars.electrons_per_s * bench.drive)[: len(rates)] < bench.faintest_shown_e_per_s]
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 
 
 def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
-    """The errors at each magnitude below full scale, down to the first at which a star shows nothing."""
+    """The errors at each magnitude below full scale, down to the first at which a star shows
+    nothing.
+    """
     target, frames = bench.renderer.target, bench.config.exposure_frames
     psf = bench.psf
     sprites, _ = phase_grid(PHASES, psf)
@@ -237,7 +255,9 @@ def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
 
 
 def write_report(directory: Path, found: LightBudget) -> None:
-    """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot be written."""
+    """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot
+    be written.
+    """
     rows = [asdict(row) for row in found.rows]
     for row in rows:  # each kind of centroider has a column of its own
         row.update({f"axis_rms_px_{kind}": value for kind, value in row.pop("axis_rms_px").items()})

@@ -47,7 +47,9 @@ class Sky(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """Medians and noise (n,) of an image's blocks, and their middles (n,), -1 to 1 over its sides."""
+    """Medians and noise (n,) of an image's blocks, and their middles (n,), -1 to 1 over its
+    sides.
+    """
 
     level: FloatArray
     noise: FloatArray

@@ -1,4 +1,6 @@
-"""A glass to who measures stars: the PSF that a centroider is told, and errors of places by what would take them away."""
+"""A glass to who measures stars: the PSF that a centroider is told, and errors of places by what
+would take them away.
+"""
 
 from dataclasses import dataclass
 
@@ -13,9 +15,11 @@ MIN_STARS = 40  # for 26 coefficients
 
 
 def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None = None) -> ToldPsf:
-    """What `psf_places` fits: a PSF in squares of `side_px` about `pixels`, rows and columns (n,), each at its place.
+    """What `psf_places` fits: a PSF in squares of `side_px` about `pixels`, rows and columns (n,),
+    each at its place.
 
-    `shares` (n, L) are the stars' spectra as a glass has them, by default those of light without a spectrum.
+    `shares` (n, L) are the stars' spectra as a glass has them, by default those of light without a
+    spectrum.
     """
     rows, columns = pixels
     near = np.arange(side_px) - side_px // 2
@@ -39,7 +43,9 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
 
 @dataclass(frozen=True, slots=True)
 class ErrorSplit:
-    """Errors of stars' places, px (n, 2): in all, what a distortion takes, what B-V takes besides, and the rest."""
+    """Errors of stars' places, px (n, 2): in all, what a distortion takes, what B-V takes
+    besides, and the rest.
+    """
 
     total: FloatArray
     distortion: FloatArray
@@ -47,7 +53,9 @@ class ErrorSplit:
 
     @property
     def psf(self) -> FloatArray:
-        """What neither takes: the PSF's shape against pixel and window, and noise where the errors have it."""
+        """What neither takes: the PSF's shape against pixel and window, and noise where the
+        errors have it.
+        """
         return np.asarray(self.total - self.distortion - self.colour)
 
     def rms_px(self) -> dict[str, float]:
@@ -57,9 +65,11 @@ class ErrorSplit:
 
 
 def split_errors(places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArray, size_px: tuple[int, int]) -> ErrorSplit:
-    """Errors (n, 2) of stars at places (n, 2): by least squares a cubic of the place, and B-V times a line of the place.
+    """Errors (n, 2) of stars at places (n, 2): by least squares a cubic of the place, and B-V times
+    a line of the place.
 
-    A distortion file can hold the first, a correction by catalogue colour the second. Raises ValueError for under MIN_STARS.
+    A distortion file can hold the first, a correction by catalogue colour the second. Raises
+    ValueError for under MIN_STARS.
     """
     if len(places_px) < MIN_STARS:
         raise ValueError(f"{len(places_px)} stars; a split takes {MIN_STARS}")

@@ -1,4 +1,6 @@
-"""Several heads through their twins: the angles between them, as solved from what each tracker would see."""
+"""Several heads through their twins: the angles between them, as solved from what each tracker
+would see.
+"""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,7 +27,9 @@ EDGE_PX = 1.5  # beyond the centroider's window
 
 @dataclass(frozen=True, slots=True)
 class HeadsErrors:
-    """By how much the angle between two heads is off, arcsec, in each field: solved from linear light, and from the codes."""
+    """By how much the angle between two heads is off, arcsec, in each field: solved from linear
+    light, and from the codes.
+    """
 
     first: str
     second: str
@@ -54,13 +58,16 @@ class _Head:
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
         finder = star_finder(twin.bench, twin.monitor_px_per_px)
-        # The window's bias repeats with the place within a pixel: a wider one has 0.0004 px of it in place of 0.0009.
+        # The window's bias repeats with the place within a pixel: a wider one has 0.0004 px of it
+        # in place of 0.0009.
         width_px = WIDER * finder.settings.window_sigma_px
         self.finder = replace(finder, settings=replace(finder.settings, window_sigma_px=width_px))
         self.mounting = Mounting(twin.config.tracker.q_body_to_cam)
 
     def solved(self, q_icrs_to_body: FloatArray, first_frame: int) -> tuple[FloatArray, FloatArray] | None:
-        """The body's attitude as this head's stars have it, from linear light and from codes; None with too few stars."""
+        """The body's attitude as this head's stars have it, from linear light and from codes;
+        None with too few stars.
+        """
         seen = self.twin.field(multiply(self.mounting.q_body_to_cam, q_icrs_to_body), first_frame)
         sky, shown = (self.finder.match(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e))
         stars = np.flatnonzero(self._usable(seen, sky, shown))
@@ -101,12 +108,15 @@ class _Head:
 
     def _body(self, q_icrs_to_body: FloatArray, found: FloatArray, wanted: FloatArray, weights: FloatArray) -> FloatArray:
         q_body_to_cam = self.mounting.q_body_to_cam
-        off = from_matrix(rotation_between(wanted, found, weights))  # turns the camera's true axes into those solved
+        # turns the camera's true axes into those solved
+        off = from_matrix(rotation_between(wanted, found, weights))
         return multiply(conjugate(q_body_to_cam), multiply(off, multiply(q_body_to_cam, q_icrs_to_body)))
 
 
 def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray) -> FloatArray:
-    """The rotation (3, 3) that takes unit vectors (n, 3) nearest to others: Wahba's problem by Markley's SVD (1988)."""
+    """The rotation (3, 3) that takes unit vectors (n, 3) nearest to others: Wahba's problem by
+    Markley's SVD (1988).
+    """
     u, _, vt = np.linalg.svd((weights[:, None] * after).T @ before)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
@@ -114,7 +124,8 @@ def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray)
 def verify_heads(
     heads: HeadsFile, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
 ) -> list[HeadsErrors]:
-    """Show `fields` random attitudes of the body on all heads, and solve the angles between each two of them.
+    """Show `fields` random attitudes of the body on all heads, and solve the angles between each
+    two of them.
 
     Raises InputError (see `Twin`).
     """

@@ -1,4 +1,6 @@
-"""The virtual tracker before a display that runs: light of its frames over an exposure, DN, found stars, an attitude."""
+"""The virtual tracker before a display that runs: light of its frames over an exposure, DN,
+found stars, an attitude.
+"""
 
 import math
 from collections import deque
@@ -46,14 +48,17 @@ MAX_REPORTED = 30  # stars
 BLINDED_SHARE = 0.05  # detector pixels at the last code
 STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
 MAX_WINDOW_PX = 6.0
-STALE_S, TURN_S = 5.0, 1.0  # an attitude older than this predicts no other; two further apart than that tell no rate
+# an attitude older than this predicts no other; two further apart than that tell no rate
+STALE_S, TURN_S = 5.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """What an exposure had of the display: lit pixels (n,), their mean light (n, primaries), e-/s, and the mean attitude.
+    """What an exposure had of the display: lit pixels (n,), their mean light (n, primaries), e-/s,
+    and the mean attitude.
 
-    `span_ns` are its begin and end; `frames` it had, and the share of it in which the field was not blank.
+    `span_ns` are its begin and end; `frames` it had, and the share of it in which the field was not
+    blank.
     """
 
     span_ns: tuple[int, int]
@@ -70,7 +75,9 @@ class Exposed:
 
 
 class WatchedFrames:
-    """The newest frames of a display, each lit until the next; `light_of` gives a frame's pixels' light (n, primaries)."""
+    """The newest frames of a display, each lit until the next; `light_of` gives a frame's
+    pixels' light (n, primaries).
+    """
 
     def __init__(self, light_of: Callable[[ShownFrame], FloatArray]) -> None:
         self.received = self.missing = 0
@@ -129,7 +136,8 @@ def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """An exposure's answer before anything is planted: its attitude (None: none was found), the stars that it rests on.
+    """An exposure's answer before anything is planted: its attitude (None: none was found), the
+    stars that it rests on.
 
     `mode` is one of the four words above; LOST is "lost in space", solved or not.
     """
@@ -146,8 +154,8 @@ Solve = Callable[[FoundStars, npt.NDArray[np.uint16]], FloatArray | None]
 class LiveTracker(Closing):
     """A bench's virtual tracker, as a watcher of its display's frames. Free it with `close`.
 
-    `lost_in_space` gives an attitude of stars or of an image when none is expected; None: each exposure's true one is taken.
-    Raises InputError as the bench does.
+    `lost_in_space` gives an attitude of stars or of an image when none is expected; None: each
+    exposure's true one is taken. Raises InputError as the bench does.
     """
 
     lost_in_space: Solve | None = None
@@ -239,7 +247,9 @@ class LiveTracker(Closing):
         return propagate(self._last[1], self.rate_cam_rad_s(), (exposed.middle_ns - self._last[0]) / NS_PER_S)
 
     def rate_cam_rad_s(self) -> FloatArray:
-        """The turn between the last two attitudes (3,), cam; 0 where there are none of the last second."""
+        """The turn between the last two attitudes (3,), cam; 0 where there are none of the last
+        second.
+        """
         before, last = self._before, self._last
         if before is None or last is None or last[0] - before[0] > TURN_S * NS_PER_S:
             return np.zeros(3)
@@ -280,7 +290,9 @@ class LiveTracker(Closing):
 
 
 def _levels_of(codes: npt.NDArray[np.unsignedinteger], rgb: npt.NDArray[np.uint16]) -> IntArray:
-    """The levels (n,) of triples of codes (n, 3); the darkest where a triple is none of the response's."""
+    """The levels (n,) of triples of codes (n, 3); the darkest where a triple is none of the
+    response's.
+    """
     numbers = rgb.astype(np.int64) @ [1 << 32, 1 << 16, 1]
     order = np.argsort(numbers)
     asked = codes.astype(np.int64) @ [1 << 32, 1 << 16, 1]

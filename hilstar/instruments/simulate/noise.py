@@ -1,10 +1,13 @@
-"""The noise of a tracker's stars by source, and the limits that it sets: detection, place, flux and attitude.
+"""The noise of a tracker's stars by source, and the limits that it sets: detection, place, flux and
+attitude.
 
-Fisher's information of place, flux and background is the sum over pixels of slope times slope over variance, with the noise of
-`DetectorSettings.noise` (thesis table 4.1, eq. 4.13, 4.14). Its inverse is the Cramer-Rao bound, which no unbiased centroider
-beats (Winick 1986, JOSA A 3, 1809; of a whole star sensor Fialho and Mortari 2019, Sensors 19, 5355). A star's noise is that
-of its flux under the weights share / variance, which no other weights beat: its sources add up to n_TOT, and PSF photometry
-reaches it. Pixels that clip tell nothing. Fixed patterns count as noise: all this holds over places on the detector.
+Fisher's information of place, flux and background is the sum over pixels of slope times slope over
+variance, with the noise of `DetectorSettings.noise` (thesis table 4.1, eq. 4.13, 4.14). Its inverse
+is the Cramer-Rao bound, which no unbiased centroider beats (Winick 1986, JOSA A 3, 1809; of a whole
+star sensor Fialho and Mortari 2019, Sensors 19, 5355). A star's noise is that of its flux under the
+weights share / variance, which no other weights beat: its sources add up to n_TOT, and PSF
+photometry reaches it. Pixels that clip tell nothing. Fixed patterns count as noise: all this holds
+over places on the detector.
 """
 
 import contextlib
@@ -46,7 +49,8 @@ CHUNK = 64  # stars at once
 UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
 MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
 NO_INFORMATION = NO_NOISE_E2 = 1e-12  # a star whose pixels all clip; a pixel without light
-TRIALS, MIN_FOUND = 20, 40  # simulated stars of a magnitude along a side of an image; found ones that give an error
+# simulated stars of a magnitude along a side of an image; found ones that give an error
+TRIALS, MIN_FOUND = 20, 40
 SKY_FIELDS = 100
 LIMIT_STEP_MAG = 0.25
 TURN_RAD = 1e-6
@@ -56,10 +60,11 @@ SOURCES = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu"
 WHO = ("limit", *FAMILY)
 NEA_COLUMNS = [f"{kind}_{way}_arcsec" for kind in WHO for way in ("across", "about")]
 
-# Stars in noise, electrons of a whole star, rms over the places within a pixel. `detection` is the probability that the
-# threshold finds it. `bound_px` is the Cramer-Rao bound of place along an axis (rms of x and y), flux unknown; `bound_flux_e`
-# that of flux, place unknown, `bound_flux_sky_e` background unknown too. `effective_px` is how many pixels' read noise a star
-# has, `clipped_px` how many pixels are left out because they clip.
+# Stars in noise, electrons of a whole star, rms over the places within a pixel. `detection` is the
+# probability that the threshold finds it. `bound_px` is the Cramer-Rao bound of place along an axis
+# (rms of x and y), flux unknown; `bound_flux_e` that of flux, place unknown, `bound_flux_sky_e`
+# background unknown too. `effective_px` is how many pixels' read noise a star has, `clipped_px` how
+# many pixels are left out because they clip.
 NOISE_DTYPE = np.dtype(
     [(f"{source}_e", "f8") for source in SOURCES]
     + [(name, "f8") for name in ("total_e", "snr", "detection", "bound_px", "bound_x_px", "bound_y_px")]
@@ -69,12 +74,15 @@ Table = npt.NDArray[np.void]
 
 
 def in_mosaic(mosaic: FloatArray, bayer: str, shape: tuple[int, int]) -> FloatArray:
-    """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red, green and blue (2, 3)."""
+    """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red,
+    green and blue (2, 3).
+    """
     return np.array([in_pixels([np.full(shape, one) for one in each], bayer) for each in mosaic])
 
 
 class NoisyStar:
-    """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and the detector's noise.
+    """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and
+    the detector's noise.
 
     Of a `mosaic` (see `in_mosaic`) within its four pixels, of light of one colour.
     """
@@ -98,11 +106,14 @@ class NoisyStar:
             for pattern, one in ((seen, self.stamps(x_px, y_px)), (seen, by_x), (seen, by_y), (sky, even))
         )
         self._sky = slopes[2] if mosaic is not None else np.ones((1, 1))
-        by = np.stack([*slopes[:2], self.shares, slopes[2]])  # by x, y, flux, background; of one electron
+        # by x, y, flux, background; of one electron
+        by = np.stack([*slopes[:2], self.shares, slopes[2]])
         self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
 
     def _patterns(self) -> FloatArray:
-        """What pixels have of star and background (2, n, side, side) where a star is before each of a mosaic's n pixels."""
+        """What pixels have of star and background (2, n, side, side) where a star is before each
+        of a mosaic's n pixels.
+        """
         if self.mosaic is None or self.detector.bayer is None:
             return np.ones((2, 1, 1, 1))
         side = self.side_px
@@ -115,7 +126,9 @@ class NoisyStar:
         return np.asarray(self.psf.shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]))
 
     def noise(self, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> Table:
-        """Rows of NOISE_DTYPE of stars of `star_e` (n,) electrons before `background_e` (n,) in a pixel, in one exposure."""
+        """Rows of NOISE_DTYPE of stars of `star_e` (n,) electrons before `background_e` (n,) in
+        a pixel, in one exposure.
+        """
         found = np.empty(len(star_e), NOISE_DTYPE)
         for at in range(0, len(star_e), CHUNK):
             part = slice(at, at + CHUNK)
@@ -123,7 +136,9 @@ class NoisyStar:
         return found
 
     def fisher(self, weight: FloatArray, star_e: FloatArray) -> FloatArray:
-        """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n, 1, 1) by 1 / pixels' variance."""
+        """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n,
+        1, 1) by 1 / pixels' variance.
+        """
         unit = (weight.transpose(1, 0, 2) @ self._pairs).transpose(1, 0, 2).reshape(*weight.shape[:2], 4, 4)
         scale = np.concatenate([star_e, star_e, np.ones_like(star_e), np.ones_like(star_e)], axis=-1)
         return np.asarray(unit * scale.transpose(0, 2, 1)[:, None] * scale[:, None])
@@ -146,7 +161,8 @@ class NoisyStar:
         for source, e2 in zip(SOURCES, variances, strict=True):
             found[f"{source}_e"] = np.sqrt(e2.mean(axis=(1, 2)))
         found["total_e"] = np.sqrt(np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0))
-        # Where one pixel is left, it cannot tell place from flux: a bound is then large, and not an error.
+        # Where one pixel is left, it cannot tell place from flux: a bound is then large, and not an
+        # error.
         information = self.fisher(weight, star_e) * (1 + NO_INFORMATION * np.eye(4)) + NO_INFORMATION * np.eye(4)
         known, free = (
             np.sqrt(np.linalg.inv(information[..., :size, :size]).diagonal(axis1=-2, axis2=-1).mean(axis=1)) for size in (3, 4)
@@ -155,7 +171,8 @@ class NoisyStar:
             found[f"bound_{name}"] = one
         found["bound_px"] = np.sqrt((found["bound_x_px"] ** 2 + found["bound_y_px"] ** 2) / 2)
         found["effective_px"] = effective_px.mean(axis=(1, 2))
-        found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan  # somewhere within a pixel nothing is left of them
+        # somewhere within a pixel nothing is left of them
+        found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan
         found["star_e"], found["clipped_px"] = star_e[:, 0, 0], (~unclipped).sum(axis=-1).mean(axis=-1)
         found["snr"] = found["star_e"] / found["total_e"]
         found["detection"] = found_share(self._above(star_e, under_e, (noise, sky), finder), finder.minimum_pixels)
@@ -163,9 +180,11 @@ class NoisyStar:
     def _above(
         self, star_e: FloatArray, under_e: FloatArray, noises: "tuple[PixelNoise, PixelNoise]", finder: CentroidSettings
     ) -> FloatArray:
-        """The probability (n, phases, pixels) that a pixel is above the threshold, by its noise with a star and without.
+        """The probability (n, phases, pixels) that a pixel is above the threshold, by its noise
+        with a star and without.
 
-        Noise of superpixels is that of their neighbours: of every second one along both axes, which tells the most.
+        Noise of superpixels is that of their neighbours: of every second one along both axes, which
+        tells the most.
         """
         noise, sky = noises
         if self.detector.takes_superpixels:
@@ -178,7 +197,8 @@ class NoisyStar:
             each = np.stack([above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)], axis=1)
             best = each[np.arange(len(each)), np.prod(1 - each, axis=2).argmin(axis=1)]
             return np.asarray(best.reshape(*noise.total_e2.shape[:2], -1))
-        # The first code over the threshold begins half a step below it, and rounding is no noise of its own.
+        # The first code over the threshold begins half a step below it, and rounding is no noise of
+        # its own.
         step_e = self.detector.gain_e_per_dn
         level_dn = (under_e + sky.dark_e2) / step_e + self.detector.offset_dn
         first_dn = np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
@@ -195,11 +215,13 @@ def superpixels(images: npt.NDArray[np.floating[Any]], *, squared: bool = False)
 
 
 def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
-    """The probability (n,) that at least so many pixels of a star are above the threshold, mean over its phases.
+    """The probability (n,) that at least so many pixels of a star are above the threshold, mean
+    over its phases.
 
     `above` (n, phases, pixels) are those of each pixel, whose noise is independent of the others'.
     """
-    fewer = np.zeros((minimum_pixels, *above.shape[:2]))  # the probabilities of 0, 1, ... pixels so far
+    # the probabilities of 0, 1, ... pixels so far
+    fewer = np.zeros((minimum_pixels, *above.shape[:2]))
     fewer[0] = 1.0
     for pixel in np.moveaxis(above, -1, 0):
         fewer[1:] = fewer[1:] * (1 - pixel) + fewer[:-1] * pixel
@@ -208,10 +230,11 @@ def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
 
 
 def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSettings, rng: np.random.Generator) -> FloatArray:
-    """The rms error along an axis, px, that each kind of FAMILY has with simulated stars that the threshold finds; NaN for few.
+    """The rms error along an axis, px, that each kind of FAMILY has with simulated stars that the
+    threshold finds; NaN for few.
 
-    TRIALS^2 stars at random places within a pixel, through the detector with all its noise but hot and dead pixels. What all
-    are off by in common is no error.
+    TRIALS^2 stars at random places within a pixel, through the detector with all its noise but hot
+    and dead pixels. What all are off by in common is no error.
     """
     side, shape = star.side_px, (TRIALS * star.side_px,) * 2
     plain = {"hot_pixel_fraction": 0.0, "dead_pixel_fraction": 0.0, "false_stars": 0, "cosmic_rays_per_cm2_s": 0.0}
@@ -237,7 +260,8 @@ def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSe
         return np.full(len(FAMILY), np.nan)
     width_px = software_psf_px(star.psf.width_px, star.detector)
     off = [np.stack(star_places(stamps[found], kind, width_px)) - place_px[:, found] for kind in FAMILY]
-    return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))  # an offset of all, as by coma, is the calibration's
+    # an offset of all, as by coma, is the calibration's
+    return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))
 
 
 def field_stars(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray) -> Table:
@@ -261,15 +285,17 @@ def turns_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
 
 
 def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -> FloatArray:
-    """NEA across (rms of both axes) and about the boresight (2, n) by the first 1, 2, ... n stars; infinite for too few.
+    """NEA across (rms of both axes) and about the boresight (2, n) by the first 1, 2, ... n stars;
+    infinite for too few.
 
-    `turns` are as by `turns_of`, `sigma_px` (2, n) errors of places along x and y (NaN: not used), `detection` (n,) the
-    share of exposures that has them.
+    `turns` are as by `turns_of`, `sigma_px` (2, n) errors of places along x and y (NaN: not used),
+    `detection` (n,) the share of exposures that has them.
     """
     weight = np.where(sigma_px < NO_PLACE_PX, detection / np.square(sigma_px), 0.0).T
     information = np.einsum("na,nai,naj->nij", weight, turns, turns).cumsum(axis=0)
     usable = weight.all(axis=1).cumsum() >= MIN_STARS
-    # Two stars in one place leave the turn about them open: it comes out as large, and not as an error.
+    # Two stars in one place leave the turn about them open: it comes out as large, and not as an
+    # error.
     information += NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     found = np.full((2, len(usable)), np.inf)
     x, y, z = np.linalg.inv(information[usable]).diagonal(axis1=1, axis2=2).T
@@ -279,10 +305,12 @@ def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -
 
 @dataclass(frozen=True, slots=True)
 class NoiseBudget:
-    """The noise of a tracker's stars and its limits; the fields are the keys of the JSON object of `hilstar budget --noise`.
+    """The noise of a tracker's stars and its limits; the fields are the keys of the JSON object of
+    `hilstar budget --noise`.
 
-    `rows`, `stars` and `nea` are those of noise.csv, stars.csv and nea.csv, the last of one field or medians of several.
-    `nea_arcsec` has its last row by who finds the stars: NEA across and about the boresight in one exposure.
+    `rows`, `stars` and `nea` are those of noise.csv, stars.csv and nea.csv, the last of one field
+    or medians of several. `nea_arcsec` has its last row by who finds the stars: NEA across and
+    about the boresight in one exposure.
     """
 
     threshold_sigma: float
@@ -298,7 +326,9 @@ class NoiseBudget:
 
 
 def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -> NoisyStar:
-    """A star on a bench's tracker, of a mosaic one of the Sun's colour before a sky (h, w), whole or as a channel sees it."""
+    """A star on a bench's tracker, of a mosaic one of the Sun's colour before a sky (h, w),
+    whole or as a channel sees it.
+    """
     tracker, mosaic, bayer = file.config.tracker, None, file.config.tracker.detector.bayer
     if bayer is not None:
         of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
@@ -311,9 +341,11 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
 def noise_budget(
     file: BenchFile, q_icrs_to_cam: FloatArray | None, finder: CentroidSettings, rng: np.random.Generator
 ) -> NoiseBudget:
-    """The noise of a bench's tracker at rest and its limits, in one field or, without an attitude, all over the sky.
+    """The noise of a bench's tracker at rest and its limits, in one field or, without an attitude,
+    all over the sky.
 
-    Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`. Raises InputError.
+    Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`.
+    Raises InputError.
     """
     config, tracker = file.config, file.config.tracker
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
@@ -378,9 +410,11 @@ def noise_budget(
 
 
 def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
-    """NEA across and about the boresight (n, 2) that a bench's tracker at rest allows at attitudes (n, 4), by all its stars.
+    """NEA across and about the boresight (n, 2) that a bench's tracker at rest allows at attitudes
+    (n, 4), by all its stars.
 
-    Infinite with too few stars, and nearer to the Sun than its zodiacal light is known. Raises InputError.
+    Infinite with too few stars, and nearer to the Sun than its zodiacal light is known. Raises
+    InputError.
     """
     tracker = file.config.tracker
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(file.config, file.folder)
@@ -400,7 +434,9 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
 
 
 def between(noise: Table, star_e: FloatArray) -> FloatArray:
-    """Bounds of x and y [px] and the probability of detection of other stars (n,), (3, n), between those of a table."""
+    """Bounds of x and y [px] and the probability of detection of other stars (n,), (3, n),
+    between those of a table.
+    """
     grid, at = -np.log(noise["star_e"]), -np.log(star_e)
     bounds = [np.exp(np.interp(at, grid, np.log(noise[name]))) for name in ("bound_x_px", "bound_y_px")]
     return np.stack([*bounds, np.interp(at, grid, noise["detection"])])
@@ -412,7 +448,9 @@ def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[d
 
 
 def _nea_rows(sights: list[Table], curves: list[FloatArray], faintest_v_mag: float) -> list[dict[str, Any]]:
-    """Medians over fields by the faintest star used, from the first limit at which half of the fields have an attitude."""
+    """Medians over fields by the faintest star used, from the first limit at which half of the
+    fields have an attitude.
+    """
     first = min(one["v_mag"].min(initial=faintest_v_mag) for one in sights)
     limits = np.arange(math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG)
     none, rows = np.full((len(WHO), 2), np.inf), []
@@ -426,7 +464,9 @@ def _nea_rows(sights: list[Table], curves: list[FloatArray], faintest_v_mag: flo
 
 
 def write_noise(directory: Path, found: NoiseBudget) -> None:
-    """noise.csv, nea.csv and their charts, and stars.csv of a field. Raises InputError where one cannot be written."""
+    """noise.csv, nea.csv and their charts, and stars.csv of a field. Raises InputError where one
+    cannot be written.
+    """
     for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
         if rows:
             texts = [["" if isinstance(v, float) and not math.isfinite(v) else v for v in row.values()] for row in rows]
@@ -444,7 +484,8 @@ def _draw(path: Path, found: NoiseBudget) -> None:
     note = f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated {own}."
     with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
         for axes, key, label in zip(panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True):
-            rows = list({row[key]: row for row in found.nea}.values())  # the last one of a number of stars
+            # the last one of a number of stars
+            rows = list({row[key]: row for row in found.nea}.values())
             for way, colour in (("about", ORANGE), ("across", BLUE)):
                 for kind, style in ((own, "--"), ("limit", "-")):
                     values = [row[f"{kind}_{way}_arcsec"] for row in rows]

@@ -1,8 +1,10 @@
-"""The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
+"""The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their
+light through the optics.
 
-A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four, nine or more Gaussians
-that have the square's variance together (`square_points`), spread by the tracker's PSF. The black level is a glow over the
-whole monitor, by its own density on the image.
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel:
+four, nine or more Gaussians that have the square's variance together (`square_points`), spread by
+the tracker's PSF. The black level is a glow over the whole monitor, by its own density on the
+image.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,14 +29,17 @@ from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
 POINTS_AT_ONCE = 400_000
-PIXELS_AT_ONCE = 500_000  # of a glow, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
+# of a glow, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
+PIXELS_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True, slots=True)
 class BenchGeometry:
-    """Where the monitor stands before the tracker: `monitor` maps cam to its pixels, `tracker` maps cam to the detector's.
+    """Where the monitor stands before the tracker: `monitor` maps cam to its pixels, `tracker` maps
+    cam to the detector's.
 
-    `mirror` is what the screen does to its image, about the middle: columns reversed, rows reversed, or axes swapped.
+    `mirror` is what the screen does to its image, about the middle: columns reversed, rows
+    reversed, or axes swapped.
     """
 
     monitor: Camera
@@ -44,13 +49,17 @@ class BenchGeometry:
     def to_tracker(
         self, x_px: FloatArray, y_px: FloatArray, place_px: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, FloatArray]:
-        """Tracker pixels of light at `place_px` from the middles of monitor pixels, (n,) each; NaN behind the tracker."""
+        """Tracker pixels of light at `place_px` from the middles of monitor pixels, (n,) each;
+        NaN behind the tracker.
+        """
         x_px, y_px = self.shown_at(x_px, y_px)
         rays = self.monitor.rays(x_px + place_px[0], y_px + place_px[1])
         return self.tracker.project(rays @ self.tracker.cam_to_image.T)
 
     def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
+        """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the
+        monitor.
+        """
         return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
 
     def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -69,9 +78,11 @@ class BenchGeometry:
 
 
 class Primary(NamedTuple):
-    """A monitor's primary before the tracker's optics: where its light lies within a pixel, and its glass's spectrum.
+    """A monitor's primary before the tracker's optics: where its light lies within a pixel, and its
+    glass's spectrum.
 
-    That is each of the file's wavelengths' share (L,) of its electrons; None: as of light without a spectrum.
+    That is each of the file's wavelengths' share (L,) of its electrons; None: as of light without a
+    spectrum.
     """
 
     place_px: tuple[float, float] = (0.0, 0.0)
@@ -82,7 +93,9 @@ ALL_ALIKE = (Primary(),)
 
 
 def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
-    """The primaries of a bench before its tracker's optics: one for all where they are not driven apart."""
+    """The primaries of a bench before its tracker's optics: one for all where they are not
+    driven apart.
+    """
     colours, psf = bench.colours, bench.tracker_psf
     if colours is None:
         return ALL_ALIKE
@@ -93,9 +106,11 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
 
 @dataclass(frozen=True, slots=True)
 class DisplayColours:
-    """A display's light in the pixels of a tracker with a mosaic; all of it in those of a tracker without.
+    """A display's light in the pixels of a tracker with a mosaic; all of it in those of a tracker
+    without.
 
-    `by_primary` (channels, primaries) are the channels' shares of a primary's electrons, `white` (channels,) of black's.
+    `by_primary` (channels, primaries) are the channels' shares of a primary's electrons, `white`
+    (channels,) of black's.
     """
 
     bayer: str | None
@@ -104,7 +119,9 @@ class DisplayColours:
 
     @classmethod
     def of(cls, bench: Bench) -> "DisplayColours":
-        """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean colour of the stars."""
+        """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean
+        colour of the stars.
+        """
         config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
         bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
         if bayer is None or stars.colours is None:
@@ -128,33 +145,43 @@ class DisplayColours:
 
 
 class TwinOptics(Closing):
-    """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
+    """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a
+    context manager.
+    """
 
     def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         self._steps, self._psf = square_points(side_px, psf)
-        # A pixel farther than this from the detector lights none of it, though it be twice as large there as on the axis.
+        # A pixel farther than this from the detector lights none of it, though it be twice as large
+        # there as on the axis.
         self._reach_px = 2 * side_px + self._psf.footprint_px / 2 + 1
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
     def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:
-        """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w), float64."""
+        """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w),
+        float64.
+        """
         images = [self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)]
         return np.array(images) if len(images) > 1 else images[0][None]
 
     def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
-        """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit ones or all (H, W), float64."""
+        """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit
+        ones or all (H, W), float64.
+        """
         lit = light_e_per_s if isinstance(light_e_per_s, LitLight) else LitLight.of(light_e_per_s)
         lit = self._near_the_detector(lit, primary)
         at_once = POINTS_AT_ONCE // len(self._steps) ** 2
         total = self._points(lit.part(0, at_once), primary)
         for begin in range(at_once, len(lit.place), at_once):
             total += self._points(lit.part(begin, begin + at_once), primary)
-        return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
+        # a measured PSF may be negative somewhere
+        return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total
 
     def _near_the_detector(self, lit: LitLight, primary: Primary) -> LitLight:
-        """The lit pixels that may light the detector, of a screen that it may see a small part of."""
+        """The lit pixels that may light the detector, of a screen that it may see a small part
+        of.
+        """
         rows, columns = np.divmod(lit.place, self.geometry.monitor.resolution_px[0])
         x_px, y_px = self.geometry.to_tracker(columns.astype(np.float64), rows.astype(np.float64), primary.place_px)
         width, height = self.geometry.tracker.resolution_px
@@ -176,9 +203,11 @@ class TwinOptics(Closing):
         return self._renderer.linear().astype(np.float64)
 
     def glow_e_per_s(self, panel: Panel) -> FloatArray:
-        """Electrons per second of each tracker pixel (h, w) from the black level of the whole monitor.
+        """Electrons per second of each tracker pixel (h, w) from the black level of the whole
+        monitor.
 
-        The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the pixel, not within it.
+        The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the
+        pixel, not within it.
         """
         width, height = self.geometry.tracker.resolution_px
         glow = np.zeros((height, width))
@@ -187,7 +216,8 @@ class TwinOptics(Closing):
         rows = max(1, PIXELS_AT_ONCE // width)
         for top in range(0, height, rows):
             below = min(top + rows, height)
-            # A density is a slope: of a band's first and last row, too, it needs the rows beside them.
+            # A density is a slope: of a band's first and last row, too, it needs the rows beside
+            # them.
             first, last = max(top - 1, 0), min(below + 1, height)
             glow[top:below] = self._glow_of_rows(panel, first, last)[top - first : below - first]
         return glow
@@ -198,7 +228,8 @@ class TwinOptics(Closing):
         y, x = np.mgrid[first:last, 0:width].astype(np.float64)
         seen_x, seen_y = (part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
-        # Beyond a lens there is no place: a pixel whose neighbour looks there has no density either.
+        # Beyond a lens there is no place: a pixel whose neighbour looks there has no density
+        # either.
         density = np.nan_to_num(np.abs(x_right * y_down - x_down * y_right))
         screen_w, screen_h = self.geometry.monitor.resolution_px
         on_screen = np.abs(seen_x - (screen_w - 1) / 2) <= screen_w / 2

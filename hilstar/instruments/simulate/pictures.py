@@ -1,4 +1,6 @@
-"""Exposures of the virtual tracker as files (FITS, 16-bit greyscale, PNG for people), and as pictures for a simulation."""
+"""Exposures of the virtual tracker as files (FITS, 16-bit greyscale, PNG for people), and as
+pictures for a simulation.
+"""
 
 import math
 from collections.abc import Callable
@@ -46,7 +48,9 @@ class Imager(Protocol):
 
 
 def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise) -> None:
-    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both were made."""
+    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how
+    both were made.
+    """
     from astropy.io import fits
 
     tracker = simulator.config.tracker
@@ -84,7 +88,9 @@ def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16], detector: Detecto
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """The DN themselves, unscaled, as 16-bit greyscale: TIFF where the name ends in .tif or .tiff, else PNG."""
+    """The DN themselves, unscaled, as 16-bit greyscale: TIFF where the name ends in .tif or
+    .tiff, else PNG.
+    """
     from PIL import Image
 
     tiff = path.suffix.lower() in {".tif", ".tiff"}
@@ -92,11 +98,13 @@ def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
 
 
 class TrackerPictures:
-    """A greyscale PNG of 16 bits for each attitude, drawn in the bench's GL context and freed with the bench.
+    """A greyscale PNG of 16 bits for each attitude, drawn in the bench's GL context and freed with
+    the bench.
 
-    Its leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture; sBIT says how many they are.
-    The exposure is centred on the attitude; stars smear where the attitude has a rate. Noise is full, and that of the n-th
-    picture of a run is always the same. `now` says which faults of a scenario are on.
+    Its leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture; sBIT
+    says how many they are. The exposure is centred on the attitude; stars smear where the attitude
+    has a rate. Noise is full, and that of the n-th picture of a run is always the same. `now` says
+    which faults of a scenario are on.
     """
 
     def __init__(self, bench: Bench, scenario: Scenario = NO_SCENARIO, now: Callable[[], tuple[Now, ...]] = tuple) -> None:
@@ -116,7 +124,9 @@ class TrackerPictures:
         return png_of(np.left_shift(exposure.dn, 16 - bits, dtype=np.uint16), bits)
 
     def _faults(self, view: View) -> FaultyExposure | None:
-        """The exposure with the faults of the display's frame; where that stands still, at the attitude at which it does."""
+        """The exposure with the faults of the display's frame; where that stands still, at the
+        attitude at which it does.
+        """
         now = self._now()
         if not any(isinstance(one.fault, Freeze | Drop) for one in now):
             self._stood = view

@@ -1,4 +1,6 @@
-"""A detector whose rows are exposed one after the other, before the sky or a screen that lights row by row."""
+"""A detector whose rows are exposed one after the other, before the sky or a screen that lights
+row by row.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -20,7 +22,8 @@ S_PER_US = 1e-6
 
 
 def rolled(view: View, tracker: Tracker) -> View:
-    """An exposure with the rows of a tracker's shutter; the same where all pixels are exposed at once.
+    """An exposure with the rows of a tracker's shutter; the same where all pixels are exposed at
+    once.
 
     `q_icrs_to_cam` and `t_ns` are then those in the middle of the middle row's exposure.
     """
@@ -33,9 +36,11 @@ def rolled(view: View, tracker: Tracker) -> View:
 
 @dataclass(frozen=True, slots=True)
 class RowBeat:
-    """A screen that lights row by row before rows that are exposed in turn: `rows` of the tracker, `screen` of the display.
+    """A screen that lights row by row before rows that are exposed in turn: `rows` of the tracker,
+    `screen` of the display.
 
-    Frame k lights the screen's middle row `phase_s` + k periods after the middle of the exposure of the tracker's middle row.
+    Frame k lights the screen's middle row `phase_s` + k periods after the middle of the exposure of
+    the tracker's middle row.
     """
 
     rows: Scan
@@ -60,10 +65,11 @@ class RowBeat:
         return self.phase_s + frame * self.period_s
 
     def shares(self, frame: int, screen_late_s: FloatArray, row_late_s: FloatArray) -> FloatArray:
-        """What a frame gives to places (n,) of an exposure's light, relative to the mean light of the screen.
+        """What a frame gives to places (n,) of an exposure's light, relative to the mean light of
+        the screen.
 
-        `screen_late_s` (n,) is how long after its middle row the screen lights a place, `row_late_s` (n,) how long after its
-        own the tracker exposes it.
+        `screen_late_s` (n,) is how long after its middle row the screen lights a place,
+        `row_late_s` (n,) how long after its own the tracker exposes it.
         """
         begin, exposed = self.begin_s(frame) + screen_late_s, row_late_s - self.rows.hold_s / 2
         lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(begin, exposed)
@@ -73,7 +79,8 @@ class RowBeat:
 def rolling_light(
     bench: Bench, geometry: BenchGeometry, panel: Panel, view: View, phase_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The mean light (primaries, H, W) of a display over each place's own exposure, and the glow's share of its mean (h, w).
+    """The mean light (primaries, H, W) of a display over each place's own exposure, and the glow's
+    share of its mean (h, w).
 
     Frames begin at the view's time, at `phase_s` as in `RowBeat`.
     """

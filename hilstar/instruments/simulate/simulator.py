@@ -1,6 +1,7 @@
 """The virtual tracker: the sky straight onto its detector, in electrons and then in DN.
 
-An exposure with faults is cut where a fault begins or ends; each piece has its own view and its own faults.
+An exposure with faults is cut where a fault begins or ends; each piece has its own view and its own
+faults.
 """
 
 import itertools
@@ -58,8 +59,11 @@ log = logging.getLogger(__name__)
 
 # The attitude at a time of the run, ns.
 AttitudeAt = Callable[[int], FloatArray]
-LATTICE = 17  # places along each side of a detector at which zodiacal light is computed; it is linear between them
-# A row of TRUTH_DTYPE, and the place of its light, px, and its illumination, as the tracker's optics make them.
+# places along each side of a detector at which zodiacal light is computed; it is linear between
+# them
+LATTICE = 17
+# A row of TRUTH_DTYPE, and the place of its light, px, and its illumination, as the tracker's
+# optics make them.
 EXPOSURE_DTYPE = np.dtype(
     [*TRUTH_DTYPE.descr, ("x_centroid_px", "f8"), ("y_centroid_px", "f8"), ("relative_illumination", "f8")]
 )
@@ -83,12 +87,14 @@ class FrameNoise:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its stars.
+    """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its
+    stars.
 
-    DN and electrons are those of the raw mosaic where the tracker has one. `truth` has the rows of EXPOSURE_DTYPE, and of three
-    channels CHANNEL_COLUMNS: what a star gives where all pixels have that colour. Places are those at the middle of the
-    exposure (NaN behind the camera), and `clipped` stars reach full well or the ADC's last code. `capped` stars have paths
-    coarser than they should be.
+    DN and electrons are those of the raw mosaic where the tracker has one. `truth` has the rows of
+    EXPOSURE_DTYPE, and of three channels CHANNEL_COLUMNS: what a star gives where all pixels have
+    that colour. Places are those at the middle of the exposure (NaN behind the camera), and
+    `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than
+    they should be.
     """
 
     view: View
@@ -100,10 +106,13 @@ class Exposure:
 
 
 class Simulator(Closing):
-    """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another renderer's.
+    """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another
+    renderer's.
 
-    Free it with `close`, or use it as a context manager; one in another's context ends with that. One that
-    does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands for the bench's own.
+    Free it with `close`, or use it as a context manager; one in another's context ends with that.
+    One that
+    does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands for the
+    bench's own.
     """
 
     def __init__(
@@ -143,7 +152,8 @@ class Simulator(Closing):
     def change(self, file: BenchFile) -> None:
         """Switch to another bench file of the same folder, rebuilding only what changed.
 
-        The simulator must have a GL context of its own. Raises what the simulator itself does; close it then.
+        The simulator must have a GL context of its own. Raises what the simulator itself does;
+        close it then.
         """
         if file.config == self.config and file.sha256 == self.file.sha256:
             return
@@ -176,11 +186,15 @@ class Simulator(Closing):
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
     ) -> View:
-        """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate (see `View`)."""
+        """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a
+        constant rate (see `View`).
+        """
         return View.exposure(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns, velocity_km_s, place_km)
 
     def expose(self, view: View, rng: np.random.Generator | None, faults: "FaultyExposure | None" = None) -> Exposure:
-        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
+        """One frame; without a generator, without noise. Raises InputError for what a detector
+        cannot take.
+        """
         exposure_s, canvas, view = self.config.tracker.exposure_s, self.canvas, rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
         if self.moving is not None and self.moving.air is not None and rng is not None:
@@ -197,7 +211,8 @@ class Simulator(Closing):
             )
             mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
             light = faults.sprites()
-        if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
+        # the Sun has more than a detector can be asked for; its wells are full long before
+        if self.moving is not None:
             mean_e = np.minimum(mean_e, BODY_MAX_E)
         if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
@@ -223,7 +238,9 @@ class Simulator(Closing):
         return np.multiply(in_pixels(images, self._bayer), seconds, dtype=np.float64)
 
     def _image(self, sprites: Sprites, stars: Stars, glass: StarGlass | None) -> Float32Array:
-        """Electrons per second of each pixel (h, w) of one colour, in memory that the next image takes."""
+        """Electrons per second of each pixel (h, w) of one colour, in memory that the next image
+        takes.
+        """
         if glass is None:
             self.renderer.draw(sprites)
             return self.renderer.linear()
@@ -240,7 +257,9 @@ class Simulator(Closing):
 
 @dataclass(frozen=True, slots=True)
 class ExposurePiece:
-    """A part of an exposure in which the same faults are on: its own view, and what is on when it begins."""
+    """A part of an exposure in which the same faults are on: its own view, and what is on when
+    it begins.
+    """
 
     view: View
     now: tuple[Now, ...]
@@ -251,7 +270,8 @@ def pieces_of(
 ) -> tuple[ExposurePiece, ...]:
     """The pieces of an exposure whose middle is at `run_ns` of a scenario.
 
-    `attitude_at` gives the attitude at which a display that stands still has stopped; by default it had the exposure's rate.
+    `attitude_at` gives the attitude at which a display that stands still has stopped; by default it
+    had the exposure's rate.
     """
     rate = view.turn.rate_cam_rad_s
 
@@ -289,9 +309,11 @@ class FaultyExposure:
     def light_e(
         self, light_of: Callable[[View, FaultLayer], Sprites], exposed_e: Callable[[Sprites, float], FloatArray]
     ) -> tuple[FloatArray, float]:
-        """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not blank.
+        """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not
+        blank.
 
-        `light_of` makes the light of a view with faults, `exposed_e` the electrons of its image in some seconds.
+        `light_of` makes the light of a view with faults, `exposed_e` the electrons of its image in
+        some seconds.
         """
         total: FloatArray | None = None
         open_s = 0.0
@@ -325,7 +347,9 @@ class FaultyExposure:
         return replace(whole, capped=sum(part.capped for part in parts), discs=discs)
 
     def added_truth(self) -> npt.NDArray[np.void]:
-        """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole exposure, at the mean place."""
+        """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole
+        exposure, at the mean place.
+        """
         tracks = {one.fault.name for piece in self.pieces for one in piece.now if isinstance(one.fault, CosmicRays)}
         points: dict[str, npt.NDArray[np.void]] = {}
         found: list[npt.NDArray[np.void]] = []
@@ -368,7 +392,9 @@ def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
 
 
 def detector_canvas(file: BenchFile, camera: Camera, psf: Psf | None = None) -> Canvas:
-    """The detector of a bench's tracker as layers draw on it, by its own PSF or `psf`. Raises InputError as `tracker_psf`."""
+    """The detector of a bench's tracker as layers draw on it, by its own PSF or `psf`. Raises
+    InputError as `tracker_psf`.
+    """
     tracker = file.config.tracker
     return Canvas(camera, psf or tracker_psf(tracker, file.folder), full_e=full_e(tracker.detector))
 
@@ -376,10 +402,11 @@ def detector_canvas(file: BenchFile, camera: Camera, psf: Psf | None = None) -> 
 def exposure_truth(
     canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray, glass: StarGlass | None = None
 ) -> npt.NDArray[np.void]:
-    """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its light, and for discs.
+    """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its
+    light, and for discs.
 
-    Behind a rolling shutter each is in the middle of its own row's exposure. With a `glass` centroids and illumination are
-    those of each star's light through it.
+    Behind a rolling shutter each is in the middle of its own row's exposure. With a `glass`
+    centroids and illumination are those of each star's light through it.
     """
     star = np.append(np.unique(light.star), disc_stars(stars, light.discs))
     icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, canvas.camera)[0]
@@ -393,7 +420,8 @@ def exposure_truth(
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
     inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
     place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
-    if stars.colours is not None:  # of other colours, the brightest pixel may be a neighbour of the star's own
+    # of other colours, the brightest pixel may be a neighbour of the star's own
+    if stars.colours is not None:
         from scipy.ndimage import maximum_filter
 
         mean_e = maximum_filter(mean_e, CLIPPED_PX)
@@ -435,12 +463,15 @@ def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
 
 
 class TrackerBackground:
-    """Light between the stars on a bench's detector: what is the same in every view, zodiacal light by direction, sky glow.
+    """Light between the stars on a bench's detector: what is the same in every view, zodiacal light
+    by direction, sky glow.
 
-    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels. Zodiacal light
-    and glow are computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where the
-    table of zodiacal light is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled
-    light is drawn, and a warning says so once until the field has left that part of the sky.
+    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all
+    channels. Zodiacal light
+    and glow are computed at LATTICE places along each side of the detector, each with its pixel's
+    solid angle. Where the table of zodiacal light is blank, near the Sun, a field is refused
+    (InputError); without `refuse` the nearest tabled light is drawn, and a warning says so once
+    until the field has left that part of the sky.
     """
 
     def __init__(
@@ -504,10 +535,11 @@ class TrackerBackground:
 
 
 def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> FloatArray:
-    """Electrons per exposure in every view, (height, width), by a channel's optics: level, plus a gradient, 0 in the middle.
+    """Electrons per exposure in every view, (height, width), by a channel's optics: level, plus a
+    gradient, 0 in the middle.
 
-    Zodiacal light is V mag/arcsec^2 through the tracker's optics, times each pixel's solid angle, `pixel_sr` (height, width)
-    (thesis eq. 4.10 and 4.11, which gives all pixels the middle one's).
+    Zodiacal light is V mag/arcsec^2 through the tracker's optics, times each pixel's solid angle,
+    `pixel_sr` (height, width) (thesis eq. 4.10 and 4.11, which gives all pixels the middle one's).
     """
     tracker, background = config.tracker, config.background
     width, height = tracker.resolution_px

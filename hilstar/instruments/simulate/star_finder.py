@@ -1,4 +1,6 @@
-"""From an image to stars: the centroider as wide as the bench's stars, and which of its finds is which star."""
+"""From an image to stars: the centroider as wide as the bench's stars, and which of its finds is
+which star.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -19,16 +21,21 @@ from hilstar.tracker.mosaic import software_psf_px
 
 USUAL: Centroider = "window"
 MATCH_PX = 3.0
-# Others' light in a star's window, as a share of its own. Both images have it, so its effect is of second order: at
+# Others' light in a star's window, as a share of its own. Both images have it, so its effect is of
+# second order: at
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
 CROWDED_SHARE = 0.02
-WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
+# how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh
+# magnitude
+WING_SIGMAS = 6.0
 MOSAIC_SHARE = 0.25  # least part of a star's light that a mosaic has: that of red alone
 MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 
 class Difference(NamedTuple):
-    """Stars (n,) in one image against themselves in another: magnitudes too faint, px right and down; NaN if not found."""
+    """Stars (n,) in one image against themselves in another: magnitudes too faint, px right and
+    down; NaN if not found.
+    """
 
     flux_mag: FloatArray
     x_px: FloatArray
@@ -54,22 +61,28 @@ class Matched:
 
 @dataclass(frozen=True, slots=True)
 class StarFinder:
-    """A centroider for a bench's stars: their PSF on the tracker, and the background for noiseless images."""
+    """A centroider for a bench's stars: their PSF on the tracker, and the background for
+    noiseless images.
+    """
 
     settings: CentroidSettings
     psf: Psf
     background: LocalBackground
     centroider: Centroider = USUAL
-    told: Psf | None = None  # a star's PSF as shown, where the tracker's is no Gaussian: what `psf` fits
+    # a star's PSF as shown, where the tracker's is no Gaussian: what `psf` fits
+    told: Psf | None = None
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
-        """The stars of a noiseless image (h, w) at their places (n,), where the bench's own centroider finds them."""
+        """The stars of a noiseless image (h, w) at their places (n,), where the bench's own
+        centroider finds them.
+        """
         return self.placed(self.find(image_e, x_px, y_px), image_e, (x_px, y_px), self.centroider)
 
     def find(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,), where a window finds them.
 
-        A tracker subtracts the screen's glow around each star: here it is not added in the first place.
+        A tracker subtracts the screen's glow around each star: here it is not added in the first
+        place.
         """
         found = find_stars(image_e, self.settings, self.background)
         return Matched(found, nearest(found, x_px, y_px))
@@ -82,9 +95,11 @@ class StarFinder:
         kind: Centroider,
         level: float = 0.0,
     ) -> Matched:
-        """The stars that a window has found where another centroider has them, above the image's `level`.
+        """The stars that a window has found where another centroider has them, above the image's
+        `level`.
 
-        A box is about the pixel of the star's true place, or as many whole pixels aside as the star is.
+        A box is about the pixel of the star's true place, or as many whole pixels aside as the star
+        is.
         """
         found, stars = matched.found, np.flatnonzero(matched.index >= 0)
         if kind == "window" or not len(stars):
@@ -103,7 +118,9 @@ class StarFinder:
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
-    """The finder for a bench's stars; `monitor_px_per_px` monitor pixels are as wide as a tracker pixel."""
+    """The finder for a bench's stars; `monitor_px_per_px` monitor pixels are as wide as a
+    tracker pixel.
+    """
     psf = seen_psf(bench, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *psf.width_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
@@ -116,14 +133,18 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
 
 
 def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
-    """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and the tracker's own PSF."""
+    """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and
+    the tracker's own PSF.
+    """
     spread = _shown_px2(bench, monitor_px_per_px)
     x, y = (math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True))
     return GaussianPsf(software_psf_px((x, y), bench.config.tracker.detector))
 
 
 def _shown_px2(bench: Bench, monitor_px_per_px: float) -> list[float]:
-    """Variances along x and y of a star's light on the monitor, px^2 of the tracker: two squares, sampled and shown."""
+    """Variances along x and y of a star's light on the monitor, px^2 of the tracker: two
+    squares, sampled and shown.
+    """
     return [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in bench.psf.width_px]
 
 
@@ -144,9 +165,11 @@ def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
 
 
 def neighbours(places: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs (m,) of places (n, 2) and others (k, 2) within a distance of each other, and it, by a sweep along x; none of NaN.
+    """Pairs (m,) of places (n, 2) and others (k, 2) within a distance of each other, and it, by a
+    sweep along x; none of NaN.
 
-    For the few thousand stars of a field it takes as long as a tree of SciPy's, whose import takes 0.1 s.
+    For the few thousand stars of a field it takes as long as a tree of SciPy's, whose import takes
+    0.1 s.
     """
     order = np.argsort(others[:, 0])
     x, at = others[order, 0], np.nan_to_num(places[:, 0], nan=np.inf)
@@ -166,7 +189,9 @@ def shared(match: IntArray) -> npt.NDArray[np.bool_]:
 
 
 def crowded(x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf) -> npt.NDArray[np.bool_]:
-    """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their own light."""
+    """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their
+    own light.
+    """
     places, half, result = np.stack([x_px, y_px], axis=1), radius_px + 0.5, np.zeros(len(flux), dtype=np.bool_)
     a, b, _ = neighbours(places, places, math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px))
     a, b = a[a != b], b[a != b]

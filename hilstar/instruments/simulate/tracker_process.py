@@ -1,7 +1,9 @@
-"""The virtual tracker as a process: in real time, on its own clock, with errors that are planted, it answers over a link.
+"""The virtual tracker as a process: in real time, on its own clock, with errors that are planted,
+it answers over a link.
 
-An exposure is one of `exposure_s` every 1 / rate seconds. It is computed once a frame has come that was lit after its end, or
-GRACE_NS later. One that cannot begin in time, because those before it took too long, is passed over and counted.
+An exposure is one of `exposure_s` every 1 / rate seconds. It is computed once a frame has come that
+was lit after its end, or GRACE_NS later. One that cannot begin in time, because those before it
+took too long, is passed over and counted.
 """
 
 import heapq
@@ -26,7 +28,8 @@ from hilstar.server.answers.answer import Answer
 
 GRACE_NS = 50 * NS_PER_MS  # three refreshes at 60 Hz
 SLICE_MS = 20
-ROLL = 4.0  # errors about the boresight are this many times those across it, as stars have a fifth of the lever
+# errors about the boresight are this many times those across it, as stars have a fifth of the lever
+ROLL = 4.0
 FOV_PERIOD_PX = 400.0
 MIN_FORWARD = 0.05
 SILENT_AFTER_S = 5.0
@@ -34,11 +37,12 @@ SILENT_AFTER_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Planted:
-    """What is wrong with the tracker: a bias about cam x, y, z, and one sigma of errors that repeat; shares; seconds.
+    """What is wrong with the tracker: a bias about cam x, y, z, and one sigma of errors that
+    repeat; shares; seconds.
 
-    Field-of-view error is a wave of 400 px of the star field's place, pixel error one of a pixel, each `_arcsec` about x and y,
-    and ROLL times that about the boresight. `wrong` is the share of answers that are any attitude. Silence begins `after_s`
-    and lasts `silent_s`.
+    Field-of-view error is a wave of 400 px of the star field's place, pixel error one of a pixel,
+    each `_arcsec` about x and y, and ROLL times that about the boresight. `wrong` is the share of
+    answers that are any attitude. Silence begins `after_s` and lasts `silent_s`.
     """
 
     bias_arcsec: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -78,7 +82,9 @@ class PlantedErrors:
 
 
 class OwnClock:
-    """The tracker's clock: off from the host's by `offset_s` when it begins, and fast by `drift_ppm`."""
+    """The tracker's clock: off from the host's by `offset_s` when it begins, and fast by
+    `drift_ppm`.
+    """
 
     def __init__(self, planted: Planted, begun_ns: int) -> None:
         self._begun_ns, self._rate = begun_ns, 1 + 1e-6 * planted.drift_ppm
@@ -98,7 +104,9 @@ Send = Callable[[Answer], None]
 
 @dataclass(slots=True)
 class TrackerTally:
-    """Counts of a run, and the tracker's own error, arcsec about cam x, y, z, before anything was planted."""
+    """Counts of a run, and the tracker's own error, arcsec about cam x, y, z, before anything
+    was planted.
+    """
 
     answers: int = 0
     valid: int = 0
@@ -124,7 +132,9 @@ MAX_ERRORS = 100_000
 
 
 class TrackerProcess:
-    """A live tracker, its watch, its clock and its errors; each answer's `host_ns` is that of mid-exposure."""
+    """A live tracker, its watch, its clock and its errors; each answer's `host_ns` is that of
+    mid-exposure.
+    """
 
     def __init__(
         self, tracker: LiveTracker, watch: FrameWatch, planted: Planted, rate_hz: float, rng: np.random.Generator
@@ -138,7 +148,9 @@ class TrackerProcess:
         self._host: HostClock = HOST_CLOCK
 
     def run(self, send: Send, stop: threading.Event, duration_s: float = math.inf) -> None:
-        """Answer until stopped, or for a duration from the first frame on. Raises InputError for frames of another display."""
+        """Answer until stopped, or for a duration from the first frame on. Raises InputError for
+        frames of another display.
+        """
         while not self._tracker.frames.received and not stop.is_set():
             self._take(SLICE_MS)
         begun_ns = self._tracker.frames.newest_ns
@@ -162,7 +174,8 @@ class TrackerProcess:
             number += 1
             behind = (self._host.now_ns() - end_ns) // self._period_ns - 1
             acquired = solved.mode == LOST and solved.identified is not None
-            if behind > 0 and not acquired:  # the exposure after it tells the rate, however long the solver took
+            # the exposure after it tells the rate, however long the solver took
+            if behind > 0 and not acquired:
                 self.tally.passed_over += behind
                 number += behind
         while self._waiting and not stop.is_set():

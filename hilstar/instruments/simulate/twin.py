@@ -1,6 +1,7 @@
 """From codes to light: the monitor as it is, and as the bench assumes it.
 
-The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads out.
+The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads
+out.
 """
 
 import itertools
@@ -44,11 +45,13 @@ PHASES = 4  # frames of a sequence with which an exposure may begin
 def exposure_lights(
     bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FaultLayer | None = None
 ) -> list[list[LitLight]]:
-    """The mean light of each primary, electrons per second, of each panel over an exposure from frame `first_frame` on.
+    """The mean light of each primary, electrons per second, of each panel over an exposure from
+    frame `first_frame` on.
 
     There is one light of all primaries where they are not driven apart.
 
-    With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first of.
+    With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first
+    of.
     """
     count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
@@ -69,7 +72,9 @@ def exposure_lights(
 
 
 def true_panel(bench: Bench) -> Panel:
-    """The true panel, which turns the bench's levels into light. Raises InputError for an unusable true calibration."""
+    """The true panel, which turns the bench's levels into light. Raises InputError for an
+    unusable true calibration.
+    """
     verify = bench.config.verify
     white = verify.true_flux_at_white_e_per_s or bench.flux_at_white_e_per_s
     if verify.true_calibration is None:
@@ -90,7 +95,9 @@ def true_calibration(bench: Bench, name: str, *, bit_stealing: bool = False) -> 
 
 
 def levels_of(assumed: Response, true: Response) -> Response:
-    """The true light of the assumed levels: with bit stealing another monitor orders its triples differently."""
+    """The true light of the assumed levels: with bit stealing another monitor orders its triples
+    differently.
+    """
     if assumed.rgb is None or true.rgb is None:
         return true
     light = {tuple(triple): value for triple, value in zip(true.rgb.tolist(), true.light, strict=True)}
@@ -103,14 +110,17 @@ def levels_of(assumed: Response, true: Response) -> Response:
 
 @dataclass(frozen=True, slots=True)
 class TwinField:
-    """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
+    """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker
+    pixels, as the sky has them.
 
-    Images are those in which the tracker's software finds stars: of a mosaic its superpixels, or itself, and stars have the
-    electrons of an average pixel of it. `pixels_e` are the detector's own of what is shown. `shown_e` is what the monitor as
-    it is makes, `assumed_e` what it would make if everything were as assumed (the same array where nothing differs), and
-    `sky_e` what the stars themselves make. `by_channel` has shown and sky of each channel,
-    where primaries are driven apart for several. `under_e` lies under them all. `truth` has the rows of TRUTH_DTYPE of stars
-    and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
+    Images are those in which the tracker's software finds stars: of a mosaic its superpixels, or
+    itself, and stars have the electrons of an average pixel of it. `pixels_e` are the detector's
+    own of what is shown. `shown_e` is what the monitor as it is makes, `assumed_e` what it would
+    make if everything were as assumed (the same array where nothing differs), and `sky_e` what the
+    stars themselves make. `by_channel` has shown and sky of each channel,
+    where primaries are driven apart for several. `under_e` lies under them all. `truth` has the
+    rows of TRUTH_DTYPE of stars and points, and `discs` those bodies' directions (3,), cam, and
+    radii, rad, which are more
     than points.
     """
 
@@ -162,7 +172,9 @@ class Twin(Closing):
         self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving)
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
-        """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
+        """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the
+        run on.
+        """
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
         skies = [self.sky_optics.image_e_per_s(light) * exposure_s for light in frame.light]
@@ -206,15 +218,19 @@ class Twin(Closing):
         return View.exposure(frame.q_icrs_to_cam, STILL, self.config.tracker.exposure_s, frame.t_ns)
 
     def _phase_s(self, first_frame: int) -> float:
-        """When the screen begins a frame after the middle of an exposure: of a free tracker each exposure at another moment."""
+        """When the screen begins a frame after the middle of an exposure: of a free tracker each
+        exposure at another moment.
+        """
         if self.config.tracker.trigger != "free":
             return -self.config.tracker.exposure_s / 2
         return (first_frame * GOLDEN % 1.0) / self.config.monitor.refresh_hz
 
     def detected_dn(self, seen: TwinField, rng: np.random.Generator) -> npt.NDArray[Any]:
-        """One noisy exposure (h, w), DN, the mean of glow and background subtracted unless all pixels have the same.
+        """One noisy exposure (h, w), DN, the mean of glow and background subtracted unless all
+        pixels have the same.
 
-        A frame transfer's smear is in these alone: in images without noise, sky and display would have the same.
+        A frame transfer's smear is in these alone: in images without noise, sky and display would
+        have the same.
         """
         exposure_s, under_e = self.config.tracker.exposure_s, np.broadcast_to(seen.under_e, seen.pixels_e.shape)
         dn = self.detector.expose(seen.pixels_e + under_e, exposure_s, rng)
@@ -241,9 +257,11 @@ def changed_keys(verify: Verify) -> list[str]:
 
 
 def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
-    """How monitor and collimator really stand: as the bench assumes, by a geometry file, or an ideal lens by keys of [verify].
+    """How monitor and collimator really stand: as the bench assumes, by a geometry file, or an
+    ideal lens by keys of [verify].
 
-    Raises InputError for a rotation that is not unit within 1e-3, and for a geometry file that cannot be used.
+    Raises InputError for a rotation that is not unit within 1e-3, and for a geometry file that
+    cannot be used.
     """
     config = bench.config
     verify, collimator, monitor = config.verify, config.collimator, config.monitor

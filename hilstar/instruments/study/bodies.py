@@ -1,7 +1,9 @@
-"""The study of bodies: the cost of each in a frame, the accuracy of its disc at each size, and its approach.
+"""The study of bodies: the cost of each in a frame, the accuracy of its disc at each size, and its
+approach.
 
-Each body is alone on its bench; its cost is the difference from the same frame without bodies. A disc is compared with rays
-traced in float64 and with a point in its place. An approaching body is judged by frame time and by finite light.
+Each body is alone on its bench; its cost is the difference from the same frame without bodies. A
+disc is compared with rays traced in float64 and with a point in its place. An approaching body is
+judged by frame time and by finite light.
 """
 
 import math
@@ -56,7 +58,8 @@ FOCAL_PX = 6000.0
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
 PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
-MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400  # along each side: at most 0.07 px apart, under a tenth of sigma
+# along each side: at most 0.07 px apart, under a tenth of sigma
+MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400
 LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
 PLACES = 60
 MARGIN_PX = 8
@@ -94,7 +97,9 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
 
 
 def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
-    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb (negative: on it)."""
+    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb
+    (negative: on it).
+    """
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
     disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body)
@@ -109,7 +114,9 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class BodyScene:
-    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock from frame to frame."""
+    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock
+    from frame to frame.
+    """
 
     name: str
     bench: str
@@ -127,10 +134,12 @@ def at_a_step(scene: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class BodyCost:
-    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the difference.
+    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the
+    difference.
 
-    `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy machine changes it least,
-    and in software rendering it is the whole cost. `discs` are the bodies drawn as discs, `stars` counts the stars drawn.
+    `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy
+    machine changes it least, and in software rendering it is the whole cost. `discs` are the bodies
+    drawn as discs, `stars` counts the stars drawn.
     """
 
     scene: str
@@ -161,7 +170,9 @@ SCENES = (
 
 
 def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
-    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all" and the scene's."""
+    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all"
+    and the scene's.
+    """
     bench, nothing = benches[scene.bench], benches["nothing"]
     knows = bench.moving is not None and scene.body in bench.moving.names
     q = attitude(bench if knows else benches["all"], scene.body, scene.off_deg, scene.t_ns)
@@ -173,7 +184,8 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
 
 
 def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int) -> tuple[Spent, Spent]:
-    """The fastest frame, from attitude to levels in memory, of a bench without bodies and of one with, timed in turn.
+    """The fastest frame, from attitude to levels in memory, of a bench without bodies and of one
+    with, timed in turn.
 
     The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
     """
@@ -185,9 +197,11 @@ def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int
 
 @dataclass(frozen=True, slots=True)
 class Exactness:
-    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its middle, single pixels.
+    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its
+    middle, single pixels.
 
-    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel; `point_pixel_off` is that of a point.
+    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel;
+    `point_pixel_off` is that of a point.
     """
 
     body: str
@@ -246,7 +260,9 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
 
 
 def traced(disc: Disc, camera: Camera) -> FloatArray:
-    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the Gaussian over the pixels."""
+    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the
+    Gaussian over the pixels.
+    """
     from scipy.special import ndtr
 
     radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
@@ -266,7 +282,9 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
 
 
 def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
-    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward of the limb."""
+    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward
+    of the limb.
+    """
     from scipy.ndimage import map_coordinates
 
     half = image.shape[0] // 2
@@ -290,10 +308,12 @@ def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and without any body.
+    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and
+    without any body.
 
-    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0: fainter), `finite` says that
-    every pixel's light is a number, `white_is_white` that each with more than white has white's code; `stars` those drawn.
+    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0:
+    fainter), `finite` says that every pixel's light is a number, `white_is_white` that each with
+    more than white has white's code; `stars` those drawn.
     """
 
     body: str
@@ -331,7 +351,9 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each finding. Raises InputError."""
+    """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each
+    finding. Raises InputError.
+    """
     others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
     scenes = [scene for scene in SCENES if scene.bench in QUICK_BENCHES] if quick else SCENES
     with opened(QUICK_BENCHES if quick else tuple(BODIES)) as benches:

@@ -1,4 +1,6 @@
-"""Ways from light to code values, and the error of each by every centroider: of one frame, and over an exposure."""
+"""Ways from light to code values, and the error of each by every centroider: of one frame, and
+over an exposure.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -20,7 +22,8 @@ from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 
 BITS = (8, 10, 12)
-# By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is allowed.
+# By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is
+# allowed.
 AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
 AIM_PX = 0.01
 # Rec. 709's shares of white stand in for the primaries as a tracker sees them.
@@ -45,7 +48,9 @@ AIM_FRAMES = 6
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way from light to levels: its name, the renderer's method, its colour, and in how many frames it is seen."""
+    """One way from light to levels: its name, the renderer's method, its colour, and in how many
+    frames it is seen.
+    """
 
     name: str
     method: Quantisation
@@ -71,7 +76,9 @@ def response_of(bits: int, way: Way) -> Response:
 
 
 def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
-    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as in the one before."""
+    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as
+    in the one before.
+    """
     rng = np.random.default_rng(SEED)
     mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
     flux = WHITE / USUAL_PSF.peak_share * flux_ratio(mag)
@@ -80,7 +87,9 @@ def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
 
 
 def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
-    """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its judge by the usual tracker."""
+    """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its
+    judge by the usual tracker.
+    """
     sprites, tile = phase_grid(phases, USUAL_PSF)
     bright = phase_image(sprites, USUAL_PSF)
     judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
@@ -88,7 +97,9 @@ def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
 
 
 def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
-    """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
+    """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the
+    tracker is as usual.
+    """
     panel, balance = Panel(response_of(bits, way), WHITE), Balance(USUAL_PSF, AS_USUAL)
     sprites, _, bright, judge = judged_phases(phases)
     errors = []
@@ -100,7 +111,9 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
 
 
 def error_cells(errors: StarErrors) -> tuple[float, ...]:
-    """The values of ERROR_COLUMNS; `centroid_...` are distances by the plain moment, `axis_rms_...` along one axis."""
+    """The values of ERROR_COLUMNS; `centroid_...` are distances by the plain moment,
+    `axis_rms_...` along one axis.
+    """
     distance_px = np.sqrt(2) * errors.axis_rms_px("moment")
     return (
         errors.flux_rms_mag,
@@ -114,9 +127,11 @@ def error_cells(errors: StarErrors) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class OverFrames:
-    """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many frames, places along an axis.
+    """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many
+    frames, places along an axis.
 
-    `steps` is the star's light in steps from black; errors are infinite where a star may show nothing.
+    `steps` is the star's light in steps from black; errors are infinite where a star may show
+    nothing.
     """
 
     panel: str
@@ -134,7 +149,8 @@ def study_frames(directory: Path, quick: bool) -> str:
     """Write over_frames.csv and its chart into `directory`; the finding."""
     phases, counts = (6, FRAMES[:4]) if quick else (16, FRAMES)
     equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
-    # Monitors of 8 bits, and microdisplays whose levels are equal; a star so many magnitudes under white on each.
+    # Monitors of 8 bits, and microdisplays whose levels are equal; a star so many magnitudes under
+    # white on each.
     shown = (
         ("sRGB, 8 bits", srgb_response(8), 6.0),
         ("gamma 2.2, 8 bits", gamma_response(8), 6.0),
@@ -158,7 +174,8 @@ def _left_by(name: str, response: Response, mag: float, phases: int, counts: tup
     steps = float(stars.data["electrons_per_s"][0]) / (float(response.light[1]) * WHITE)
     kinds: tuple[Centroider, ...] = ("moment", "window", "fit")
     for method in ("temporal", "dither"):
-        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))  # light up to the end of each frame
+        # light up to the end of each frame
+        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))
         for frame in range(len(whole) - 1):
             levels = quantiser.levels(stars) if method == "temporal" else dither_levels(linear, panel, mask_turn(frame))
             whole[frame + 1] = whole[frame] + shown_light(levels, panel)

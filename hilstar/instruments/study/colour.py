@@ -1,8 +1,10 @@
-"""The study of colour: what the primaries of a display can do for mono and Bayer trackers, and what no primary can.
+"""The study of colour: what the primaries of a display can do for mono and Bayer trackers, and what
+no primary can.
 
-Stars stand alone in frames drawn by each choice. Codes become light by primary, and that the tracker's electrons by channel.
-Subtypes are those of the Pickles library's dwarfs of the same colour, as the same tracker sees it: the ratio of blue to red, or
-for one channel the mean wavelength of detected photons.
+Stars stand alone in frames drawn by each choice. Codes become light by primary, and that the
+tracker's electrons by channel. Subtypes are those of the Pickles library's dwarfs of the same
+colour, as the same tracker sees it: the ratio of blue to red, or for one channel the mean
+wavelength of detected photons.
 """
 
 import math
@@ -52,7 +54,8 @@ from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL_VARIANCE_PX2, in_pixels,
 
 NM = np.arange(380.0, 1001.0, 2.0)
 Lobes = tuple[tuple[float, float, float], ...]  # peak, half width at 1/e, nm, and height
-# Primaries as wide as an OLED's, as an sRGB LCD's with a phosphor of two red lines, and as a projector's lasers.
+# Primaries as wide as an OLED's, as an sRGB LCD's with a phosphor of two red lines, and as a
+# projector's lasers.
 PANELS: dict[str, tuple[Lobes, ...]] = {
     "OLED": (((625, 40, 1.0),), ((530, 45, 1.0),), ((460, 30, 0.8),)),
     "sRGB LCD": (((612, 12, 1.0), (645, 15, 0.6)), ((540, 35, 1.0),), ((450, 15, 1.2),)),
@@ -64,7 +67,8 @@ SENSORS: dict[str, tuple[Lobes, ...]] = {
     "Bayer, wide dyes": (((620, 80, 0.6),), ((540, 80, 0.7),), ((460, 70, 0.6),)),
     "Bayer, no cut": (((610, 50, 0.6), (850, 90, 0.3)), ((535, 50, 0.7), (850, 80, 0.3)), ((460, 40, 0.6), (850, 75, 0.3))),
 }
-# Mono sensors, the quantum efficiency of each: one that no light from CUT_NM on reaches is as any panel has light for it.
+# Mono sensors, the quantum efficiency of each: one that no light from CUT_NM on reaches is as any
+# panel has light for it.
 CUT_NM = 700.0
 MONO_SENSOR = "ccd47-20"
 MONO = {"ccd47-20": "ccd47-20", "kai-4021": "kai-4021", "ccd47-20 to 700 nm": "ccd47-20 to 700 nm.csv"}
@@ -76,16 +80,21 @@ FIELDS, QUICK_FIELDS, ROUNDS, QUICK_ROUNDS = 40, 3, 15, 3
 BRIGHTEST_V_MAG, FAINTEST_V_MAG = 1.0, 5.5
 LONE = Isolation(5.0, 1e-3)
 PUBLISHED_SUBTYPES = 6.55  # a rig with an OLED of 2025
-# Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they stand.
+# Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they
+# stand.
 SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12_000.0), 16, 24
 Row = tuple[str | float, ...]
-# Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean wavelength, and subtypes.
+# Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean
+# wavelength, and subtypes.
 GAMUT = ("panel", "sensor", "condition", "out_share", "off_median", "off_95", "off_percent_k", "subtypes", "subtypes_white")
-# The same of a mono sensor by spectral class: stars to V = 7, their mean wavelength and how far it is off, and subtypes.
+# The same of a mono sensor by spectral class: stars to V = 7, their mean wavelength and how far it
+# is off, and subtypes.
 BY_CLASS = ("panel", "sensor", "class", "stars", "mean_nm", "off_nm", "subtypes", "subtypes_white")
-# Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's light [%] and place; time.
+# Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's
+# light [%] and place; time.
 CHOICE = ("tracker", "colour", "method", "stars", "wall_ms", "cpu_ms", "subtypes", "off_percent_k", "mag", "channel", "px")
-# Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1 px for 100 nm of the mean.
+# Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1
+# px for 100 nm of the mean.
 LATERAL = ("lens", "panel", "colour", "sky_px", "off_px", "off_share")
 # Errors of a noiseless star's place along an axis, over places in four pixels.
 PLACES = ("sigma_px", "temperature_k", "image", "rms_px", "max_px")
@@ -131,7 +140,8 @@ def file_of(folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, 
 
 
 def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatArray]:
-    """Spectral subtypes (0 is O0, 60 is M0) by a tracker's colour: shares of channels (n, 3), or a mean wavelength (n, 1).
+    """Spectral subtypes (0 is O0, 60 is M0) by a tracker's colour: shares of channels (n, 3), or a
+    mean wavelength (n, 1).
 
     Those of colours beyond the dwarfs' are their ends'.
     """
@@ -174,7 +184,9 @@ def study_gamut(folder: Path, by_class: list[Row]) -> Iterator[Row]:
 
 
 def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[FloatArray, ...]]:
-    """Lone stars of frames: what is wanted, the shares of primaries shown (3,), light over wanted (1,), and place off (2,)."""
+    """Lone stars of frames: what is wanted, the shares of primaries shown (3,), light over
+    wanted (1,), and place off (2,).
+    """
     light, rgb = srgb_response(bench.config.monitor.bits).light, bench.calibration.response.rgb
     white, stars, rng = colours.of_white * bench.flux_at_white_e_per_s, bench.shown_stars, np.random.default_rng(1)
     for _ in range(fields):
@@ -200,7 +212,9 @@ def frame_of(bench: Bench, number: int) -> Levels:
 
 
 def study_choices(folder: Path, trackers: Mapping[str, str], fields: int, rounds: int) -> Iterator[Row]:
-    """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn: rows of CHOICE."""
+    """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn:
+    rows of CHOICE.
+    """
     for tracker, sensor in trackers.items():
         with ExitStack() as stack:
             benches = {
@@ -214,7 +228,8 @@ def study_choices(folder: Path, trackers: Mapping[str, str], fields: int, rounds
                 stars = zip(*shown_stars(bench, colours, fields), strict=True)
                 wanted, shares, flux, off = (np.array(part) for part in stars)
                 shown = colours.shown(shares)
-                off = np.hypot(*(off - np.median(off, axis=0)).T)  # what all are off by is the alignment's
+                # what all are off by is the alignment's
+                off = np.hypot(*(off - np.median(off, axis=0)).T)
                 flux_mag = np.abs([magnitude(float(one)) for one in flux[:, 0]])
                 channels = np.abs(flux - 1) if colours.mono else np.abs(shown / wanted - 1)
                 off_kind = np.abs(subtypes(shown) - subtypes(wanted[:, : shown.shape[1]])).mean()
@@ -246,7 +261,8 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         own, wanted = StarGlass(file, psf).shares(stars, np.arange(len(stars))), colours.wanted(stars)
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
         places = np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
-        white, plain = colours.of_white + 0 * wanted[:, :1], replace(colours, lateral=None)  # as for a lens that is not known
+        # as for a lens that is not known
+        white, plain = colours.of_white + 0 * wanted[:, :1], replace(colours, lateral=None)
         for colour, known, unknown in (("white", white, white), ("star", colours.shares(wanted), plain.shares(wanted))):
             glass = [moved_px(psf, places, one, solar) for one in (own, known @ by_primary)]
             means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], plain.shown(unknown))]
@@ -276,7 +292,8 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
             settings = CentroidSettings(window_sigma_px=max(1.0, width_px), psf_sigma_px=(width_px, width_px), minimum_pixels=2)
             found = find_stars(image, settings, LocalBackground(0.0, 1e-3))
             tiles = np.stack([found.x_px // TILE_PX, found.y_px // TILE_PX]).astype(np.intp)
-            first = np.unique(tiles[1] * PHASES + tiles[0], return_index=True)[1]  # the brightest of a tile
+            # the brightest of a tile
+            first = np.unique(tiles[1] * PHASES + tiles[0], return_index=True)[1]
             column, row = tiles[:, first]
             true_x, true_y = (TILE_PX * tile + TILE_PX // 2 + steps[tile] for tile in (column, row))
             off = np.concatenate([found.x_px[first] - true_x, found.y_px[first] - true_y])
@@ -310,7 +327,9 @@ def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and _mosaic; findings."""
+    """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and
+    _mosaic; findings.
+    """
     others = OtherWork()
     with TemporaryDirectory() as name:
         folder = Path(name)

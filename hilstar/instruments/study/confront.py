@@ -1,4 +1,6 @@
-"""What the simulator gets right and wrong of photographs: each camera fitted, each image held out of the fit of the others."""
+"""What the simulator gets right and wrong of photographs: each camera fitted, each image held
+out of the fit of the others.
+"""
 
 import math
 import re
@@ -21,7 +23,9 @@ FORM = "a folder for each camera: guess.toml, which holds its [tracker], and its
 
 @dataclass(frozen=True, slots=True)
 class PhotographFound:
-    """One image: how far stars to V = 6.5 are off, alone and by a camera that other images fitted; NaN where not measured."""
+    """One image: how far stars to V = 6.5 are off, alone and by a camera that other images
+    fitted; NaN where not measured.
+    """
 
     camera: str
     image: str
@@ -39,7 +43,8 @@ class PhotographFound:
 
 
 def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
-    """Confront every camera's images, write `confront.csv`, its chart and a page for each camera; a line for each image.
+    """Confront every camera's images, write `confront.csv`, its chart and a page for each camera; a
+    line for each image.
 
     With `quick` no image is held out. Raises InputError where `images` has no cameras.
     """
@@ -121,7 +126,9 @@ def line_of(row: PhotographFound) -> str:
 
 
 def draw(path: Path, found: Sequence[PhotographFound]) -> None:
-    """Bars of what is left of places and light in each image, and points of what is left when it is held out."""
+    """Bars of what is left of places and light in each image, and points of what is left when it
+    is held out.
+    """
     rows = [row for row in found if not row.refused]
     if not rows:
         return

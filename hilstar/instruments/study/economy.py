@@ -1,4 +1,5 @@
-"""The gain of `effort = "auto"`: five scenes on panels of 8, 10 and 12 bits, at full effort and at the effort that
+"""The gain of `effort = "auto"`: five scenes on panels of 8, 10 and 12 bits, at full effort and at
+the effort that
 two tolerances need, with the times of whole frames and the errors of stars.
 """
 
@@ -80,7 +81,8 @@ SCENES = (
 
 @dataclass(frozen=True, slots=True)
 class EffortOutcome:
-    """A scene at one effort: the times of a frame, the largest errors of stars that stand alone, and the tolerance.
+    """A scene at one effort: the times of a frame, the largest errors of stars that stand alone,
+    and the tolerance.
 
     `tolerance` is "full" at full effort, which has the default's figures. `frame_ms` is the median
     time of a whole frame, `cpu_ms` that of the processor in it. `claimed_mag` and `claimed_px` are
@@ -140,7 +142,9 @@ class EffortComparison:
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Measure every scene, and write `economy.csv` and its chart; a line for each comparison. Raises InputError."""
+    """Measure every scene, and write `economy.csv` and its chart; a line for each comparison.
+    Raises InputError.
+    """
     others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
     comparisons, rows = [], []
     for bits in BITS:
@@ -239,7 +243,9 @@ def _line(comparison: EffortComparison, load: Load) -> str:
 
 
 def economy_finding(comparisons: list[EffortComparison]) -> str:
-    """What was found in one sentence: the median speed-up at the default tolerance by bits, its range, and the errors."""
+    """What was found in one sentence: the median speed-up at the default tolerance by bits, its
+    range, and the errors.
+    """
     found = []
     for bits in sorted({one.auto.bits for one in comparisons}):
         mine = [one.speed_up for one in comparisons if (one.auto.bits, one.auto.tolerance) == (bits, DEFAULT.name)]

@@ -1,4 +1,6 @@
-"""The cost of each fault on request in a frame, and the error of stars in the codes under stray light."""
+"""The cost of each fault on request in a frame, and the error of stars in the codes under stray
+light.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +28,8 @@ ROUNDS, QUICK_ROUNDS = 30, 1
 QUANTISATIONS = ("round", "exact")
 COLOURS = dict(zip(QUANTISATIONS, (GREEN, BLUE), strict=True))
 FIELD = from_radec_roll_deg(84.057, -1.2, 0.0)
-SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that a fault that is fixed on the sky is new in each frame
+# so that a fault that is fixed on the sky is new in each frame
+SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])
 ISOLATION = Isolation(margin_px=7, max_share=1e-3)
 SHARES = (0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 QUICK_SHARES = (0.0, 0.01, 1.0)
@@ -55,7 +58,9 @@ CASES: dict[str, list[dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class FaultCost:
-    """One case: median times of a frame, ms, with the fault and without any, in turn in the same run."""
+    """One case: median times of a frame, ms, with the fault and without any, in turn in the same
+    run.
+    """
 
     quantisation: str
     case: str
@@ -66,7 +71,9 @@ class FaultCost:
 
 @dataclass(frozen=True, slots=True)
 class Stray:
-    """Stars over even stray light of a share of white: the error of their light in the codes, and the share that is lost."""
+    """Stars over even stray light of a share of white: the error of their light in the codes,
+    and the share that is lost.
+    """
 
     quantisation: str
     share_of_white: float
@@ -116,10 +123,13 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
 
 
 def stray_light(bench: Bench, share: float) -> Stray:
-    """Each star's light in the codes over even stray light: the frame with the stars, less the same without them."""
+    """Each star's light in the codes over even stray light: the frame with the stars, less the
+    same without them.
+    """
     white = bench.flux_at_white_e_per_s
     sprites = bench.light(bench.view(FIELD))
-    glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
+    # 100 rad wide: even
+    glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)
     lights = (glow,) if share else ()
     both, alone = (
         shown_light(bench.draw_sprites(replace(each, extended=lights)).levels, bench.panel).copy()
@@ -137,7 +147,9 @@ def stray_light(bench: Bench, share: float) -> Stray:
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a line each. Raises InputError."""
+    """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a
+    line each. Raises InputError.
+    """
     costs: list[FaultCost] = []
     strays: list[Stray] = []
     rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
@@ -169,7 +181,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
-    """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None where none spoils them."""
+    """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None
+    where none spoils them.
+    """
     worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG]
     return min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
 

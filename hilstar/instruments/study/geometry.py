@@ -1,9 +1,11 @@
-"""Star errors after a geometric calibration, by number of dots, by centroid noise and by lens model.
+"""Star errors after a geometric calibration, by number of dots, by centroid noise and by lens
+model.
 
-The true lens belongs to no model's family: chief rays are traced by Snell's law through a real doublet onto a screen (mm, cam
-axes; the tracker's pupil is at the origin and looks along +z). The doublet has the prescription of a 100 mm achromat (N-BK7
-and SF5, radii 62.8, -45.7 and -128.2 mm, 4.0 and 2.5 mm thick), scaled to the focal length. The tracker has 38 arcsec per pixel
-and sees the whole screen; 5 % of the dots are lost and as many are false.
+The true lens belongs to no model's family: chief rays are traced by Snell's law through a real
+doublet onto a screen (mm, cam axes; the tracker's pupil is at the origin and looks along +z). The
+doublet has the prescription of a 100 mm achromat (N-BK7 and SF5, radii 62.8, -45.7 and -128.2 mm,
+4.0 and 2.5 mm thick), scaled to the focal length. The tracker has 38 arcsec per pixel and sees the
+whole screen; 5 % of the dots are lost and as many are false.
 """
 
 from collections.abc import Iterator
@@ -32,7 +34,9 @@ DESIGN_FOCAL_MM = 100.0
 
 @dataclass(frozen=True, slots=True)
 class DotFaults:
-    """The noise of a centroid (one sigma, one axis), and the shares of lit dots that are lost and false."""
+    """The noise of a centroid (one sigma, one axis), and the shares of lit dots that are lost
+    and false.
+    """
 
     noise_px: float = 0.02
     lost: float = 0.05
@@ -47,7 +51,9 @@ def observed_dots(
     faults: DotFaults,
     rng: np.random.Generator,
 ) -> Observed:
-    """Centroids of the lit dots that are at (x, y) (n,) in a tracker's image of `resolution_px`, frame by frame."""
+    """Centroids of the lit dots that are at (x, y) (n,) in a tracker's image of `resolution_px`,
+    frame by frame.
+    """
     width, height = resolution_px
     inside = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
     found: list[FloatArray] = []
@@ -106,7 +112,9 @@ class TracedBench:
         return x + (self.resolution_px[0] - 1) / 2, y + (self.resolution_px[1] - 1) / 2
 
     def directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """The directions (n, 3) in cam of pixels (n,): the inverse, by Newton's method with differences."""
+        """The directions (n, 3) in cam of pixels (n,): the inverse, by Newton's method with
+        differences.
+        """
         u = (np.asarray(x_px) - (self.resolution_px[0] - 1) / 2) * self.pitch_mm / self.focal_mm
         v = (np.asarray(y_px) - (self.resolution_px[1] - 1) / 2) * self.pitch_mm / self.focal_mm
         ones, step = np.ones_like(u), 1e-6
@@ -121,7 +129,9 @@ class TracedBench:
 
 
 def _refracted(at: FloatArray, ray: FloatArray, radius: float, ratio: float) -> tuple[FloatArray, FloatArray]:
-    """Points on, and directions behind, a sphere whose vertex is at the origin; `ratio` is n before over n after."""
+    """Points on, and directions behind, a sphere whose vertex is at the origin; `ratio` is n
+    before over n after.
+    """
     to_centre = at - [0.0, 0.0, radius]
     half = (ray * to_centre).sum(axis=1)
     root = np.sqrt(half**2 - (to_centre**2).sum(axis=1) + radius**2)
@@ -138,7 +148,9 @@ TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """A model of the lens: its name, its free parameters, and the degree of its residual field (0: none)."""
+    """A model of the lens: its name, its free parameters, and the degree of its residual field
+    (0: none).
+    """
 
     name: str
     parameters: tuple[str, ...]
@@ -172,7 +184,9 @@ SHORT = {"the same with a field of degree 4": "with a field, degree 4", "Brown-C
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOutcome:
-    """One model on one set of frames: the error of held-out dots, and that of stars all over the screen."""
+    """One model on one set of frames: the error of held-out dots, and that of stars all over the
+    screen.
+    """
 
     frames: int
     dots_per_frame: int

@@ -1,9 +1,12 @@
-"""The study of brightness models: DGS against AGS, temperature scales, zero points, black bodies against real spectra.
+"""The study of brightness models: DGS against AGS, temperature scales, zero points, black bodies
+against real spectra.
 
-Charts: figures 5.19 and 5.22 of the thesis (RAPP); temperatures against Torres 2010; the electrons of a star of V = 0 by zero
-point and passband weighting; the cost of each choice over B-V and for Hipparcos; spectra against the library's own.
+Charts: figures 5.19 and 5.22 of the thesis (RAPP); temperatures against Torres 2010; the electrons
+of a star of V = 0 by zero point and passband weighting; the cost of each choice over B-V and for
+Hipparcos; spectra against the library's own.
 
-Then figures of the thesis's chapters 2 to 5 that need no simulation, each with the thesis's value beside the one here.
+Then figures of the thesis's chapters 2 to 5 that need no simulation, each with the thesis's value
+beside the one here.
 """
 
 from collections import Counter
@@ -83,7 +86,8 @@ TABLE_2_3_V_MAG = 9.0
 CLIPPED_TIMES = 4  # errors over so many times the thesis's are drawn at the edge
 # Table 2.2: V and B-V from the ground, from Hipparcos, from Tycho; of all 118 218 rows.
 TABLE_2_2 = {"G": (23_139, 41_205), "H": (94_669, 0), "T": (409, 75_732)}
-# Table 2.5: flux of magnitude 0 by Johnson and by Bessell, erg/s/cm2/A, and Bessell's effective wavelength, nm.
+# Table 2.5: flux of magnitude 0 by Johnson and by Bessell, erg/s/cm2/A, and Bessell's effective
+# wavelength, nm.
 TABLE_2_5 = {
     "u": (4.35e-9, 4.175e-9, 366.0),
     "b": (7.20e-9, 6.32e-9, 438.0),
@@ -106,7 +110,9 @@ ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
 
 
 def catalogue_errors(directory: Path) -> ChartFinding:
-    """Figures 2.3 to 2.8 and tables 2.2 and 2.3: the errors of Hipparcos's figures, and where V and B-V are from."""
+    """Figures 2.3 to 2.8 and tables 2.2 and 2.3: the errors of Hipparcos's figures, and where V
+    and B-V are from.
+    """
     catalog = load_catalog()
     facts = facts_of(catalog.hip)
     bright = catalog.v_mag < TABLE_2_3_V_MAG
@@ -162,7 +168,9 @@ def draw_catalogue_errors(
 
 @dataclass(frozen=True, slots=True)
 class MeasuredValue:
-    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are drawn."""
+    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are
+    drawn.
+    """
 
     of_star: FloatArray
     label: str
@@ -206,7 +214,9 @@ def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) ->
 
 
 def passbands(directory: Path) -> ChartFinding:
-    """Figures 2.12, 2.13 and 3.7, and table 2.5: UBVRI, Vega, and the black body that the thesis takes for it."""
+    """Figures 2.12, 2.13 and 3.7, and table 2.5: UBVRI, Vega, and the black body that the thesis
+    takes for it.
+    """
     light = vega()
     curves = {b: read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv") for b in TABLE_2_5}
     in_v = curve_mean(light, curves["v"])
@@ -275,7 +285,9 @@ def curves(directory: Path) -> ChartFinding:
 
 
 def detector_laws(directory: Path) -> ChartFinding:
-    """Equation 4.12 and figures 4.12 and 4.15: dark current by temperature, read noise by readout frequency."""
+    """Equation 4.12 and figures 4.12 and 4.15: dark current by temperature, read noise by
+    readout frequency.
+    """
     kelvin, hz = np.arange(230.0, 300.5, 1.0), np.geomspace(1e4, 1e7, 61)
     dark = {
         name: np.array([203 * structs.replace(TABLE_4_2_DARK, temperature_k=t, **law).dark_factor for t in kelvin.tolist()])
@@ -348,7 +360,8 @@ HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
 
 SETTINGS = [Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS]
-SCALE_BV_MAG = np.arange(-35, 181) / 100  # where Torres 2010 holds; exact at 0, where wang2021 steps
+# where Torres 2010 holds; exact at 0, where wang2021 steps
+SCALE_BV_MAG = np.arange(-35, 181) / 100
 
 BV_MAG = np.arange(-30, 201) / 100
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
@@ -356,7 +369,9 @@ MIN_STARS = 20
 
 
 def spectra(directory: Path) -> ChartFinding:
-    """Black bodies and the Pickles relation, each star held out in turn, against the Pickles spectra over V-I."""
+    """Black bodies and the Pickles relation, each star held out in turn, against the Pickles
+    spectra over V-I.
+    """
     library, photometry = load_library(), Photometry()
     errors: dict[tuple[str, str], FloatArray] = {}  # relative, of each star, by sensor and method
     for sensor in SENSORS:
@@ -428,7 +443,8 @@ def zero_points(directory: Path) -> ChartFinding:
                 axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
         upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * base.max() / 1e6))
         low, high = min(0.0, *(m.min() for m in mag.values())), max(m.max() for m in mag.values())
-        limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))  # with room for figures and names
+        # with room for figures and names
+        limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))
         lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
         lower.set(ylabel="fainter than vega, energy [mag]", xlabel="zero point, weighting of the passband", ylim=limits)
         for axes in (upper, lower):
@@ -494,7 +510,8 @@ def choices(directory: Path) -> ChartFinding:
     optics, stars = study_optics("ccd47-20"), load_catalog().brighter_than(BRIGHT_V_MAG)
     cost = choice_costs_mag(BV_MAG, optics)
     real = tabulate_pickles(optics, Photometry()).electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
-    bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)  # a spectrum for each colour, of which there are few
+    # a spectrum for each colour, of which there are few
+    bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)
     body = dgs_electrons_per_s(star_temperatures_k(bv_mag, "ballesteros2012"), optics, Photometry())[star]
     on_stars = {name: mag[star] for name, mag in choice_costs_mag(bv_mag, optics).items()}
     on_stars["spectrum pickles"] = magnitude(real / body)
@@ -544,7 +561,9 @@ def choices_finding(paid: Mapping[str, FloatArray]) -> str:
 
 
 def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray]:
-    """The cost of each choice, mag (n,), against a black body by ballesteros2012, vega and energy; + is fainter."""
+    """The cost of each choice, mag (n,), against a black body by ballesteros2012, vega and
+    energy; + is fainter.
+    """
     default = Photometry()
     kelvin = star_temperatures_k(bv_mag, "ballesteros2012")
     rates = {
@@ -572,7 +591,9 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
 
 
 def run(directory: Path) -> list[ChartFinding]:
-    """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises InputError."""
+    """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises
+    InputError.
+    """
     findings = [rapp(directory, sensor) for sensor in SENSORS]
     findings += [
         chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 SEED = 1
 ZOOM_PX = 160
 STRETCH_PERCENT = (1, 99.8)
-# From black to white, in sigmas of the sky's noise: at least, and at most where a body fills pixels.
+# From black to white, in sigmas of the sky's noise: at least, and at most where a body fills
+# pixels.
 MIN_SIGMAS, MAX_SIGMAS = 10.0, 300.0
 HEIGHT_INCH = 8.4
 PUBLISHED = "_as_published"
@@ -41,7 +42,9 @@ FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.1
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A field before a camera: stem of its files, title, and star of its zoom (None: the brightest)."""
+    """A field before a camera: stem of its files, title, and star of its zoom (None: the
+    brightest).
+    """
 
     stem: str
     title: str
@@ -72,7 +75,9 @@ def run(
     file: BenchFile | None = None,
     radec_roll_deg: tuple[float, float, float] | None = None,
 ) -> list[str]:
-    """Write each scene's figure, images (FITS) and truth (CSV); a line for each. Raises InputError."""
+    """Write each scene's figure, images (FITS) and truth (CSV); a line for each. Raises
+    InputError.
+    """
     if file is not None:
         chosen = fields_of(radec_roll_deg)
         return [_output(directory, file, Scene(field.stem, f"{field.name}, {file.path.name}", field)) for field in chosen]

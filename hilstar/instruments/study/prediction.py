@@ -1,10 +1,12 @@
-"""Pointing error at the moment of light against latency and against the rate of packets, by predictor, and their times.
+"""Pointing error at the moment of light against latency and against the rate of packets, by
+predictor, and their times.
 
-The slew is a swing of degrees, shaken on each axis (`predictors.py`). A frame at time t has the samples taken before
+The slew is a swing of degrees, shaken on each axis (`predictors.py`). A frame at time t has the
+samples taken before
 t minus the latency, which covers link, drawing and scan-out.
 
-Then the prediction of a vibration beside a steady turn, against its frequency: by the rate, with `prediction = "auto"`, and for
-the newest attitude alone.
+Then the prediction of a vibration beside a steady turn, against its frequency: by the rate, with
+`prediction = "auto"`, and for the newest attitude alone.
 """
 
 import math
@@ -59,7 +61,9 @@ Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class PredictionOutcome:
-    """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one attitude, us."""
+    """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one
+    attitude, us.
+    """
 
     method: str
     rate_hz: int
@@ -70,7 +74,9 @@ class PredictionOutcome:
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Measure, and write `prediction.csv` and its chart; a line for each method. Raises InputError."""
+    """Measure, and write `prediction.csv` and its chart; a line for each method. Raises
+    InputError.
+    """
     span_s, outcomes, others = QUICK_SPAN_S if quick else SPAN_S, [], OtherWork()
     # Over latency at the usual rate, and over rate at the usual latency.
     for hz, ms in sorted({(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}):
@@ -109,7 +115,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 @dataclass(frozen=True, slots=True)
 class Shaken:
-    """A vibration by one way of prediction: the amplitude shown and the error (rms), as shares of the true ones."""
+    """A vibration by one way of prediction: the amplitude shown and the error (rms), as shares
+    of the true ones.
+    """
 
     way: str
     packets: str
@@ -121,7 +129,8 @@ class Shaken:
 
 
 def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool) -> tuple[float, float]:
-    """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of the vibration's own.
+    """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of
+    the vibration's own.
 
     "newest" stands still between packets; the steady turn is known to it.
     """
@@ -162,7 +171,9 @@ def auto_times(found: list[Shaken]) -> float:
 
 
 def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
-    """The frequency above which the newest attitude is nearer than one predicted by its rate; infinite for none."""
+    """The frequency above which the newest attitude is nearer than one predicted by its rate;
+    infinite for none.
+    """
     mine = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
     by = {way: [s.residual for s in mine if s.way == way] for way in WAYS}
     worse_by = np.array(by["rate"]) - np.array(by["newest"])

@@ -1,4 +1,6 @@
-"""A slew shaken on each axis, and the predictors that carry its samples on to the moment of light."""
+"""A slew shaken on each axis, and the predictors that carry its samples on to the moment of
+light.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +19,8 @@ from hilstar.server.bench.config import AttitudeSettings
 
 ORION = from_radec_roll_deg(84.057, -1.2, 10.0)
 SLEW_DEG, SLEW_S = 3.0, 20.0
-# Jitter per axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
+# Jitter per axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small
+# satellite.
 JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
 RATE_STEP_NS = 100_000
 NEAR = 4  # samples that a predictor has
@@ -29,7 +32,9 @@ AttitudeAt = Callable[[int], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Predictor:
-    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits` end after that time."""
+    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits`
+    end after that time.
+    """
 
     name: str
     load: Callable[[Sequence[AttitudeSample]], AttitudeAt]
@@ -38,7 +43,9 @@ class Predictor:
 
 
 def predictors() -> tuple[Predictor, ...]:
-    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it, fed with rates."""
+    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it,
+    fed with rates.
+    """
     settings = AttitudeSettings()
     own = Policy(round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS))
     hold = Policy(0, own.stale_after_ns)
@@ -53,7 +60,9 @@ def predictors() -> tuple[Predictor, ...]:
 
 
 def slew_attitude(t_ns: int) -> FloatArray:
-    """The true q_icrs_to_cam: three turns about the camera's axes on ORION, each a slow swing and a fast jitter."""
+    """The true q_icrs_to_cam: three turns about the camera's axes on ORION, each a slow swing
+    and a fast jitter.
+    """
     t_s = t_ns / NS_PER_S
     return shaken(ORION, t_s, [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)])
 
@@ -71,14 +80,17 @@ def shaken(q_icrs_to_cam: FloatArray, t_s: float, angles_rad: Sequence[float] = 
 
 
 def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
-    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec predicted."""
+    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz,
+    0.0003 arcsec predicted.
+    """
     before, after = attitude(t_ns - RATE_STEP_NS), attitude(t_ns + RATE_STEP_NS)
     return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
 
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it is `shaken`, JITTER on it.
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it
+    is `shaken`, JITTER on it.
 
     A camera at rest is not shaken.
     """

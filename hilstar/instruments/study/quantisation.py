@@ -1,4 +1,6 @@
-"""The methods from light to levels: flux and centroid errors against magnitude, and against time."""
+"""The methods from light to levels: flux and centroid errors against magnitude, and against
+time.
+"""
 
 from contextlib import ExitStack
 from functools import partial
@@ -65,7 +67,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
-    """The median time of drawing STARS stars and reading their levels back, ms, by bits and way; the ways in turn."""
+    """The median time of drawing STARS stars and reading their levels back, ms, by bits and way;
+    the ways in turn.
+    """
     sprites = codes.star_field(codes.FRAME_PX, USUAL_PSF.footprint_px)
     times: dict[tuple[int, str], float] = {}
 

@@ -65,7 +65,9 @@ class ChartFinding:
 
 @dataclass(frozen=True, slots=True)
 class FieldRatios:
-    """The stars (n,) of a field, and the electrons of each by its spectrum over the average model's."""
+    """The stars (n,) of a field, and the electrons of each by its spectrum over the average
+    model's.
+    """
 
     field: Field
     star: npt.NDArray[np.intp]

@@ -1,4 +1,6 @@
-"""Shared by studies: their benches, the optics of the brightness studies, and stars that stand alone in an image."""
+"""Shared by studies: their benches, the optics of the brightness studies, and stars that stand
+alone in an image.
+"""
 
 import json
 import math
@@ -39,7 +41,9 @@ def bench_text(tables: Mapping[str, Table]) -> str:
 
 
 def study_bench(path: Path, tables: Mapping[str, Table]) -> Bench:
-    """The bench of `bench_text`, whose file is written to `path`. Raises InputError or MachineError."""
+    """The bench of `bench_text`, whose file is written to `path`. Raises InputError or
+    MachineError.
+    """
     path.write_text(bench_text(tables), encoding="utf-8")
     return load(path)
 
@@ -50,7 +54,9 @@ def study_optics(sensor: str) -> Optics:
 
 
 def held_out_errors(rates: FloatArray) -> FloatArray:
-    """Relative error (m,) of each library star's rate by a table fitted to the others, each star held out in turn."""
+    """Relative error (m,) of each library star's rate by a table fitted to the others, each star
+    held out in turn.
+    """
     library = load_library()
     errors = np.empty(len(rates))
     for k in range(len(rates)):
@@ -62,7 +68,9 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
 
 
 def held_out_by_type(rates: FloatArray) -> FloatArray:
-    """Relative error (2m,) of each spectrum's rate by type, over `bare_and_dusty`; each star is held out with its dusty one."""
+    """Relative error (2m,) of each spectrum's rate by type, over `bare_and_dusty`; each star is
+    held out with its dusty one.
+    """
     library = bare_and_dusty()
     kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
     count, errors = len(rates) // 2, np.empty(len(rates))
@@ -78,7 +86,9 @@ def held_out_by_type(rates: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """Margin of a window around a star's sprites, px, and the share of its light that other stars may add there."""
+    """Margin of a window around a star's sprites, px, and the share of its light that other
+    stars may add there.
+    """
 
     margin_px: float
     max_share: float
@@ -87,9 +97,11 @@ class Isolation:
 def lone_windows(
     sprites: Sprites, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], isolation: Isolation
 ) -> Iterator[tuple[int, Window]]:
-    """Each isolated star whose window lies on an image of `size_px` (width, height), with that window.
+    """Each isolated star whose window lies on an image of `size_px` (width, height), with that
+    window.
 
-    `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and columns.
+    `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and
+    columns.
     """
     light, (width, height), margin = sprites.data["electrons_per_s"], size_px, isolation.margin_px
     for star in np.unique(sprites.star):
@@ -104,7 +116,9 @@ def lone_windows(
 
 
 def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
-    """The windows of an image, each alone in the middle of a square as wide as the widest: (n, side, side), side odd."""
+    """The windows of an image, each alone in the middle of a square as wide as the widest: (n,
+    side, side), side odd.
+    """
     side = max(part.stop - part.start for window in windows for part in window) | 1
     found = np.zeros((len(windows), side, side))
     for square, window in zip(found, windows, strict=True):
@@ -116,7 +130,9 @@ def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class StarError:
-    """The error of a shown star: light, mag (positive: too faint), and centroid, px; NaN where it is dark."""
+    """The error of a shown star: light, mag (positive: too faint), and centroid, px; NaN where
+    it is dark.
+    """
 
     flux_mag: float
     centroid_px: float

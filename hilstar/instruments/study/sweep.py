@@ -1,7 +1,8 @@
-"""Methods side by side: their times in turn, the front of error against time, and how busy the machine was meanwhile.
+"""Methods side by side: their times in turn, the front of error against time, and how busy the
+machine was meanwhile.
 
-Works are timed in rounds, so that other load on the machine is in the times of all of them. On a busy machine no time says
-which method is faster, so a study also notes the load by others.
+Works are timed in rounds, so that other load on the machine is in the times of all of them. On a
+busy machine no time says which method is faster, so a study also notes the load by others.
 """
 
 import math
@@ -23,7 +24,9 @@ from hilstar.basics.charts import capital
 MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
 MAX_ROUNDS = 500  # more do not move a median
 SEED = 1
-BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores
+# share of the cores taken by others above which times are 5 % and more off: a third of one of two
+# cores
+BUSY_SHARE = 0.15
 STAT = Path("/proc/stat")
 NOT_JUDGED = "the times were taken on a busy machine: none is named the faster"
 
@@ -88,8 +91,9 @@ def spent(work: Callable[[], object]) -> Spent:
 def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf) -> dict[str, list[Spent]]:
     """The times of at most `rounds` calls of each work, which is given the number of its round.
 
-    Each round has an order of its own, so that no work always follows the same one. A work that has had `share_s` skips the
-    rounds after MIN_ROUNDS. Round 0 is not counted: it compiles shaders and fills caches.
+    Each round has an order of its own, so that no work always follows the same one. A work that has
+    had `share_s` skips the rounds after MIN_ROUNDS. Round 0 is not counted: it compiles shaders and
+    fills caches.
     """
     times: dict[str, list[Spent]] = {name: [] for name in works}
     names, rng = list(works), np.random.default_rng(SEED)
@@ -117,7 +121,9 @@ def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
 
 
 def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
-    """Which methods (n,) no other beats, by error and time; two that are equal in both are both on the front."""
+    """Which methods (n,) no other beats, by error and time; two that are equal in both are both
+    on the front.
+    """
     return np.asarray(~beaten_by(errors, times_ms).any(axis=1))
 
 
@@ -132,11 +138,13 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A method: its error and a second figure, in the units of its `Trials`, and the work that is timed.
+    """A method: its error and a second figure, in the units of its `Trials`, and the work that is
+    timed.
 
-    `more` are further figures by the names of their columns. The others are measured against the exact one. `measured` adds
-    the median time and its quartiles, ms; `on_front` where no other is both as accurate and as fast; and in `beaten` the method
-    that beats the default, and why the default stays.
+    `more` are further figures by the names of their columns. The others are measured against the
+    exact one. `measured` adds the median time and its quartiles, ms; `on_front` where no other is
+    both as accurate and as fast; and in `beaten` the method that beats the default, and why the
+    default stays.
     """
 
     method: str
@@ -154,9 +162,11 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """All methods of a step. `work` names the timed work, `why_default` is the reason for the default where another beats it.
+    """All methods of a step. `work` names the timed work, `why_default` is the reason for the
+    default where another beats it.
 
-    `remark` is a caution that the figures alone would hide. `load` is what others took while it was timed.
+    `remark` is a caution that the figures alone would hide. `load` is what others took while it was
+    timed.
     """
 
     name: str
@@ -202,13 +212,17 @@ def measured(step: Trials, budget_s: float) -> Trials:
 
 
 class OtherWork:
-    """Counts the cores that other processes take from its creation on; children of this process are its own."""
+    """Counts the cores that other processes take from its creation on; children of this process
+    are its own.
+    """
 
     def __init__(self) -> None:
         self._before = self._times_s()
 
     def cores(self) -> float:
-        """How many cores the others took on average since creation; 0 where the system does not say."""
+        """How many cores the others took on average since creation; 0 where the system does not
+        say.
+        """
         all_s, others_s = (now - before for now, before in zip(self._times_s(), self._before, strict=True))
         return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
 
@@ -218,7 +232,9 @@ class OtherWork:
 
     @staticmethod
     def _times_s() -> tuple[float, float]:
-        """Processor time since the machine started, s: of all cores, idle or busy, and that of other processes."""
+        """Processor time since the machine started, s: of all cores, idle or busy, and that of
+        other processes.
+        """
         try:
             ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
         except (OSError, ValueError):

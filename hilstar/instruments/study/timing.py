@@ -1,11 +1,14 @@
-"""The study of timing: the effect of a screen's timing on a slewing tracker, and the gain and cost of each compensation.
+"""The study of timing: the effect of a screen's timing on a slewing tracker, and the gain and cost
+of each compensation.
 
-The virtual tracker integrates over several frames of a simulated panel, which lights row by row and holds each row until it is
-written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
-the stars of one exposure see the whole beat. The beat is compared with the prediction of `run.sync`.
+The virtual tracker integrates over several frames of a simulated panel, which lights row by row and
+holds each row until it is written again. Its image is compared with that of the sky in the same
+exposure, star by star. Each row is at its own phase, so the stars of one exposure see the whole
+beat. The beat is compared with the prediction of `run.sync`.
 
-Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and without noise, the glow of the
-black level shows each row's light, and lines are `run.sync`'s at each row's own phase.
+Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and
+without noise, the glow of the black level shows each row's light, and lines are `run.sync`'s at
+each row's own phase.
 """
 
 import math
@@ -100,7 +103,8 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
     config, x, y = file.config, np.zeros(STRIPE_ROWS)[::EVERY_ROWS], np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
     geometry = BenchGeometry(bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent))
     screen_late_s = scan_of(config.monitor).late_s(*geometry.to_monitor(x, y), config.monitor.resolution_px)
-    late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)  # middle rows begin together
+    # middle rows begin together
+    late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)
     foretold = seen_at(Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3), late).light
     return [
         StripePoint(case.refreshes, case.lit_ms, int(y[row]), float(light[0][row] / light[1][row]), float(foretold[row]))
@@ -116,7 +120,9 @@ def stripe_findings(directory: Path) -> list[str]:
 
 
 def stripe_depth(points: list[StripePoint], whole: bool) -> float:
-    """The largest departure of a row from the mean light, of exposures of whole refreshes or others."""
+    """The largest departure of a row from the mean light, of exposures of whole refreshes or
+    others.
+    """
     depth = 0.0
     for point in points:
         if float(point.refreshes).is_integer() == whole:
@@ -190,9 +196,11 @@ COST_ROUNDS = 9
 
 
 def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]) -> FloatArray:
-    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r); `rows` from 0 to 1.
+    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r);
+    `rows` from 0 to 1.
 
-    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one reaches it.
+    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one
+    reaches it.
     """
     begins = np.asarray(swaps_s)[:, None] + rows * scan.scanout_s
     ends = begins + scan.hold_s
@@ -201,7 +209,8 @@ def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s
 
 
 class ScanningPanel(Closing):
-    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`.
+    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of
+    it. Free it with `close`.
 
     Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
     """
@@ -228,7 +237,9 @@ class ScanningPanel(Closing):
         self.panel = self.bench.panel
 
     def attitude(self, movement: Movement, swap_s: float) -> Attitude:
-        """The attitude that the display derives from the packets received when it starts the frame of a swap."""
+        """The attitude that the display derives from the packets received when it starts the
+        frame of a swap.
+        """
         timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
         for sample in movement.samples(round((swap_s - DRAW_TO_SWAP_S) * NS_PER_S)):
             timeline.add(sample)
@@ -268,7 +279,9 @@ class ScanningPanel(Closing):
 
 
 class TimingSky(Closing):
-    """The same tracker's image of the sky itself, spread by the sprites' width. Free it with `close`."""
+    """The same tracker's image of the sky itself, spread by the sprites' width. Free it with
+    `close`.
+    """
 
     def __init__(self, shown: ScanningPanel) -> None:
         self._shown = shown
@@ -315,7 +328,8 @@ QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
 
 @dataclass(frozen=True, slots=True)
 class BeatPoint:
-    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after its row lights.
+    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after
+    its row lights.
 
     `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
     """
@@ -348,7 +362,8 @@ def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, mov
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
     paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
     windows = list(settings.lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
-    # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
+    # Where each star is on the monitor in the middle of the exposure, and just before and after:
+    # its row, and its speed.
     middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
     middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
     vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
@@ -419,7 +434,9 @@ def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) ->
 
 @dataclass(frozen=True, slots=True)
 class TimingOutcome:
-    """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error, mag, and drawing time, ms."""
+    """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error,
+    mag, and drawing time, ms.
+    """
 
     way: str
     rate_deg_s: float
@@ -454,7 +471,9 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a line each. Raises InputError."""
+    """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a
+    line each. Raises InputError.
+    """
     others = OtherWork()
     outcomes = measure(quick)
     load = others.load()

@@ -1,7 +1,8 @@
-"""Each fault of a scenario in the twin: shown alone in a field on which it falls, and taken as what it adds to that field.
+"""Each fault of a scenario in the twin: shown alone in a field on which it falls, and taken as what
+it adds to that field.
 
-What a fault should bring is what it adds to the linear image, through the same glass. A fault is asked for, so none of these
-figures is a reason against a bench.
+What a fault should bring is what it adds to the linear image, through the same glass. A fault is
+asked for, so none of these figures is a reason against a bench.
 """
 
 import math
@@ -41,10 +42,11 @@ WINDOW_SIGMAS = 6.0
 
 @dataclass(frozen=True, slots=True)
 class FaultSeen:
-    """A fault as the twin's tracker sees it: electrons that it should add in an exposure, and those that it adds.
+    """A fault as the twin's tracker sees it: electrons that it should add in an exposure, and those
+    that it adds.
 
-    `flux_mag` is how many magnitudes too faint it is, `off_px` how far from its place, tracker px (of a wrong attitude: the
-    stars' median); None where there is no such figure. `note` says why.
+    `flux_mag` is how many magnitudes too faint it is, `off_px` how far from its place, tracker px
+    (of a wrong attitude: the stars' median); None where there is no such figure. `note` says why.
     """
 
     name: str
@@ -58,7 +60,9 @@ class FaultSeen:
 
 @dataclass(frozen=True, slots=True)
 class _Shot:
-    """A field in tracker pixels: mean electrons (h, w) of its linear image, and of the monitor as it is; and its frame."""
+    """A field in tracker pixels: mean electrons (h, w) of its linear image, and of the monitor
+    as it is; and its frame.
+    """
 
     asked_e: FloatArray
     shown_e: FloatArray
@@ -139,7 +143,9 @@ class FaultyFields:
         return None
 
     def _place_px(self, fault: Fault, frame: Frame) -> FloatArray | None:
-        """The tracker pixel of a point, or of a star that is not there, from the truth of a frame."""
+        """The tracker pixel of a point, or of a star that is not there, from the truth of a
+        frame.
+        """
         if isinstance(fault, StarGone):
             toward = self._view.star_direction(fault)
             rows = np.flatnonzero((self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14)

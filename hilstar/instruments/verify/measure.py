@@ -1,10 +1,12 @@
-"""The comparison: each star that the twin sees against itself in the image of the sky, and the geometry that explains the rest.
+"""The comparison: each star that the twin sees against itself in the image of the sky, and the
+geometry that explains the rest.
 
-The smallest model that explains where stars are shown is fitted by least squares. A star of direction d is drawn where the
-assumed lens has it, and seen at d', from where the true lens shows that place. So d is a polynomial of d', in focal lengths
-from the middle of the detector: d = z d' (1 + k1 r'^2 + ...) + shift for a true lens where an ideal one is assumed, whatever
-their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars too close for the tracker to separate
-(blends) count as one, at the centroid of their light.
+The smallest model that explains where stars are shown is fitted by least squares. A star of
+direction d is drawn where the assumed lens has it, and seen at d', from where the true lens shows
+that place. So d is a polynomial of d', in focal lengths from the middle of the detector: d = z d'
+(1 + k1 r'^2 + ...) + shift for a true lens where an ideal one is assumed, whatever their size; the
+screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars too close for the tracker to
+separate (blends) count as one, at the centroid of their light.
 """
 
 import itertools
@@ -43,9 +45,11 @@ from hilstar.tracker.centroids import Centroids, estimate_background, find_stars
 
 MIN_RESIDUALS = 3  # to an unknown
 MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
-# A model explains a field where no larger one leaves much less: a quarter, and a tenth of the limit, beyond the best.
+# A model explains a field where no larger one leaves much less: a quarter, and a tenth of the
+# limit, beyond the best.
 ENOUGH, ENOUGH_OF_LIMIT = 1.25, 0.1
-TRIMS, WILD = 3, 6.0  # a star that is off by more than 6 medians and the limit is left out: 1e-11 of Gaussian errors are
+# a star that is off by more than 6 medians and the limit is left out: 1e-11 of Gaussian errors are
+TRIMS, WILD = 3, 6.0
 ALIGNED, LENS, TILT, HIGHER, DECENTRED = "aligned", "lens", "tilt", "higher", "decentred"
 MODELS = (
     (ALIGNED,),
@@ -55,11 +59,12 @@ MODELS = (
     (ALIGNED, TILT, LENS, HIGHER),
     (ALIGNED, TILT, LENS, HIGHER, DECENTRED),
 )
-# Two equal Gaussians have one peak up to 2 sigmas, and a faint one disappears beside a bright one farther out. The windowed
-# centroid of a pair is off the centre of its light by 0.02 sigma at 1 sigma, 0.06 at 1.4
-# (tests/unit/instruments/simulate/test_blends.py).
+# Two equal Gaussians have one peak up to 2 sigmas, and a faint one disappears beside a bright one
+# farther out. The windowed centroid of a pair is off the centre of its light by 0.02 sigma at 1
+# sigma, 0.06 at 1.4 (tests/unit/instruments/simulate/test_blends.py).
 BLEND_SIGMAS = 1.5
-# The glow that a missing black level adds is noticed at this share of the faintest drawn star's light, per pixel of its disc.
+# The glow that a missing black level adds is noticed at this share of the faintest drawn star's
+# light, per pixel of its disc.
 BLACK_SHARE = 0.1
 MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 
@@ -68,10 +73,11 @@ MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 class GeometryFit:
     """The smallest sufficient model of the displacements, as true minus assumed.
 
-    Scale, rotation about the detector's middle and shift, and where the displacements ask for them the screen's tilt about its
-    x and y axes and the lens, k1 of its tangents; `tilt_px` and `distortion_px` are the largest displacements by these.
-    `left` is the share of the mean square that is not explained, corrected for the number of unknowns, `left_px` what 95 % of
-    the stars are within of the model.
+    Scale, rotation about the detector's middle and shift, and where the displacements ask for them
+    the screen's tilt about its x and y axes and the lens, k1 of its tangents; `tilt_px` and
+    `distortion_px` are the largest displacements by these. `left` is the share of the mean square
+    that is not explained, corrected for the number of unknowns, `left_px` what 95 % of the stars
+    are within of the model.
     """
 
     scale_error: float
@@ -86,9 +92,11 @@ class GeometryFit:
 
 
 def fit_geometry(rows: FloatArray, tracker: Camera, limit_px: float) -> GeometryFit | None:
-    """The smallest model by least squares of stars (n, 4); None with too few. `limit_px` is what a centroid is allowed.
+    """The smallest model by least squares of stars (n, 4); None with too few. `limit_px` is what a
+    centroid is allowed.
 
-    A row has a star's place on the detector, px, and how far from it, right and down, the display shows it.
+    A row has a star's place on the detector, px, and how far from it, right and down, the display
+    shows it.
     """
     if len(rows) < MIN_STARS:
         return None
@@ -129,7 +137,9 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class _MotionFit:
-    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them leave."""
+    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them
+    leave.
+    """
 
     found: dict[str, FloatArray]
     moved: dict[str, FloatArray]
@@ -180,11 +190,13 @@ def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> Geometry
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """One star at its place on the tracker, px: errors of the display, + too faint, right and down, magnitudes and px.
+    """One star at its place on the tracker, px: errors of the display, + too faint, right and down,
+    magnitudes and px.
 
-    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN where that star would
-    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky. A body has a
-    `name`, and 0 for `hip`.
+    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN
+    where that star would
+    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue
+    and sky. A body has a `name`, and 0 for `hip`.
     """
 
     hip: int
@@ -205,11 +217,13 @@ class Star:
 class MatchTally:
     """Stars by what became of them, added up over the fields.
 
-    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` has the rows (`fit_geometry`)
-    of the stars that the display really shows, however far off. `vanished` counts how many fewer are found than the sky has,
-    `mirrored` those found where a screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
-    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`, `channels_mag` how much too faint
-    each channel is of those whose colour the primaries have; there are `out_of_gamut` others.
+    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced`
+    has the rows (`fit_geometry`) of the stars that the display really shows, however far off.
+    `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
+    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
+    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`,
+    `channels_mag` how much too faint each channel is of those whose colour the primaries have;
+    there are `out_of_gamut` others.
     """
 
     stars: list[Star] = field(default_factory=list)
@@ -231,7 +245,9 @@ class MatchTally:
 
 @dataclass(frozen=True, slots=True)
 class GlowFit:
-    """The light of the screen's black level in a tracker pixel, electrons per second: as assumed, as seen, and their limit."""
+    """The light of the screen's black level in a tracker pixel, electrons per second: as
+    assumed, as seen, and their limit.
+    """
 
     assumed_e_per_s_px: float
     seen_e_per_s_px: float
@@ -240,10 +256,12 @@ class GlowFit:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
+    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are
+    drawn as discs.
 
-    `stars_a_field` is how many stars of the bench are in the tracker's field on average. `calibration` is the one that the
-    bench assumes; `true_calibration` is the monitor's own, where it is another.
+    `stars_a_field` is how many stars of the bench are in the tracker's field on average.
+    `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where
+    it is another.
     """
 
     field_count: int
@@ -261,14 +279,18 @@ class Measured:
 
 
 class GlassEffect(NamedTuple):
-    """What the file of a tracker's PSF does to stars, at 95 %: px from chief ray to centroid, and mag of vignetting."""
+    """What the file of a tracker's PSF does to stars, at 95 %: px from chief ray to centroid,
+    and mag of vignetting.
+    """
 
     px: float
     mag: float
 
 
 def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
-    """The effect of a glass on stars where they are; None for a PSF that is the same everywhere, and without a star."""
+    """The effect of a glass on stars where they are; None for a PSF that is the same everywhere,
+    and without a star.
+    """
     if not isinstance(psf, GlassPsf) or not stars:
         return None
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
@@ -278,7 +300,8 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
 
 
 def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
-    """The field with each star that stands within BLEND_SIGMAS of a brighter one (of `psf`, the tracker's) added to that.
+    """The field with each star that stands within BLEND_SIGMAS of a brighter one (of `psf`, the
+    tracker's) added to that.
 
     The brighter one keeps its name; its light, magnitude and places become those of the sum.
     """
@@ -303,7 +326,9 @@ def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
 
 
 def _owners(places: FloatArray, light: FloatArray) -> IntArray:
-    """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a brighter one."""
+    """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a
+    brighter one.
+    """
     owner, near = np.arange(len(light)), defaultdict[int, list[int]](list)
     a, b, _ = neighbours(places, places, BLEND_SIGMAS)
     for star, other in np.stack([a, b], axis=1)[a != b].tolist():
@@ -370,7 +395,9 @@ class Comparison:
                 off.append(abs(magnitude(float(there[part].sum() / sky[part].sum()))))
 
     def measured(self) -> Measured:
-        """All that was measured so far, with what a verdict has to know of the bench. Raises InputError (see `true_panel`)."""
+        """All that was measured so far, with what a verdict has to know of the bench. Raises
+        InputError (see `true_panel`).
+        """
         bench, name = self.twin.bench, self.twin.config.verify.true_calibration
         return Measured(
             field_count=self.field_count,
@@ -405,7 +432,9 @@ class Comparison:
         )
 
     def _stars(self, seen: TwinField, k: IntArray, images: tuple[Matched, Matched, Matched]) -> list[Star]:
-        """Rows of the stars `k` (n,), from the images of the sky, of the display, and of one that is as assumed."""
+        """Rows of the stars `k` (n,), from the images of the sky, of the display, and of one
+        that is as assumed.
+        """
         sky, shown, assumed = images
         rows, places = seen.truth[k], (seen.x_px[k], seen.y_px[k])
         codes_mag, *codes_px = assumed.against(sky, k)
@@ -426,7 +455,9 @@ class Comparison:
         return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf) | by_disc)
 
     def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
-        """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
+        """Find each star where the true lens shows it, and note how far that is from where the
+        sky has it.
+        """
         geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
         match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
         k = np.flatnonzero(wanted & (match >= 0) & ~shared(match))
@@ -444,7 +475,8 @@ class Comparison:
     def _measure_noisy(self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]) -> None:
         """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
         under = estimate_background(dn, 1.0)
-        if under.noise <= 1 / math.sqrt(12):  # rounding's: most of the image may be clipped at 0 DN, beside a glow
+        # rounding's: most of the image may be clipped at 0 DN, beside a glow
+        if under.noise <= 1 / math.sqrt(12):
             under = noisiest_background(dn)
         windowed = find_stars(dn, self.finder.settings, under)
         match, true_px = nearest(windowed, seen.x_px, seen.y_px), (seen.x_px, seen.y_px)
@@ -476,6 +508,8 @@ class Comparison:
 
 
 def on_screen_median(glow_e_per_s: FloatArray) -> float:
-    """The median over the detector's pixels that see the screen; 0 where the screen's black has no light."""
+    """The median over the detector's pixels that see the screen; 0 where the screen's black has
+    no light.
+    """
     lit = glow_e_per_s[glow_e_per_s > 0]
     return float(np.median(lit)) if len(lit) else 0.0

@@ -1,8 +1,10 @@
-"""The change of a bench file that makes a failing bench pass: each one is tried on the twin, the fewest keys first.
+"""The change of a bench file that makes a failing bench pass: each one is tried on the twin, the
+fewest keys first.
 
-A change is proposed only if the bench file with it is read, drawn and passes over the same fields. Among as many keys, those
-come first that cost time alone (`quantisation`, `bit_stealing`), then the one that clips bright stars, then the one that drops
-faint ones. Of magnitudes the largest change is tried first, and the smallest that passes is proposed.
+A change is proposed only if the bench file with it is read, drawn and passes over the same fields.
+Among as many keys, those come first that cost time alone (`quantisation`, `bit_stealing`), then the
+one that clips bright stars, then the one that drops faint ones. Of magnitudes the largest change is
+tried first, and the smallest that passes is proposed.
 
 What a proposal says to a person, and the bench file with it.
 """
@@ -61,10 +63,11 @@ class Verified:
 
 @dataclass(frozen=True, slots=True)
 class BenchProposal:
-    """The changes that make a bench pass, with what the twin said of it so changed; the fields are keys of the JSON object.
+    """The changes that make a bench pass, with what the twin said of it so changed; the fields are
+    keys of the JSON object.
 
-    `changes` is empty where none passes: then `verified` is of the best of those that were tried (None without any), `best` is
-    that one, and `cannot` says what cannot be met.
+    `changes` is empty where none passes: then `verified` is of the best of those that were tried
+    (None without any), `best` is that one, and `cannot` says what cannot be met.
     """
 
     changes: tuple[KeyProposal, ...]
@@ -90,7 +93,8 @@ class _Key:
 def propose(
     file: BenchFile, verdict: Verdict, fields: int, seed: int, on_try: Callable[[int], None] = lambda tried: None
 ) -> BenchProposal:
-    """The fewest changes with which the bench of `file`, judged as `verdict`, passes over the same fields.
+    """The fewest changes with which the bench of `file`, judged as `verdict`, passes over the same
+    fields.
 
     `on_try` hears how many changes have been tried. Raises MachineError where the twin does.
     """
@@ -107,7 +111,8 @@ def propose(
             changes = tuple(key.at(-1) for key in chosen)
             if not trials.passes(changes):
                 continue
-            for place in reversed(range(count)):  # each brought to its mildest value that passes, the last key first
+            # each brought to its mildest value that passes, the last key first
+            for place in reversed(range(count)):
                 for step in range(len(chosen[place].values) - 1):
                     milder = (*changes[:place], chosen[place].at(step), *changes[place + 1 :])
                     if trials.passes(milder):
@@ -141,7 +146,9 @@ def codes_at_fault(verdict: Verdict) -> bool:
 
 
 def _not_the_codes(verdict: Verdict) -> str | None:
-    """The first limit that is exceeded even without the codes' share (errors add in squares); None if all are met."""
+    """The first limit that is exceeded even without the codes' share (errors add in squares);
+    None if all are met.
+    """
     limits, errors = verdict.measured.config.verify, verdict.errors
     wide = verdict.measured.star.fault()
     if wide is not None:
@@ -185,7 +192,9 @@ class _Trials:
 
 
 def _keys(verdict: Verdict) -> list[_Key]:
-    """The keys that a bench's calibration and settings leave to change, those that cost least first."""
+    """The keys that a bench's calibration and settings leave to change, those that cost least
+    first.
+    """
     measured = verdict.measured
     render = measured.config.render
     calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
@@ -195,7 +204,8 @@ def _keys(verdict: Verdict) -> list[_Key]:
     if render.flux_at_white_e_per_s is None:  # a measured scale is not changed
         brightest = DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
         keys.append(_Key("render", "brightest_v_mag", tuple(round(brightest + step, 3) for step in BRIGHTER_MAG)))
-    # Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that were looked for.
+    # Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that
+    # were looked for.
     v_mag = np.array([star.v_mag for star in verdict.errors.stars + verdict.errors.lost])
     seen = math.ceil(float(v_mag.max()) * STEPS_PER_MAG) / STEPS_PER_MAG
     faintest = (round(min(measured.config.sky.faintest_v_mag, seen) + step, 3) for step in FAINTER_MAG)
@@ -255,14 +265,17 @@ def check_writable(file: BenchFile) -> None:
         raise cannot_write(file.path, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise cannot_write(file.path, "it is no regular file", "leave --write out, and change the file yourself")
-    # Root may write what nobody should: a file without any write permission was protected by somebody.
+    # Root may write what nobody should: a file without any write permission was protected by
+    # somebody.
     protected = not status.st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH)
     if protected or not os.access(file.path, os.W_OK):
         raise cannot_write(file.path, "it is read-only", "copy it, and verify the copy")
 
 
 def write_proposal(file: BenchFile, proposal: BenchProposal) -> None:
-    """Make the changes in the bench file. Raises InputError where it cannot be written, or has changed since it was read."""
+    """Make the changes in the bench file. Raises InputError where it cannot be written, or has
+    changed since it was read.
+    """
     check_writable(file)
     if read_text(file.path, "give the path of a bench file", MAX_TOML_BYTES) != file.text:
         raise InputError(f"{file.path}: has changed since it was read; run verify again")

@@ -1,4 +1,6 @@
-"""`hilstar verify`: the twin over random fields, its figures as JSON and text, the table of stars and the charts."""
+"""`hilstar verify`: the twin over random fields, its figures as JSON and text, the table of
+stars and the charts.
+"""
 
 import math
 from collections.abc import Callable
@@ -32,11 +34,13 @@ def verify(
     on_field: Callable[[int], None] = lambda done: None,
     scenario: Scenario | None = None,
 ) -> Verdict:
-    """Show `fields` random attitudes and judge the bench by them; then each fault of a scenario, which is only measured.
+    """Show `fields` random attitudes and judge the bench by them; then each fault of a scenario,
+    which is only measured.
 
     Raises InputError (see `Twin`, `FaultView.prepare`).
     """
-    # Separate streams: the noise draws a number of values that depends on the light, and all benches shall see the same fields.
+    # Separate streams: the noise draws a number of values that depends on the light, and all
+    # benches shall see the same fields.
     attitudes, noise, of_faults = rng.spawn(3)
     with Twin(file) as twin:
         comparison = Comparison(twin)
@@ -51,11 +55,13 @@ def verify(
 
 
 def summarise(verdict: Verdict) -> dict[str, Any]:
-    """The figures of a verdict by the keys of --json; centroids in tracker pixels, and arcsec in the middle of its field.
+    """The figures of a verdict by the keys of --json; centroids in tracker pixels, and arcsec in
+    the middle of its field.
 
-    They are as `centroider` finds the stars; `centroid_error_px_by` has those of each kind. `black_e_per_s_px` is the glow of
-    the screen's black, electrons per second in a tracker pixel; `estimator_floor` the estimator's own errors, of the linear
-    image against the catalogue; `codes_alone` those of the codes with all else as assumed; `noisy` the same with all of the
+    They are as `centroider` finds the stars; `centroid_error_px_by` has those of each kind.
+    `black_e_per_s_px` is the glow of the screen's black, electrons per second in a tracker pixel;
+    `estimator_floor` the estimator's own errors, of the linear image against the catalogue;
+    `codes_alone` those of the codes with all else as assumed; `noisy` the same with all of the
     detector's noise.
     """
     measured, errors = verdict.measured, verdict.errors
@@ -166,7 +172,9 @@ def _number(value: float | None) -> str:
 
 
 def write_report(directory: Path, verdict: Verdict) -> None:
-    """stars.csv, and the charts errors and field, each as PNG and SVG. Raises InputError where one cannot be written."""
+    """stars.csv, and the charts errors and field, each as PNG and SVG. Raises InputError where
+    one cannot be written.
+    """
     errors = verdict.errors
     write_csv(directory / "stars.csv", [entry.name for entry in fields(Star)], map(astuple, errors.stars + errors.lost))
     _draw_field(directory / "field", errors, verdict.measured.camera.resolution_px)

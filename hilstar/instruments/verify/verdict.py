@@ -1,4 +1,6 @@
-"""The verdict of a bench: the display's errors without their common zero point, the limits exceeded, and the likely causes."""
+"""The verdict of a bench: the display's errors without their common zero point, the limits
+exceeded, and the likely causes.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -11,18 +13,21 @@ from hilstar.display.quantisers import BY_COST
 from hilstar.instruments.verify.faulty_fields import FaultSeen
 from hilstar.instruments.verify.measure import GeometryFit, Measured, Star, fit_geometry
 
-# A fit that leaves more of the residuals' squares than this explains nothing: chance matches leave nearly all.
+# A fit that leaves more of the residuals' squares than this explains nothing: chance matches leave
+# nearly all.
 MAX_LEFT = 0.5
 # A cause is named where it accounts for more than this share of the stars.
 MIN_SHARE = 0.5
-MIN_EXPECTED = 10.0  # stars over all fields: with fewer, that none can be measured is chance or an empty sky
+# stars over all fields: with fewer, that none can be measured is chance or an empty sky
+MIN_EXPECTED = 10.0
 CURE = '; [verify] centroider = "psf" fits it, hilstar assess says which correction takes how much'
 MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
 
 
 @dataclass(frozen=True, slots=True)
 class DisplayErrors:
-    """The stars with their common zero point subtracted; `codes_zero_point_mag` is the one that the codes alone would have.
+    """The stars with their common zero point subtracted; `codes_zero_point_mag` is the one that the
+    codes alone would have.
 
     `lost` stars have NaN for errors; `geometry` is None with too few stars.
     """
@@ -39,7 +44,9 @@ class DisplayErrors:
         return len(self.stars) + len(self.lost)
 
     def of(self, name: str) -> FloatArray:
-        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose the star."""
+        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose
+        the star.
+        """
         return np.array([getattr(star, name) for star in self.stars])
 
     def centroid_px(self) -> FloatArray:
@@ -123,7 +130,9 @@ def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """The parts of the geometry that are off by more than the centroid limit somewhere in the field."""
+    """The parts of the geometry that are off by more than the centroid limit somewhere in the
+    field.
+    """
     fit, limit = errors.geometry, measured.config.verify.centroid_px
     if fit is None or fit.left > MAX_LEFT:
         return []
@@ -156,7 +165,9 @@ def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
 
 
 def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """Errors of the field's stars relative to each other, then the error that all have in common."""
+    """Errors of the field's stars relative to each other, then the error that all have in
+    common.
+    """
     verify, found = measured.config.verify, []
     limit = verify.flux_mag
     seen, alone = p95(np.abs(errors.of("flux_mag"))), p95(np.abs(errors.of("codes_mag")))
@@ -184,7 +195,9 @@ def _black(measured: Measured) -> list[str]:
 
 
 def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """The linear image against the catalogue: where that exceeds the limits, the differences above say nothing."""
+    """The linear image against the catalogue: where that exceeds the limits, the differences
+    above say nothing.
+    """
     limits = measured.config.verify
     mag, px = p95(np.abs(errors.of("floor_mag"))), p95(errors.of("floor_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
@@ -204,7 +217,9 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """The errors of the codes alone, with all else as assumed, and the keys that make codes finer."""
+    """The errors of the codes alone, with all else as assumed, and the keys that make codes
+    finer.
+    """
     limits, render = measured.config.verify, measured.config.render
     mag, px = p95(np.abs(errors.of("codes_mag"))), p95(errors.of("codes_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
@@ -220,7 +235,9 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The measurement, its errors, every reason against the bench, and the scenario's faults as they were seen."""
+    """The measurement, its errors, every reason against the bench, and the scenario's faults as
+    they were seen.
+    """
 
     measured: Measured
     errors: DisplayErrors

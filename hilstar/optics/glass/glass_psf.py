@@ -1,9 +1,10 @@
 """Stars through a tracker's glass: each by its place and its spectrum.
 
-A star's PSF is a sum of basis images, each by a weight that is smooth over the field (radial basis functions with polynomials
-up to the third degree), and over wavelength and focus (splines). All of it is linear, so flux, centroid and second moments
-are interpolated as the images are. What the pixels get at each place in a pixel is tabulated once, reduced again to few
-stamps, and these to quadratic functions of the place: stars whose places are alike are one product of matrices.
+A star's PSF is a sum of basis images, each by a weight that is smooth over the field (radial basis
+functions with polynomials up to the third degree), and over wavelength and focus (splines). All of
+it is linear, so flux, centroid and second moments are interpolated as the images are. What the
+pixels get at each place in a pixel is tabulated once, reduced again to few stamps, and these to
+quadratic functions of the place: stars whose places are alike are one product of matrices.
 """
 
 import dataclasses
@@ -30,12 +31,16 @@ from hilstar.optics.psf import (
 )
 from hilstar.optics.sprites import Sprites
 
-MAX_CUT = 3e-5  # share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4 px
-# A pixel is cut into squares in each of which a star's pixels are quadratic in its place. They are as many along a side as keep
-# what cubes would add in a row or column under CUBIC_TOLERANCE of a star's light, and fitted to up to MAX_STEPS steps each.
+# share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4
+# px
+MAX_CUT = 3e-5
+# A pixel is cut into squares in each of which a star's pixels are quadratic in its place. They are
+# as many along a side as keep what cubes would add in a row or column under CUBIC_TOLERANCE of a
+# star's light, and fitted to up to MAX_STEPS steps each.
 CUBIC_TOLERANCE, MIN_SQUARES, MAX_SQUARES = 6e-4, 3, 16
 MAX_STEPS, MIN_STEPS, TABLE_SIDE, PLACES_A_PX = 4, 2, 1024, 32
-# What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids and second moments are kept.
+# What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids
+# and second moments are kept.
 STAMP_TOLERANCE = 3e-4
 FIRST_STAMPS, MAX_STAMPS = 48, 400
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
@@ -56,7 +61,8 @@ class NodeSpline:
     """
 
     def __init__(self, nodes: FloatArray, max_degree: int = MAX_DEGREE) -> None:
-        from scipy.interpolate import make_interp_spline  # 0.2 s of every command that needs none of it
+        # 0.2 s of every command that needs none of it
+        from scipy.interpolate import make_interp_spline
 
         self._nodes, self._of = nodes, None
         self._middle, self._half = (nodes[-1] + nodes[0]) / 2, (nodes[-1] - nodes[0]) / 2 or 1.0
@@ -74,10 +80,11 @@ class NodeSpline:
 
 
 class Field:
-    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth between.
+    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth
+    between.
 
-    On a full grid they are products of splines, elsewhere radial basis functions with polynomials. Beyond the points' convex
-    hull they have the values of its nearest place.
+    On a full grid they are products of splines, elsewhere radial basis functions with polynomials.
+    Beyond the points' convex hull they have the values of its nearest place.
     """
 
     def __init__(self, places_px: FloatArray) -> None:
@@ -111,7 +118,9 @@ class Field:
         return sorted({int(along.argmin()), int(along.argmax())})
 
     def within(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 2) within the hull, the nearest for those beyond, and how far these are beyond it, px (n,)."""
+        """Places (n, 2) within the hull, the nearest for those beyond, and how far these are
+        beyond it, px (n,).
+        """
         places = np.stack([x_px, y_px], axis=1)
         beyond_px = np.zeros(len(places))
         begin, along = self.hull_px, np.roll(self.hull_px, -1, axis=0) - self.hull_px
@@ -154,10 +163,12 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """What pixels get: `stamps` (R, side^2), whose coefficients are polynomials of a star's place in its pixel.
+    """What pixels get: `stamps` (R, side^2), whose coefficients are polynomials of a star's place
+    in its pixel.
 
-    `parts` (squares, 6 K, R) are what basis images have of a stamp in each square of the pixel, rows first, by `_terms`.
-    `sums` (R,) are those of the stamps, and `light` (K, n) is what pixels get of basis images at all tabulated places.
+    `parts` (squares, 6 K, R) are what basis images have of a stamp in each square of the pixel,
+    rows first, by `_terms`. `sums` (R,) are those of the stamps, and `light` (K, n) is what pixels
+    get of basis images at all tabulated places.
     """
 
     stamps: Float32Array
@@ -168,9 +179,11 @@ class _Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Focused:
-    """A glass at one focus: `basis` (K, height, width), and by field point and wavelength the `weights` (F, L, K) of PSFs.
+    """A glass at one focus: `basis` (K, height, width), and by field point and wavelength the
+    `weights` (F, L, K) of PSFs.
 
-    These sum to 1. `illumination` (F, L) is relative to the axis, and `inside` (F, L) the share of it within the images.
+    These sum to 1. `illumination` (F, L) is relative to the axis, and `inside` (F, L) the share of
+    it within the images.
     """
 
     basis: FloatArray
@@ -187,9 +200,11 @@ class _Measured(SampledPsf):
 
 @dataclass(frozen=True, eq=False)
 class GlassPsf(SampledPsf):
-    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in the field's middle.
+    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in
+    the field's middle.
 
-    `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its own. Make it with `glass_psf`.
+    `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its
+    own. Make it with `glass_psf`.
     """
 
     optics: Focused = dataclasses.field(kw_only=True)
@@ -197,7 +212,8 @@ class GlassPsf(SampledPsf):
     mean_shares: FloatArray = dataclasses.field(kw_only=True)
     wavelengths_nm: FloatArray = dataclasses.field(kw_only=True)
     by_place, by_colour = True, True
-    max_negative = MAX_NEGATIVE  # stars keep what is negative: noise of a measured map then moves none on average
+    # stars keep what is negative: noise of a measured map then moves none on average
+    max_negative = MAX_NEGATIVE
 
     def __post_init__(self) -> None:
         """Refuse what is no PSF, the mean and each of the others."""
@@ -222,7 +238,9 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def footprint_px(self) -> int:
-        """The side of the smallest odd square outside which no PSF has more than MAX_CUT of its light."""
+        """The side of the smallest odd square outside which no PSF has more than MAX_CUT of its
+        light.
+        """
         count, height, width = self.optics.basis.shape
         y, x = np.indices((height, width))
         ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
@@ -248,7 +266,9 @@ class GlassPsf(SampledPsf):
         return self._parts(weights, *np.zeros((2, len(weights)))) @ self._stamps.stamps
 
     def _tabulated(self, steps: int) -> list[FloatArray]:
-        """What pixels of the footprint get of the basis' rows and columns: (steps + 1, side, samples), by place in a pixel."""
+        """What pixels of the footprint get of the basis' rows and columns: (steps + 1, side,
+        samples), by place in a pixel.
+        """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
         shape = self.optics.basis.shape[1:]
@@ -264,12 +284,15 @@ class GlassPsf(SampledPsf):
             line @ np.diff(table, 3, axis=0).swapaxes(1, 2)
             for line, table in zip(lines, self._tabulated(PLACES_A_PX), strict=True)
         ]
-        cubic = max(float(np.abs(one).max()) for one in each) * PLACES_A_PX**3 / 192  # over a square of 1 px, by Chebyshev's
+        # over a square of 1 px, by Chebyshev's
+        cubic = max(float(np.abs(one).max()) for one in each) * PLACES_A_PX**3 / 192
         return int(np.clip(math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE)), MIN_SQUARES, MAX_SQUARES))
 
     @cached_property
     def _stamps(self) -> _Stamps:
-        """The basis as pixels get it, tabulated by a star's place in its middle pixel and reduced to few stamps."""
+        """The basis as pixels get it, tabulated by a star's place in its middle pixel and
+        reduced to few stamps.
+        """
         side, squares = self.footprint_px, self._squares
         steps_a_square = min(MAX_STEPS, max(MIN_STEPS, min(TABLE_SIDE // side, MAX_STEPS * 6) // squares))
         steps, count = steps_a_square * squares, len(self.optics.basis)
@@ -293,7 +316,9 @@ class GlassPsf(SampledPsf):
         return _Stamps(stamps, parts.reshape(squares**2, -1, len(stamps)), stamps.sum(axis=1), light)
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
-        """How much stars at places (n,) have of each basis image (n, K); `shares` as in `of_stars`."""
+        """How much stars at places (n,) have of each basis image (n, K); `shares` as in
+        `of_stars`.
+        """
         by_field, shares = self.field(x_px, y_px).T.astype(np.float32), shares.T.astype(np.float32, order="C")
         by_point = by_field[:, None] * shares.reshape(shares.shape[0], -1)
         return np.asarray(by_point.reshape(len(self._light), -1).T @ self._light)
@@ -304,13 +329,17 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def _light(self) -> Float32Array:
-        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its illumination inside the image."""
+        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its
+        illumination inside the image.
+        """
         optics = self.optics
         found = optics.weights * (optics.illumination * optics.inside)[..., None]
         return np.asarray(found.reshape(-1, len(optics.basis)), dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
-        """What stars at places (n,), by square, that have `weights` (n, K) of the basis images have of each stamp (n, R)."""
+        """What stars at places (n,), by square, that have `weights` (n, K) of the basis images
+        have of each stamp (n, R).
+        """
         square, *within = _square(x_px, y_px, self._squares)
         terms, found = _terms(*within).astype(np.float32)[:, :, None], self._stamps.parts
         counts = np.bincount(square, minlength=self._squares**2)
@@ -332,7 +361,8 @@ class GlassPsf(SampledPsf):
         return np.asarray(self.optics.weights @ firsts / self.per_px)
 
     def centroids_px(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The centroids (n,) of the light of stars at places (n,), px, and their illumination relative to the axis.
+        """The centroids (n,) of the light of stars at places (n,), px, and their illumination
+        relative to the axis.
 
         What lies outside the images does not count. `shares` as in `of_stars`.
         """
@@ -349,7 +379,8 @@ class GlassPsf(SampledPsf):
     def of_stars(
         self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray, electrons_per_s: FloatArray | Float32Array
     ) -> Float32Array:
-        """The light of stars at places (n,) in squares of pixels (n, side, side) about the pixels nearest to them.
+        """The light of stars at places (n,) in squares of pixels (n, side, side) about the pixels
+        nearest to them.
 
         Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
         """
@@ -360,7 +391,9 @@ class GlassPsf(SampledPsf):
         return squares.reshape(-1, self.footprint_px, self.footprint_px)
 
     def _drawn(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """What pixels get of stars at places (n,), sorted by `_square`: (n, side^2), times factors (n,)."""
+        """What pixels get of stars at places (n,), sorted by `_square`: (n, side^2), times
+        factors (n,).
+        """
         weights = self._mixed(x_px, y_px, shares)
         parts = self._parts(weights, x_px, y_px)
         # Polynomials and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
@@ -368,7 +401,9 @@ class GlassPsf(SampledPsf):
         return parts @ self._stamps.stamps, np.asarray(light / np.where(whole > 0, whole, np.inf), dtype=np.float32)
 
     def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
-        """The same of stars of 1 electron per second, by the whole basis: exact, and some hundred times as slow."""
+        """The same of stars of 1 electron per second, by the whole basis: exact, and some
+        hundred times as slow.
+        """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2
         found = np.empty((len(x_px), side, side))
@@ -382,8 +417,11 @@ class GlassPsf(SampledPsf):
         return found
 
     def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
-        """The light of sprites (n,) in all pixels (height, width), electrons per second; `shares` as in `of_stars`."""
-        from scipy.sparse import csc_array  # as `NodeSpline`; its product takes half the time of `np.add.at`
+        """The light of sprites (n,) in all pixels (height, width), electrons per second;
+        `shares` as in `of_stars`.
+        """
+        # as `NodeSpline`; its product takes half the time of `np.add.at`
+        from scipy.sparse import csc_array
 
         side, (width, height) = self.footprint_px, resolution_px
         across = width + 2 * side
@@ -414,7 +452,9 @@ class GlassPsf(SampledPsf):
 
 
 def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPsf:
-    """A glass at one of its focus positions, or between them. Raises InputError for PSFs that cannot be drawn."""
+    """A glass at one of its focus positions, or between them. Raises InputError for PSFs that
+    cannot be drawn.
+    """
     at_focus = NodeSpline(glass.focuses_um)(np.array([focus_um]))[0]
     weights, illumination, inside = (
         np.tensordot(part, at_focus, axes=(2, 0)) for part in (glass.weights, glass.illumination, 1 - glass.outside)
@@ -437,7 +477,8 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
 
 
 def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[FloatArray, int]:
-    """PSFs (n, height, width) by other pixels, and their samples a pixel: `matrix` (2, 2) takes offsets in pixels to these.
+    """PSFs (n, height, width) by other pixels, and their samples a pixel: `matrix` (2, 2) takes
+    offsets in pixels to these.
 
     There are at least as many samples to the same length as before, and MIN_REGRIDDED to a pixel.
     """
@@ -461,12 +502,15 @@ def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
 
 
 def with_components(psf: GlassPsf, count: int) -> GlassPsf:
-    """A glass by so many basis images: the mean and the principal components of its PSFs' light. Each PSF still sums to 1."""
+    """A glass by so many basis images: the mean and the principal components of its PSFs' light.
+    Each PSF still sums to 1.
+    """
     optics = psf.optics
     flat, basis = optics.weights.reshape(-1, len(optics.basis)), optics.basis.reshape(len(optics.basis), -1)
     mean = flat.mean(axis=0)
     values, vectors = np.linalg.eigh(basis @ basis.T)
-    scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))  # its square is the metric of weights
+    # its square is the metric of weights
+    scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
     turned, sizes, components = np.linalg.svd((flat - mean) @ scale, full_matrices=False)
     kept = min(count - 1, int((sizes > 1e-9 * sizes[0]).sum()))
     images = np.vstack([mean, components[:kept] @ np.linalg.pinv(scale)]) @ basis
@@ -475,7 +519,9 @@ def with_components(psf: GlassPsf, count: int) -> GlassPsf:
 
 
 def as_gaussians(psf: GlassPsf) -> GlassPsf:
-    """A glass whose PSFs are Gaussians, each of its own axes and angle: the centroids, and widths by adaptive moments."""
+    """A glass whose PSFs are Gaussians, each of its own axes and angle: the centroids, and
+    widths by adaptive moments.
+    """
     optics, side = psf.optics, psf.footprint_px
     pixel = np.stack([part.ravel() for part in np.indices((side, side))[::-1]], axis=1) - side // 2
     _, height, width = optics.basis.shape
@@ -507,7 +553,8 @@ def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassP
 
 
 def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
-    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus needs fewer components.
+    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus
+    needs fewer components.
 
     Pixels have `width` samples, 1 where they are integrated.
     """
@@ -530,7 +577,9 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
 
 
 def _square(x_px: FloatArray, y_px: FloatArray, squares: int) -> tuple[IntArray, FloatArray, FloatArray]:
-    """In which square of its pixel each star (n,) is, and its place in it, -1 to 1 right and down."""
+    """In which square of its pixel each star (n,) is, and its place in it, -1 to 1 right and
+    down.
+    """
     at = [(place - np.floor(place + 0.5) + 0.5) * squares for place in (x_px, y_px)]
     column, row = (np.minimum(place.astype(np.intp), squares - 1) for place in at)
     return row * squares + column, 2 * (at[0] - column) - 1, 2 * (at[1] - row) - 1
@@ -542,7 +591,9 @@ def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> FloatArray:
-    """What pixels centred `at_px` (n,) along an axis get of each of `size` samples: (n, size), by `SampledPsf`'s spline."""
+    """What pixels centred `at_px` (n,) along an axis get of each of `size` samples: (n, size),
+    by `SampledPsf`'s spline.
+    """
     from scipy.interpolate import make_interp_spline
 
     each = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
@@ -556,15 +607,18 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
 
 
 def _normal_floats(values: FloatArray) -> Float32Array:
-    """Values in single precision, the smallest set to zero: products of subnormal numbers are slow."""
+    """Values in single precision, the smallest set to zero: products of subnormal numbers are
+    slow.
+    """
     return np.where(np.abs(values) < SMALLEST, 0, values).astype(np.float32)
 
 
 def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
-    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to STAMP_TOLERANCE.
+    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to
+    STAMP_TOLERANCE.
 
-    Flux, centroids and second moments are kept exactly. Random projections find the principal components of the rest (Halko,
-    Martinsson and Tropp 2011, algorithm 4.4), always the same.
+    Flux, centroids and second moments are kept exactly. Random projections find the principal
+    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same.
     """
     carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
     moments = table @ terms
@@ -587,7 +641,9 @@ def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
 
 
 def _orthonormal(columns: Float32Array | FloatArray) -> Float32Array:
-    """Orthonormal columns that span those given, by their products with each other: QR takes far longer on long ones."""
+    """Orthonormal columns that span those given, by their products with each other: QR takes far
+    longer on long ones.
+    """
     values, vectors = np.linalg.eigh((columns.T @ columns).astype(np.float64))
     good = values > 1e-9 * values[-1]
     return np.asarray(columns @ (vectors[:, good] / np.sqrt(values[good])), dtype=np.float32)

@@ -1,4 +1,6 @@
-"""A map of PSF images, measured or simulated, with a table of where each belongs, as a tracker's glass."""
+"""A map of PSF images, measured or simulated, with a table of where each belongs, as a tracker's
+glass.
+"""
 
 from pathlib import Path
 
@@ -44,7 +46,9 @@ def _images(path: Path) -> FloatArray:
 
 
 def _points(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Places (n, 4) in the order of AXES and facts (n, 4) in that of FACTS; what has no column or cell is not known."""
+    """Places (n, 4) in the order of AXES and facts (n, 4) in that of FACTS; what has no column
+    or cell is not known.
+    """
     more = (*AXES[2:], *FACTS)
     rows, defaults = [], [np.nan, 0.0, *facts_of(1)[0]]
     for line, cells in read_rows(path, AXES[:2], POINTS_ADVICE, MAX_CSV_BYTES, more):

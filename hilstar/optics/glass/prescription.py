@@ -1,12 +1,14 @@
-"""A glass from a lens's prescription: optiland traces it, and its rays become PSFs with diffraction.
+"""A glass from a lens's prescription: optiland traces it, and its rays become PSFs with
+diffraction.
 
-Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path + L (x - x_ray) +
-M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the angular spectrum, Goodman,
-Fourier Optics, section 3.10). Where the pupil would need too many rays, because what diffraction spreads is far finer than
-the aberrations, rays are counted as they fall.
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k
+(path + L (x - x_ray) +
+M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the
+angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would need too many rays,
+because what diffraction spreads is far finer than the aberrations, rays are counted as they fall.
 
-Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its middle on the chief ray of the
-field's middle, its axes the surface's own.
+Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its
+middle on the chief ray of the field's middle, its axes the surface's own.
 """
 
 import contextlib
@@ -38,7 +40,8 @@ MAX_BYTES = 50_000_000
 POINTS = 5  # field points along each side
 MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
 MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does not say
-PERIOD_MARGIN = 2.0  # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
+# the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
+PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
 CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
 EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
@@ -47,7 +50,9 @@ MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """The detector behind a lens: its size and pixel pitch, focus positions (positive: farther from the lens), half a stamp."""
+    """The detector behind a lens: its size and pixel pitch, focus positions (positive: farther
+    from the lens), half a stamp.
+    """
 
     resolution_px: tuple[int, int]
     pitch_um: float
@@ -57,7 +62,9 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """The glass of a prescription, its focal length and F-number, and what was taken for granted."""
+    """The glass of a prescription, its focal length and F-number, and what was taken for
+    granted.
+    """
 
     glass: Glass
     focal_length_mm: float
@@ -76,7 +83,9 @@ class _Lens:
 
 @dataclass(frozen=True, slots=True)
 class _Bundle:
-    """Rays of a pupil's grid (n, n) at the image: places, direction cosines, path, all mm; and their light, 0 where blocked."""
+    """Rays of a pupil's grid (n, n) at the image: places, direction cosines, path, all mm; and
+    their light, 0 where blocked.
+    """
 
     x: FloatArray
     y: FloatArray
@@ -150,7 +159,9 @@ def _fields_of(optic: Any) -> tuple[FieldPoint, ...]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[list[str]]:
-    """Keeps what optiland prints from stdout; its own warnings are put into the list, those of numba's compiler are not."""
+    """Keeps what optiland prints from stdout; its own warnings are put into the list, those of
+    numba's compiler are not.
+    """
     warned: list[str] = []
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -161,7 +172,9 @@ def _quiet() -> Iterator[list[str]]:
 
 
 def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
-    """The glass of an optic of optiland's, at its wavelengths and within its field. Raises InputError."""
+    """The glass of an optic of optiland's, at its wavelengths and within its field. Raises
+    InputError.
+    """
     return _traced(_Lens(optic, _fields_of(optic)), plate, per_px, tolerance, made_by)
 
 
@@ -177,7 +190,9 @@ def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, mad
 
 
 class _LensRays:
-    """Rays through an optic, with its vignetting factors interpolated over the field; optiland takes the nearest."""
+    """Rays through an optic, with its vignetting factors interpolated over the field; optiland
+    takes the nearest.
+    """
 
     def __init__(self, optic: Any, points: tuple[FieldPoint, ...]) -> None:
         if not optic.object_surface.is_infinite:
@@ -202,12 +217,15 @@ class _LensRays:
             raise InputError(
                 "the chief ray of its field's middle is lost; is a surface tilted too far, or its aperture beside it?"
             )
-        # A lens with one field, on the axis, has no direction in which its image could be turned round.
+        # A lens with one field, on the axis, has no direction in which its image could be turned
+        # round.
         self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0]))) or 1.0
         self.centre_mm = places[0]
 
     def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
-        """Places (2, n), mm from the detector's middle, and direction cosines (3, n) of rays, by the image surface's axes."""
+        """Places (2, n), mm from the detector's middle, and direction cosines (3, n) of rays, by
+        the image surface's axes.
+        """
         places, cosines = (
             self._to_image.T @ np.stack([np.asarray(part) for part in parts])
             for parts in ((rays.x, rays.y, rays.z - self._image_mm[2]), (rays.L, rays.M, rays.N))
@@ -216,7 +234,9 @@ class _LensRays:
         return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
 
     def chiefs(self, fields: FloatArray, um: float) -> tuple[FloatArray, FloatArray]:
-        """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields (n, 2) relative to the largest."""
+        """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields
+        (n, 2) relative to the largest.
+        """
         none = np.zeros(len(fields))
         starts = self.optic.ray_tracer.ray_generator.generate_rays(fields[:, 0], fields[:, 1], none, none, um)
         tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
@@ -241,12 +261,14 @@ class _LensRays:
         radius = float(np.hypot(*field))
         at_field = radius * self.max_field
         beside_cut, along_cut, shift = (np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:])
-        turn = field / radius if radius else np.array([0.0, 1.0])  # the field's direction is the factors' y
+        # the field's direction is the factors' y
+        turn = field / radius if radius else np.array([0.0, 1.0])
         along = across * turn[0] + down * turn[1]
         beside = across * turn[1] - down * turn[0]
         moved_along = shift - along_cut * along
         moved_beside = beside_cut * beside
-        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)  # beyond it only where no light is
+        # beyond it only where no light is
+        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)
         py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
         hx, hy = np.full(px.size, field[0]), np.full(px.size, field[1])
         generate = self.optic.ray_tracer.ray_generator.generate_rays
@@ -256,16 +278,19 @@ class _LensRays:
         (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
         path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
         good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
-        # A plane wave's path up to where its rays start, and the area of the beam that each ray stands for.
+        # A plane wave's path up to where its rays start, and the area of the beam that each ray
+        # stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
         return _Bundle(x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0))
 
 
 def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
-    """Field radii, and there: how much of the pupil is cut off across the field's direction and along it, and its shift.
+    """Field radii, and there: how much of the pupil is cut off across the field's direction and
+    along it, and its shift.
 
-    Shape (4, n). Factors are of the pupil's x and y, so a field's direction has to be one of them. Raises InputError.
+    Shape (4, n). Factors are of the pupil's x and y, so a field's direction has to be one of them.
+    Raises InputError.
     """
     rows = []
     for point in points:
@@ -333,7 +358,9 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
-    """Places (n, 2) from the middle, px: a grid over the detector, or as much of it as the prescription's field has."""
+    """Places (n, 2) from the middle, px: a grid over the detector, or as much of it as the
+    prescription's field has.
+    """
     half = (np.array(plate.resolution_px) - 1) / 2
     if lens.max_field == 0:
         return np.zeros((1, 2))
@@ -358,7 +385,8 @@ def _dark(side: int) -> FloatArray:
 def _psf(
     lens: _LensRays, light: tuple[FloatArray, float, float], centre: FloatArray, grid: tuple[int, float]
 ) -> tuple[FloatArray, float]:
-    """A PSF about its chief ray's place `centre` on its stamp's samples, and the share of its light outside of them.
+    """A PSF about its chief ray's place `centre` on its stamp's samples, and the share of its light
+    outside of them.
 
     `light` is its field, wavelength (um) and defocus (mm), `grid` the stamp's side and step (mm).
     """
@@ -384,11 +412,13 @@ def _waves(
     path = path[lit] - np.median(path[lit])
     light, angle, cos_x, cos_y = rays.light[lit], angle[lit], cos_x[lit], cos_y[lit]
     part = np.sqrt(light * angle) * np.exp(1j * wave * path)
-    middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))  # a phase that no light shows
+    # a phase that no light shows
+    middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))
     across = np.exp(1j * wave * np.outer(cos_x - middle_x, at_mm))
     down = np.exp(1j * wave * np.outer(cos_y - middle_y, at_mm))
     image = np.abs((down * part[:, None]).T @ across) ** 2
-    # Parseval: the integral over the image is the wavelength squared times that of the squared amplitude over solid angles.
+    # Parseval: the integral over the image is the wavelength squared times that of the squared
+    # amplitude over solid angles.
     total = float(light.sum()) * (um * 1e-3 / (step_mm / finer)) ** 2
     image = image.reshape(side, finer, side, finer).sum(axis=(1, 3))
     return image, float(np.clip(1 - image.sum() / total, 0, 0.999))
@@ -418,7 +448,9 @@ def _counted(rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, st
 
 @dataclass(frozen=True, slots=True)
 class _Chiefs:
-    """The camera that the chief rays at the primary wavelength have: focal length, mm, and Brown-Conrady relative to it."""
+    """The camera that the chief rays at the primary wavelength have: focal length, mm, and
+    Brown-Conrady relative to it.
+    """
 
     focal_length_mm: float
     lens: Lens | None

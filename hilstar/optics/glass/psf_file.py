@@ -1,13 +1,18 @@
-"""The file of a tracker's glass: point spread functions over the field, wavelength and focus, and what belongs with them.
+"""The file of a tracker's glass: point spread functions over the field, wavelength and focus, and
+what belongs with them.
 
-The layout is one FITS file. docs/optics.md states it for writers; `read_glass` and `write_glass` keep it:
+The layout is one FITS file. docs/optics.md states it for writers; `read_glass` and `write_glass`
+keep it:
 
-- the first HDU has the basis, float32 (components, height, width): x right, y down, `OVERSAMP` samples a tracker pixel, the
+- the first HDU has the basis, float32 (components, height, width): x right, y down, `OVERSAMP`
+  samples a tracker pixel, the
   chief ray in the middle of the middle sample. `PIXINT` says whether the pixel is integrated in it;
-- the table POINTS has a row for each field point, wavelength and focus: `x_px`, `y_px`, `wavelength_nm`, `focus_um`,
-  `relative_illumination`, `outside_share`, `lateral_x_px`, `lateral_y_px`, and `weights`: that row's PSF is the sum of weight
-  times basis image, and sums to 1;
-- the table TRANSMISSION (`wavelength_nm`, `transmission`) and the keys `K1` to `P2` are there where they are known.
+- the table POINTS has a row for each field point, wavelength and focus: `x_px`, `y_px`,
+  `wavelength_nm`, `focus_um`,
+  `relative_illumination`, `outside_share`, `lateral_x_px`, `lateral_y_px`, and `weights`: that
+  row's PSF is the sum of weight times basis image, and sums to 1;
+- the table TRANSMISSION (`wavelength_nm`, `transmission`) and the keys `K1` to `P2` are there where
+  they are known.
 """
 
 from collections.abc import Sequence
@@ -40,7 +45,9 @@ TOLERANCE = 1e-3  # share of a PSF's light that its basis may put elsewhere
 MAX_FILE_BYTES, MAX_IMAGES = 500_000_000, 20_000
 PHASES = 4  # places along a pixel's side at which what pixels get is compared
 FEW_IMAGES = 7  # no basis has fewer components
-MAX_OFF = 0.25  # share of a stamp's side; a PSF whose centroid lies farther from the middle is not centred on its chief ray
+# share of a stamp's side; a PSF whose centroid lies farther from the middle is not centred on its
+# chief ray
+MAX_OFF = 0.25
 MAX_NEGATIVE = 0.1  # share of a PSF's light, summed over pixels
 SUM_TOLERANCE = 2e-3
 ADVICE = "give a FITS file with one image, or one that `hilstar optics` wrote"
@@ -50,11 +57,12 @@ ADVICE = "give a FITS file with one image, or one that `hilstar optics` wrote"
 class Glass:
     """PSFs at F field points, L wavelengths and Z focus positions, as K basis images.
 
-    `places_px` (F, 2) are tracker pixels, `wavelengths_nm` (L,) and `focuses_um` (Z,) rise; one wavelength of NaN counts for
-    all light. `basis` (K, height, width) and `weights` (F, L, Z, K) give PSFs that sum to 1. (F, L, Z) are `illumination`,
-    relative to the axis, and the share of light `outside` the image. `lateral_px` (F, L, Z, 2) is where a wavelength's chief
-    ray meets the detector, from the camera's place of the point: images do not have it. `residual` is the largest share of a
-    PSF's light that the basis puts elsewhere.
+    `places_px` (F, 2) are tracker pixels, `wavelengths_nm` (L,) and `focuses_um` (Z,) rise; one
+    wavelength of NaN counts for all light. `basis` (K, height, width) and `weights` (F, L, Z, K)
+    give PSFs that sum to 1. (F, L, Z) are `illumination`, relative to the axis, and the share of
+    light `outside` the image. `lateral_px` (F, L, Z, 2) is where a wavelength's chief ray meets the
+    detector, from the camera's place of the point: images do not have it. `residual` is the largest
+    share of a PSF's light that the basis puts elsewhere.
     """
 
     places_px: FloatArray
@@ -85,7 +93,9 @@ class Glass:
 
 @dataclass(frozen=True, slots=True)
 class Stack:
-    """Images (n, height, width) of PSFs and where each belongs: `at` (n, 4) in the order of AXES, `facts` (n, 4) of FACTS."""
+    """Images (n, height, width) of PSFs and where each belongs: `at` (n, 4) in the order of
+    AXES, `facts` (n, 4) of FACTS.
+    """
 
     images: FloatArray
     at: FloatArray
@@ -106,7 +116,9 @@ def glass_of(
     transmission: Curve | None = None,
     history: Sequence[str] = (),
 ) -> Glass:
-    """The glass of a stack, whose images need not be normalised. Raises InputError for one that is not of PSFs."""
+    """The glass of a stack, whose images need not be normalised. Raises InputError for one that
+    is not of PSFs.
+    """
     images, count, per_px = stack.images, len(stack.images), stack.per_px
     if images.ndim != 3 or not all(side % 2 for side in images.shape[1:]):
         found = " x ".join(map(str, images.shape[::-1]))
@@ -148,10 +160,11 @@ def glass_of(
 
 
 def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Six images (6, m) that carry one moment each, and the moments' own terms (m, 6), of images of a shape (height, width).
+    """Six images (6, m) that carry one moment each, and the moments' own terms (m, 6), of images of
+    a shape (height, width).
 
-    The moments are flux, x, y, x^2, xy and y^2 about the middle sample. An image less what its moments' carriers have of it
-    has none of these moments, and neither has any sum of such images.
+    The moments are flux, x, y, x^2, xy and y^2 about the middle sample. An image less what its
+    moments' carriers have of it has none of these moments, and neither has any sum of such images.
     """
     y, x = ((np.indices(shape) - np.array(shape)[:, None, None] // 2) / sigma).reshape(2, -1)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
@@ -162,11 +175,13 @@ def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, F
 def principal(
     images: FloatArray, shape: tuple[int, int], tolerance: float, width: int
 ) -> tuple[Float32Array, FloatArray, float]:
-    """Basis (K, m), weights (n, K) and the residual of images (n, m) that sum to 1, for pixels of `width` samples.
+    """Basis (K, m), weights (n, K) and the residual of images (n, m) that sum to 1, for pixels of
+    `width` samples.
 
-    Flux, centroids and second moments are kept exactly; of the rest there are as few principal components as leave at most
-    `tolerance`: half the sum of a residual's absolute values, which is the share of light that lies elsewhere. Both are of
-    what pixels get (`_by_pixels`): detail finer than a pixel moves no electron.
+    Flux, centroids and second moments are kept exactly; of the rest there are as few principal
+    components as leave at most `tolerance`: half the sum of a residual's absolute values, which is
+    the share of light that lies elsewhere. Both are of what pixels get (`_by_pixels`): detail finer
+    than a pixel moves no electron.
     """
     if len(images) <= FEW_IMAGES:
         return images.astype(np.float32), np.eye(len(images)), 0.0
@@ -190,9 +205,11 @@ def principal(
 
 
 def _by_pixels(images: FloatArray, width: int) -> FloatArray:
-    """What pixels of `width` samples get of images (n, height, width), at about PHASES places in a pixel along each axis.
+    """What pixels of `width` samples get of images (n, height, width), at about PHASES places in a
+    pixel along each axis.
 
-    The result (n, m) is divided by the number of these places: of one image its absolute values sum to its mean light.
+    The result (n, m) is divided by the number of these places: of one image its absolute values sum
+    to its mean light.
     """
     apart = max(1, round(width / PHASES))
     found = images
@@ -209,7 +226,8 @@ def _elsewhere(residuals: FloatArray) -> float:
 
 
 def _product(at: FloatArray) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[IntArray, ...]]:
-    """Field points (F, 2), wavelengths (L,) and focus positions (Z,), and the place of each row among them.
+    """Field points (F, 2), wavelengths (L,) and focus positions (Z,), and the place of each row
+    among them.
 
     Raises InputError where a field point lacks a wavelength or a focus, or has one twice.
     """
@@ -320,7 +338,8 @@ def write_glass(path: Path, glass: Glass) -> None:
 
 
 def read_glass(path: Path) -> SampledPsf | Glass:
-    """The glass of a file, or the one PSF of a FITS image (`read_psf`); the same file again is the same object.
+    """The glass of a file, or the one PSF of a FITS image (`read_psf`); the same file again is the
+    same object.
 
     Raises InputError for any other file.
     """
@@ -335,7 +354,8 @@ def _glass_in(path: Path, content: bytes) -> Glass | None:
             return _checked_glass(path, hdus) if POINTS in hdus else None
     except InputError:
         raise
-    except Exception:  # astropy raises whatever a broken header causes in its layers; `read_psf` says it
+    except Exception:
+        # astropy raises whatever a broken header causes in its layers; `read_psf` says it
         return None
 
 

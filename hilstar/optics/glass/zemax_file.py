@@ -493,7 +493,9 @@ def _numbers_of(words: Iterable[str]) -> Iterator[float]:
 
 
 def _terms(surface: _Surface, mm: float) -> Iterator[float]:
-    """Coefficients of r, r^2, ... in mm. A parameter that is not of the kind, and not 0, is refused."""
+    """Coefficients of r, r^2, ... in mm. A parameter that is not of the kind, and not 0, is
+    refused.
+    """
     count = SURFACE_KINDS[surface.kind]
     _refuse_parameters(surface, count)
     for number in range(1, count + 1):

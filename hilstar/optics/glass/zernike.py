@@ -1,8 +1,10 @@
-"""A glass from its pupil and its aberrations: diffraction PSFs by Zernike or Seidel coefficients over field and wavelength.
+"""A glass from its pupil and its aberrations: diffraction PSFs by Zernike or Seidel coefficients
+over field and wavelength.
 
-The pupil's field is exp(2 pi i W / wavelength) within the aperture, W the wavefront's lead over the reference sphere; poppy
-(Perrin et al. 2012, SPIE 8442) makes the Zernike polynomials and propagates it. Pupil axes are the detector's, x right and y
-down. Coordinates in the pupil are relative to its radius.
+The pupil's field is exp(2 pi i W / wavelength) within the aperture, W the wavefront's lead over the
+reference sphere; poppy (Perrin et al. 2012, SPIE 8442) makes the Zernike polynomials and propagates
+it. Pupil axes are the detector's, x right and y down. Coordinates in the pupil are relative to its
+radius.
 """
 
 import math
@@ -31,11 +33,13 @@ Nm = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
 class Term(Table, frozen=True):
-    """A Zernike term by Noll's index (rms), or a Seidel one (at the pupil's edge), in nm at the field's corner or on the axis.
+    """A Zernike term by Noll's index (rms), or a Seidel one (at the pupil's edge), in nm at the
+    field's corner or on the axis.
 
-    A Zernike term grows with the field's radius to the power `field_power`, 0 for the same everywhere, and keeps its
-    orientation. Seidel terms grow as they do (W131 with the field, W222 and W220 with its square) and turn with the field.
-    `per_nm` is added for each nm of wavelength over `reference_nm`.
+    A Zernike term grows with the field's radius to the power `field_power`, 0 for the same
+    everywhere, and keeps its orientation. Seidel terms grow as they do (W131 with the field, W222
+    and W220 with its square) and turn with the field. `per_nm` is added for each nm of wavelength
+    over `reference_nm`.
     """
 
     kind: Literal["zernike", "W020", "W040", "W131", "W222", "W220"]
@@ -82,7 +86,9 @@ def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
 
 
 def diffracted(pupil: Pupil, per_px: int) -> Stack:
-    """The PSFs of a pupil at its field points, wavelengths and focus positions. Raises InputError and MachineError."""
+    """The PSFs of a pupil at its field points, wavelengths and focus positions. Raises
+    InputError and MachineError.
+    """
     pupil_field = PupilField(pupil)
     (width, height), middle = pupil.resolution_px, (np.array(pupil.resolution_px) - 1) / 2
     columns, rows = (
@@ -101,7 +107,9 @@ def diffracted(pupil: Pupil, per_px: int) -> Stack:
 
 
 class PupilField:
-    """The complex field of a pupil (PUPIL, PUPIL) at a place of the image, a wavelength and a focus."""
+    """The complex field of a pupil (PUPIL, PUPIL) at a place of the image, a wavelength and a
+    focus.
+    """
 
     def __init__(self, pupil: Pupil) -> None:
         zernike = _poppy().zernike
@@ -115,7 +123,9 @@ class PupilField:
         self._zernikes: dict[int, FloatArray] = {j: zernike.zernike1(j, **polar) for j in nolls}
 
     def __call__(self, off_px: FloatArray, nm: float, focus_um: float) -> FloatArray:
-        """The field at a place, px from the image's middle. Raises InputError where its samples are too coarse."""
+        """The field at a place, px from the image's middle. Raises InputError where its samples
+        are too coarse.
+        """
         pupil = self._pupil
         radius = float(np.hypot(*off_px)) / (float(np.hypot(*pupil.resolution_px)) / 2)
         direction = off_px / max(float(np.hypot(*off_px)), 1e-12)
@@ -161,11 +171,12 @@ def aperture(pupil: Pupil) -> FloatArray:
 
 
 def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[FloatArray, float]:
-    """The PSF of a pupil's field on the stamp's samples, and the share of its light outside of them.
+    """The PSF of a pupil's field on the stamp's samples, and the share of its light outside of
+    them.
 
-    poppy's transform keeps the light by Parseval's theorem; that of a sample at the pupil's edge is its open part. The kernel
-    is exp(+i), so that light goes against the slope of a leading wavefront, as rays do. Raises InputError for samples too
-    coarse for the diffraction.
+    poppy's transform keeps the light by Parseval's theorem; that of a sample at the pupil's edge is
+    its open part. The kernel is exp(+i), so that light goes against the slope of a leading
+    wavefront, as rays do. Raises InputError for samples too coarse for the diffraction.
     """
     side = 2 * pupil.half_px * per_px + 1
     resolution_um = nm * 1e-3 * pupil.focal_length_mm / pupil.aperture_mm

@@ -21,15 +21,19 @@ from hilstar.sky.stars import Stars
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
-# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85 px by 0.2 %.
+# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85
+# px by 0.2 %.
 POINT_PX = 0.2
 HIDDEN = 0.005  # a star or a body is not drawn if less than this share of its light comes through
 MAX_POSES = 7  # camera poses at which a disc is drawn in a frame
-MAX_POSED_PX = 120  # a disc of a larger radius is drawn at one pose, in the middle of the time, which bounds the work
-# Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most 1.6 sigma apart.
+# a disc of a larger radius is drawn at one pose, in the middle of the time, which bounds the work
+MAX_POSED_PX = 120
+# Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most
+# 1.6 sigma apart.
 EXPOSED_PER_SIGMA = 1.0
 MAX_EXPOSED = 63
-LIMB_PLACES = 24  # places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
+# places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
+LIMB_PLACES = 24
 LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested
 
 
@@ -43,7 +47,9 @@ class BodyLayer:
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light before without what discs hide, and with the light of the discs, which ends up farthest first."""
+        """The light before without what discs hide, and with the light of the discs, which ends
+        up farthest first.
+        """
         discs = self._near(view)
         if not discs:
             return light
@@ -75,22 +81,28 @@ class BodyLayer:
         return tuple(self._lights([disc], self._still(view.icrs_to_image(self.canvas.camera)))[0])
 
     def any_lights(self) -> tuple[ExtendedLight, ...]:
-        """Discs of several sizes in the middle of the image: for a driver that compiles a shader for each kind."""
+        """Discs of several sizes in the middle of the image: for a driver that compiles a shader
+        for each kind.
+        """
         ahead = np.array([0.0, 0.0, 1.0])
         radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
         discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
 
     def unhidden(self, light: Sprites, stars: Stars, discs: list[Disc], view: View) -> Sprites:
-        """Sprites as seen past `discs` and through their air, without those of the discs themselves."""
+        """Sprites as seen past `discs` and through their air, without those of the discs
+        themselves.
+        """
         which, first = light.star, len(stars) - len(self._moving.names)
         through, directions = np.ones(len(which)), stars.directions(which)
-        # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds those that nothing hides.
+        # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds
+        # those that nothing hides.
         satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
         point = np.flatnonzero(which >= first)
         far_km = self._moving.distances_km(*view.observer)[which[point] - first] if len(point) else np.empty(0)
         for disc in discs:
-            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
+            # more than a cosine rounds
+            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7
             near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
             near[point[far_km <= disc.distance_km]] = False  # itself among them
             near[satellite] = False
@@ -106,7 +118,9 @@ class BodyLayer:
         return replace(light, data=data, star=light.star[kept], x_px=light.x_px[kept], y_px=light.y_px[kept])
 
     def _near(self, view: View) -> list[Disc]:
-        """Discs that may be on the image at some time of a view, and that no other hides, nearest first."""
+        """Discs that may be on the image at some time of a view, and that no other hides,
+        nearest first.
+        """
         reach_rad, wide_rad = self._reach_rad, POINT_PX / self._px_per_rad
         if view.turns:
             reach_rad += view.turn.speed_rad_s * (view.scan.whole_s / 2 if view.exposed else view.scan.longest_s)
@@ -126,7 +140,9 @@ class BodyLayer:
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
 
     def _exposed(self, view: View) -> DiscView:
-        """The camera during an exposure: poses that follow one another along its turn, all with the exposure's mean light."""
+        """The camera during an exposure: poses that follow one another along its turn, all with
+        the exposure's mean light.
+        """
         camera, exposure_s = self.canvas.camera, view.scan.hold_s
         length_sigma = view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
@@ -142,7 +158,8 @@ class BodyLayer:
         length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
         count = 1
         if length_sigma > POINT_SIGMA:
-            count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)  # odd: one is in the middle
+            # odd: one is in the middle
+            count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)
         place, weight = gauss_legendre(count)
         times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
         attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
@@ -150,12 +167,16 @@ class BodyLayer:
         return DiscView(camera, self.canvas.psf, poses, _shear(scan, turn.rate_cam_rad_s, camera))
 
     def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
-        """The light of each of some discs, which are nearest first, in the order in which they are drawn."""
+        """The light of each of some discs, which are nearest first, in the order in which they
+        are drawn.
+        """
         ordered = reversed([*enumerate(discs, 1)])
         return [disc_lights(disc, posed, covers=k < len(discs)) for k, disc in ordered]
 
     def _clips(self, lights: list[ExtendedLight], white_e_per_s: float) -> bool:
-        """Whether a disc's lights have more than white in a pixel; a large disc is tested at a lattice of places."""
+        """Whether a disc's lights have more than white in a pixel; a large disc is tested at a
+        lattice of places.
+        """
         if not math.isfinite(white_e_per_s):
             return False
         brightest = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))

@@ -1,9 +1,11 @@
-"""Light that stands on the sky, as `[sky.diffuse]` has it: a map of it for each view, where it is bright enough to be seen.
+"""Light that stands on the sky, as `[sky.diffuse]` has it: a map of it for each view, where it is
+bright enough to be seen.
 
-The image is divided into cells. What the map has in a cell decides whether it is drawn; each group of cells that touch becomes
-a map of light. Places in the map are exact at the cells' corners and linear between them. A pixel has the map's value in its
-middle, spread by a round Gaussian of the PSF's variance, times its solid angle. The camera's turn within a frame, which changes
-smooth light little, is left out.
+The image is divided into cells. What the map has in a cell decides whether it is drawn; each group
+of cells that touch becomes a map of light. Places in the map are exact at the cells' corners and
+linear between them. A pixel has the map's value in its middle, spread by a round Gaussian of the
+PSF's variance, times its solid angle. The camera's turn within a frame, which changes smooth light
+little, is left out.
 """
 
 import itertools
@@ -27,7 +29,9 @@ MOVED_PX = 0.25  # at most, by taking one attitude for a cell of them
 
 
 class DiffuseLayer:
-    """The light of tangent images in electrons/s/sr; of a monitor only cells that pass its first step in a pixel."""
+    """The light of tangent images in electrons/s/sr; of a monitor only cells that pass its first
+    step in a pixel.
+    """
 
     def __init__(self, images: tuple[TangentImage, ...], canvas: Canvas) -> None:
         self._camera, self._faintest = canvas.camera, canvas.first_step_e_per_s
@@ -55,7 +59,9 @@ class DiffuseLayer:
         self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light before, and the map's; a screen's is that of its attitude's cell, and the same objects within a cell."""
+        """The light before, and the map's; a screen's is that of its attitude's cell, and the
+        same objects within a cell.
+        """
         cell = view.q_icrs_to_cam
         if self._cell_q:
             cell = np.rint(cell * np.sign(cell[np.argmax(np.abs(cell))]) / self._cell_q) * self._cell_q
@@ -84,7 +90,8 @@ class DiffuseLayer:
 
         near = self._rays @ (icrs_to_cam @ face.middle) >= face.cos_radius
         lit = [np.flatnonzero(near.any(axis=axis)) for axis in (1, 0)]
-        if min(map(len, lit)) < 2:  # no whole cell: its light is two cells and more beside the image
+        # no whole cell: its light is two cells and more beside the image
+        if min(map(len, lit)) < 2:
             return []
         around = tuple(slice(int(one[0]), int(one[-1]) + 1) for one in lit)
         x_px, y_px = face.image.places_px(self._rays[around] @ icrs_to_cam)
@@ -102,7 +109,9 @@ class DiffuseLayer:
         return found
 
     def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> "_Part":
-        """The pixels of a box of cells, counted from the first ones `around`, of which some are `own`."""
+        """The pixels of a box of cells, counted from the first ones `around`, of which some are
+        `own`.
+        """
         first = [part.start + whole.start for part, whole in zip(box, around, strict=True)]
         rows, columns = (
             np.ceil(np.arange(at, at + part.stop - part.start + 1) * size / (count - 1) - 0.5).astype(int)
@@ -119,7 +128,9 @@ class DiffuseLayer:
 
 @dataclass(slots=True)
 class _Part:
-    """A rectangle of an image: its first pixel, its cells' corners, their shares in its rows and columns, which are its own."""
+    """A rectangle of an image: its first pixel, its cells' corners, their shares in its rows and
+    columns, which are its own.
+    """
 
     corner_px: tuple[int, int]
     nodes: tuple[slice, ...]
@@ -132,7 +143,9 @@ class _Part:
         return np.asarray(self.down @ np.nan_to_num(at_corners[self.nodes]).astype(np.float32) @ self.across.T)
 
     def keep(self, held: BoolArray, taken: BoolArray) -> None:
-        """Leave pixels that are not `held` here or `taken` before, and take the others, in an image's `taken` (h, w)."""
+        """Leave pixels that are not `held` here or `taken` before, and take the others, in an
+        image's `taken` (h, w).
+        """
         (left, top), (rows, columns) = self.corner_px, self.own.shape
         here = taken[top : top + rows, left : left + columns]
         self.own &= held & ~here
@@ -142,7 +155,8 @@ class _Part:
 class _Face:
     """A tangent image, and the most light that any place has within a cell of it.
 
-    What has more light than `least` is within a radius of the direction `middle` (3,), ICRS, cells that touch it included.
+    What has more light than `least` is within a radius of the direction `middle` (3,), ICRS, cells
+    that touch it included.
     """
 
     def __init__(self, image: TangentImage, px_rad: float, least: float) -> None:
@@ -150,7 +164,8 @@ class _Face:
 
         self.image = image
         self.middle_px, self.is_of_cube = (len(image.image) - 1) / 2, math.isfinite(image.max_tangent)
-        # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's corner
+        # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's
+        # corner
         self._reach_px = math.ceil(CELL_PX * px_rad * image.px_per_tangent * 3 * math.sqrt(2)) + 1
         rows, columns = np.nonzero(image.image > least)
         lit = np.stack([columns - self.middle_px, rows - self.middle_px, np.full(len(rows), image.px_per_tangent)], axis=-1)
@@ -169,6 +184,8 @@ class _Face:
         return np.where(inside, self.most[(y * inside).astype(np.intp), (x * inside).astype(np.intp)], 0.0)
 
     def holds(self, x_px: Float32Array, y_px: Float32Array) -> BoolArray:
-        """Which places are not beyond its edge, or hardly: two faces both hold a place on their edge."""
+        """Which places are not beyond its edge, or hardly: two faces both hold a place on their
+        edge.
+        """
         half_px = self.image.max_tangent * self.image.px_per_tangent + ON_EDGE_PX
         return np.asarray((np.abs(x_px - self.middle_px) <= half_px) & (np.abs(y_px - self.middle_px) <= half_px))

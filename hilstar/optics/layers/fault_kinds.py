@@ -1,7 +1,9 @@
-"""The kinds of fault, one class each: the keys of a `[[fault]]` table, which are those of a message of the stream too.
+"""The kinds of fault, one class each: the keys of a `[[fault]]` table, which are those of a message
+of the stream too.
 
-Light is in electrons per second, or in electrons of one exposure of the tracker; places are in the frame that suits: `icrs`
-or `radec_deg` on the sky, `tracker_px` on the tracker's detector, `screen_px` on the monitor.
+Light is in electrons per second, or in electrons of one exposure of the tracker; places are in the
+frame that suits: `icrs` or `radec_deg` on the sky, `tracker_px` on the tracker's detector,
+`screen_px` on the monitor.
 """
 
 import math
@@ -38,7 +40,8 @@ KeyGroups = tuple[tuple[str, ...], ...]
 
 
 class Fault(Table, frozen=True, kw_only=True):
-    """The keys of every fault: a name, its beginning (seconds of the run; None: on request), and how long it lasts.
+    """The keys of every fault: a name, its beginning (seconds of the run; None: on request), and
+    how long it lasts.
 
     Without `for_s` it lasts until it is stopped.
     """
@@ -128,9 +131,11 @@ class StarGone(Fault, frozen=True, kw_only=True):
 
 
 class CosmicRays(Fault, frozen=True, kw_only=True):
-    """A burst of `number` straight tracks in each exposure that it lasts, at random places and in random directions.
+    """A burst of `number` straight tracks in each exposure that it lasts, at random places and in
+    random directions.
 
-    Each leaves `electrons` in an exposure, along `length_px` of the detector. Without `for_s` the burst is one exposure.
+    Each leaves `electrons` in an exposure, along `length_px` of the detector. Without `for_s` the
+    burst is one exposure.
     """
 
     KIND: ClassVar[str] = "cosmic-rays"
@@ -150,9 +155,11 @@ class CosmicRays(Fault, frozen=True, kw_only=True):
 
 
 class Gradient(Fault, frozen=True, kw_only=True):
-    """Stray light that grows evenly across the detector: from nothing to its light, electrons in a tracker pixel.
+    """Stray light that grows evenly across the detector: from nothing to its light, electrons in a
+    tracker pixel.
 
-    `towards_deg` is where it is brightest: 0 at the right edge of the tracker's image, 90 at the bottom.
+    `towards_deg` is where it is brightest: 0 at the right edge of the tracker's image, 90 at the
+    bottom.
     """
 
     KIND: ClassVar[str] = "gradient"
@@ -166,7 +173,8 @@ class Gradient(Fault, frozen=True, kw_only=True):
 
 
 class Glow(PlacedFault, frozen=True, kw_only=True):
-    """Stray light about a direction, also one off the field: peak (1 + (angle / scale)^2)^(-exponent / 2).
+    """Stray light about a direction, also one off the field: peak (1 + (angle /
+    scale)^2)^(-exponent / 2).
 
     The peak is in a tracker pixel.
     """
@@ -183,10 +191,11 @@ class Glow(PlacedFault, frozen=True, kw_only=True):
 
 
 class MeasuredMap(Fault, frozen=True, kw_only=True):
-    """Stray light as it was measured: an image (FITS, PNG or npy) over the whole detector, or the whole screen.
+    """Stray light as it was measured: an image (FITS, PNG or npy) over the whole detector, or the
+    whole screen.
 
-    Its values are electrons per second in a pixel of the tracker (of the monitor with `frame = "screen"`), unless
-    `electrons_per_s` or `electrons` says what its brightest pixel is.
+    Its values are electrons per second in a pixel of the tracker (of the monitor with `frame =
+    "screen"`), unless `electrons_per_s` or `electrons` says what its brightest pixel is.
     """
 
     KIND: ClassVar[str] = "light-map"
@@ -217,7 +226,9 @@ class Freeze(Fault, frozen=True, kw_only=True):
 
 
 class Drop(Fault, frozen=True, kw_only=True):
-    """Frames that are never shown: the display keeps the one before. A `share` of them, chosen by the seed."""
+    """Frames that are never shown: the display keeps the one before. A `share` of them, chosen
+    by the seed.
+    """
 
     KIND: ClassVar[str] = "drop"
 
@@ -225,7 +236,9 @@ class Drop(Fault, frozen=True, kw_only=True):
 
 
 class AttitudeStep(Fault, frozen=True, kw_only=True):
-    """The sky of a wrong attitude: the camera turned by a rotation vector in its own axes, as a rate of that size for 1 s."""
+    """The sky of a wrong attitude: the camera turned by a rotation vector in its own axes, as a
+    rate of that size for 1 s.
+    """
 
     KIND: ClassVar[str] = "attitude-step"
     ONE_OF: ClassVar[KeyGroups] = (("turn_arcsec", "turn_deg"),)
@@ -250,9 +263,11 @@ class AttitudeStep(Fault, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """A fault that is on in a frame: its number in the run, and how long it has been on when the frame's light begins, ns.
+    """A fault that is on in a frame: its number in the run, and how long it has been on when the
+    frame's light begins, ns.
 
-    `share` is the part of the frame that it lasts: less than 1 only in its first frame and its last.
+    `share` is the part of the frame that it lasts: less than 1 only in its first frame and its
+    last.
     """
 
     number: int
@@ -280,7 +295,9 @@ KINDS: dict[str, type[Fault]] = {
 
 
 def fault_of(table: Any) -> Fault:
-    """The fault of a table, as TOML or JSON has it. Raises InputError: key, what is wrong and what to write."""
+    """The fault of a table, as TOML or JSON has it. Raises InputError: key, what is wrong and
+    what to write.
+    """
     if not isinstance(table, dict):
         raise InputError(f"{shortened(table)} is no table; write keys, such as kind and name (see {REFERENCE})")
     keys = {key: value for key, value in table.items() if key != "kind"}

@@ -43,19 +43,23 @@ from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars
 
 TRACK_SEED = 2  # beside the number of an exposure
-TRACK_BV_MAG = 0.0  # a track has no colour; its magnitude is that of a white star of as many electrons
+# a track has no colour; its magnitude is that of a white star of as many electrons
+TRACK_BV_MAG = 0.0
 KEPT_MAPS, KEPT_BURSTS, KEPT_STARS = 16, 64, 512  # a stream may ask for any star
-# Sprites this many sigmas apart make a line whose brightness ripples by 2 exp(-2 pi^2 / 1.5^2) = 3e-4.
+# Sprites this many sigmas apart make a line whose brightness ripples by 2 exp(-2 pi^2 / 1.5^2) =
+# 3e-4.
 STEP_SIGMA = 1.5
 MAX_STEPS = 20_000  # on one line
 
 
 @dataclass(frozen=True, slots=True)
 class FaultCamera:
-    """A camera's canvas and what a fault has to know to be drawn on it: the bench's two cameras, and its light.
+    """A camera's canvas and what a fault has to know to be drawn on it: the bench's two cameras,
+    and its light.
 
-    `points` draws a few stars as the camera's own are drawn, `apparent` turns directions (n, 3), ICRS, into those that the
-    bench's observer sees, and `v0_e_per_s` gives the electrons per second of a star of V = 0 by its B-V.
+    `points` draws a few stars as the camera's own are drawn, `apparent` turns directions (n, 3),
+    ICRS, into those that the bench's observer sees, and `v0_e_per_s` gives the electrons per second
+    of a star of V = 0 by its B-V.
     """
 
     canvas: Canvas
@@ -71,8 +75,8 @@ class FaultCamera:
 class FaultView:
     """The faults of one camera. A fault of the stream may be prepared while another thread draws.
 
-    `seed` is that of everything random in them. Maps are files in `folder` (None: a message names no file); those of the
-    `lasting` faults are kept.
+    `seed` is that of everything random in them. Maps are files in `folder` (None: a message names
+    no file); those of the `lasting` faults are kept.
     """
 
     def __init__(
@@ -86,7 +90,9 @@ class FaultView:
         self._tracks: dict[tuple[str, int], PointChain] = {}
 
     def prepare(self, fault: Fault) -> Fault:
-        """The fault with everything prepared that a frame has no time for. Raises InputError (see `FaultSchedule`)."""
+        """The fault with everything prepared that a frame has no time for. Raises InputError
+        (see `FaultSchedule`).
+        """
         if not self.by.exposure_s and getattr(fault, "electrons", None) is not None:
             raise InputError("electrons: [tracker] exposure_s is 0, and no exposure has them; write a longer one")
         if isinstance(fault, CosmicRays) and fault.for_s is None:
@@ -110,7 +116,9 @@ class FaultView:
         return fault
 
     def light_e_per_s(self, fault: Fault) -> float:
-        """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1 where a map says it."""
+        """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1
+        where a map says it.
+        """
         per_s, in_exposure = getattr(fault, "electrons_per_s", None), getattr(fault, "electrons", None)
         if per_s is not None:
             return float(per_s)
@@ -158,7 +166,9 @@ class FaultView:
     # Called for each frame
 
     def sky_points(self, now: Sequence[Now], stars: Stars) -> tuple[FloatArray, list[AddedLight]]:
-        """False stars and flashes that are fixed on the sky: their directions (n, 3), and their names and light."""
+        """False stars and flashes that are fixed on the sky: their directions (n, 3), and their
+        names and light.
+        """
         vectors, lights = [], []
         for one in now:
             fault = one.fault
@@ -184,7 +194,9 @@ class FaultView:
         return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
 
     def camera_points(self, now: Sequence[Now], scan: Scan | None) -> "tuple[list[PointChain], list[AddedLight]]":
-        """False stars and flashes that move with the camera, and tracks: chains, and the name and light of each line."""
+        """False stars and flashes that move with the camera, and tracks: chains, and the name
+        and light of each line.
+        """
         chains, lights = [], []
         for one in now:
             fault = one.fault
@@ -230,7 +242,8 @@ class FaultView:
         return [(int(star), 1 - one.share) for one in taken for star in self._places(stars, one.fault)]
 
     def _places(self, stars: Stars, fault: Fault) -> IntArray:
-        """The places of a fault's star in `stars`; empty if it is not among them, or the fault is about none.
+        """The places of a fault's star in `stars`; empty if it is not among them, or the fault is
+        about none.
 
         A bench's arrays keep their order for a whole run: each star is searched for once.
         """
@@ -241,7 +254,8 @@ class FaultView:
             return np.empty(0, dtype=np.intp)
         key = (id(stars.hip), wanted)
         known = self._found.get(key)
-        if known is None or known[0] is not stars.hip:  # the array is kept, so that no other one has its id
+        # the array is kept, so that no other one has its id
+        if known is None or known[0] is not stars.hip:
             if len(self._found) >= KEPT_STARS:
                 self._found.clear()
             known = self._found[key] = (stars.hip, _places(stars, wanted))
@@ -281,7 +295,9 @@ class FaultView:
         return made
 
     def footprints(self, chains: "list[PointChain]") -> list[Sprites]:
-        """The sprites of chains. Their lines are numbered from one chain to the next, as stars -1, -2 and on."""
+        """The sprites of chains. Their lines are numbered from one chain to the next, as stars
+        -1, -2 and on.
+        """
         made, first = [], 0
         for chain in chains:
             star = -1 - first - chain.line
@@ -320,7 +336,9 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class PointChain:
-    """Points of light (n,): pixels of a camera, electrons per second, and which of `lines` lines each is of."""
+    """Points of light (n,): pixels of a camera, electrons per second, and which of `lines` lines
+    each is of.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -331,21 +349,26 @@ class PointChain:
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Straight lines (n, 2) in pixels of a camera, each with its light, electrons per second (n,), evenly along it."""
+    """Straight lines (n, 2) in pixels of a camera, each with its light, electrons per second
+    (n,), evenly along it.
+    """
 
     begin_px: FloatArray
     end_px: FloatArray
     electrons_per_s: FloatArray
 
     def seen_by(self, camera: Camera, source: Camera, psf: Psf) -> PointChain:
-        """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its lens have no points."""
+        """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its
+        lens have no points.
+        """
         ends = [np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)]
         length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(psf.width_px)[:, None]))
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
         counts = np.where(known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1)
         line = np.repeat(np.arange(len(counts)), counts)
         first = np.repeat(np.cumsum(counts) - counts, counts)
-        # One point of a line that is none lies at its place; those of a longer one in the middles of its equal parts.
+        # One point of a line that is none lies at its place; those of a longer one in the middles
+        # of its equal parts.
         share = ((np.arange(len(line)) - first + 0.5) / counts[line])[:, None]
         places = self.begin_px[line] * (1 - share) + self.end_px[line] * share
         x_px, y_px = camera.pixels_from(source, *places.T)
@@ -353,7 +376,9 @@ class Lines:
 
 
 def tracks(burst: CosmicRays, resolution_px: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> Lines:
-    """The tracks of one exposure in tracker pixels: their middles anywhere on the detector, in any direction."""
+    """The tracks of one exposure in tracker pixels: their middles anywhere on the detector, in
+    any direction.
+    """
     width, height = resolution_px
     middle = rng.random((burst.number, 2)) * (width, height) - 0.5
     angle = rng.uniform(0.0, 2 * np.pi, burst.number)

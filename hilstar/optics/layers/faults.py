@@ -1,4 +1,6 @@
-"""The faults that are on in one image: what they do to its view and to its light, and whether it is shown at all."""
+"""The faults that are on in one image: what they do to its view and to its light, and whether it
+is shown at all.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +50,9 @@ class FaultLayer:
         )
 
     def turned(self, view: View) -> View:
-        """The view that is shown in place of another: its attitude, and its rate in the axes of the camera as turned."""
+        """The view that is shown in place of another: its attitude, and its rate in the axes of
+        the camera as turned.
+        """
         if not self._has(AttitudeStep):
             return view
         q, step = view.q_icrs_to_cam, NO_TURN
@@ -60,7 +64,9 @@ class FaultLayer:
         return replace(view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate)
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light before without the stars that faults take away, and with the light that they add."""
+        """The light before without the stars that faults take away, and with the light that they
+        add.
+        """
         by, now = self.view, self.now
         if self.blank:
             return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
@@ -99,7 +105,9 @@ def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
 
 
 def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
-    """Sprites whose discs of some bodies are dark, or have a share of their light; what they hide stays hidden."""
+    """Sprites whose discs of some bodies are dark, or have a share of their light; what they
+    hide stays hidden.
+    """
     if not any(name in gone for name in sprites.discs):
         return sprites
     lights = tuple(

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 class Sources:
     """The light of a bench's sky beside its stars.
 
-    That is bodies, satellites and the observer (`moving`, None where the sky stands still), and `diffuse` light, e-/s/sr.
+    That is bodies, satellites and the observer (`moving`, None where the sky stands still), and
+    `diffuse` light, e-/s/sr.
     """
 
     moving: "MovingSky | None" = None
@@ -32,7 +33,9 @@ NO_SOURCES = Sources()
 
 
 def seen_in(view: View, stars: Stars, moving: "MovingSky | None") -> Stars:
-    """A bench's stars as a view has them; bodies are moved to their places in the arrays of `stars`."""
+    """A bench's stars as a view has them; bodies are moved to their places in the arrays of
+    `stars`.
+    """
     return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
 
 
@@ -44,13 +47,15 @@ def sky_layers(
     *,
     paths: bool = True,
 ) -> tuple[Layer, ...]:
-    """The layers of the sky: a bench's stars, diffuse light, bodies, and satellites of at least `faintest_e_per_s`.
+    """The layers of the sky: a bench's stars, diffuse light, bodies, and satellites of at least
+    `faintest_e_per_s`.
 
     For `frequent` and `paths` see `StarLayer`.
     """
     layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
     if sources.diffuse:
-        from hilstar.optics.layers.diffuse import DiffuseLayer  # its libraries take 30 ms, which only a map needs
+        # its libraries take 30 ms, which only a map needs
+        from hilstar.optics.layers.diffuse import DiffuseLayer
 
         layers.append(DiffuseLayer(sources.diffuse, canvas))
     moving = sources.moving
@@ -79,9 +84,11 @@ def no_light(footprint_px: int) -> Sprites:
 
 @dataclass(frozen=True, slots=True)
 class StarLayer:
-    """Stars: points where the camera is at rest or without `paths`, otherwise each along its path while light arrives.
+    """Stars: points where the camera is at rest or without `paths`, otherwise each along its path
+    while light arrives.
 
-    The stars `frequent` are drawn in most frames: those near the field are kept from one frame to the next.
+    The stars `frequent` are drawn in most frames: those near the field are kept from one frame to
+    the next.
     """
 
     canvas: Canvas

@@ -1,4 +1,6 @@
-"""Satellites in an image: each a streak along its path, a disc where it is wide enough to have a face."""
+"""Satellites in an image: each a streak along its path, a disc where it is wide enough to have a
+face.
+"""
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -17,8 +19,8 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
     from hilstar.sky.bodies.passes import Pass, Satellites
 
-# Limits of the work: sprites of all satellites together in a frame (the cost of 60 stars' paths of 16 px) and in an exposure,
-# and poses of one disc.
+# Limits of the work: sprites of all satellites together in a frame (the cost of 60 stars' paths of
+# 16 px) and in an exposure, and poses of one disc.
 FRAME_SPRITES, EXPOSURE_SPRITES = 1000, 200_000
 FRAME_POSES, EXPOSURE_POSES = 33, 500
 ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
@@ -33,12 +35,15 @@ class SatelliteLayer:
     faintest_e_per_s: float = 0.0
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light before and that of the satellites in the image, which are written into the arrays of `stars`."""
+        """The light before and that of the satellites in the image, which are written into the
+        arrays of `stars`.
+        """
         canvas, satellites = self.canvas, self.moving.satellites
         rows, turn = view.rows, view.turn
         if not view.exposed:
             turn, _ = slowed(turn, view.scan, canvas.camera)
-        longest_s = max(abs(view.begin_s), rows.longest_s)  # between the moment of the attitude and any light
+        # between the moment of the attitude and any light
+        longest_s = max(abs(view.begin_s), rows.longest_s)
         margin_px = canvas.psf.footprint_px / 2 + 1
         reach_rad = canvas.camera.field_radius_rad(margin_px) + turn.speed_rad_s * longest_s
         seen = self._passing(view, reach_rad, longest_s)
@@ -95,7 +100,9 @@ class SatelliteLayer:
         return Lit(view.begin_s + late_s, rows.hold_s)
 
     def _with_discs(self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View) -> Sprites:
-        """The light before with satellites as discs, the farthest first, and without what they hide."""
+        """The light before with satellites as discs, the farthest first, and without what they
+        hide.
+        """
         satellites: Satellites | None = self.moving.satellites
         if satellites is None:
             return light

@@ -1,6 +1,7 @@
 """Stray light over an image: a gradient and a measured map, as one camera sees them.
 
-Both are computed once, in the camera's own pixels: what each collects of the light of a tracker pixel.
+Both are computed once, in the camera's own pixels: what each collects of the light of a tracker
+pixel.
 """
 
 import hashlib
@@ -19,14 +20,17 @@ from hilstar.basics.reading import read_bytes
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
 
-GRID_PX = 8  # a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
+# a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
+GRID_PX = 8
 MAX_FILE_BYTES = 200_000_000
 MAX_SIDE_PX = 16_384
 MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
 
 
 def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32Array:
-    """Electrons per second of each camera pixel (h, w) where the brightest corner of the detector has 1 in a tracker pixel."""
+    """Electrons per second of each camera pixel (h, w) where the brightest corner of the
+    detector has 1 in a tracker pixel.
+    """
     x_px, y_px, area = pixels_in(camera, tracker)
     width, height = tracker.resolution_px
     right, down = math.cos(math.radians(fault.towards_deg)), math.sin(math.radians(fault.towards_deg))
@@ -36,7 +40,9 @@ def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32A
 
 
 def map_image(values: FloatArray, fault: MeasuredMap, camera: Camera, source: Camera) -> Float32Array:
-    """Electrons per second of each camera pixel (h, w) of a map over the whole image of `source`; nothing outside it."""
+    """Electrons per second of each camera pixel (h, w) of a map over the whole image of
+    `source`; nothing outside it.
+    """
     from scipy.ndimage import map_coordinates
 
     x_px, y_px, area = pixels_in(camera, source)
@@ -54,7 +60,9 @@ def as_light(image: FloatArray) -> Float32Array:
 
 
 class PixelsIn(NamedTuple):
-    """Where each pixel of a camera is in another's pixels, and how many of those it covers: (h, w) each, NaN for nowhere."""
+    """Where each pixel of a camera is in another's pixels, and how many of those it covers: (h,
+    w) each, NaN for nowhere.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -91,7 +99,9 @@ def map_sha256(path: Path) -> str:
 
 
 def read_map(path: Path) -> FloatArray:
-    """The image (h, w) in a file, its first row at the top. Raises InputError for one that is no map of light."""
+    """The image (h, w) in a file, its first row at the top. Raises InputError for one that is no
+    map of light.
+    """
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     values = _decoded(path, raw)
     if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:

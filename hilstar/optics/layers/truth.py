@@ -51,7 +51,9 @@ def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
 
 
 def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
-    """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none clipped yet."""
+    """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none
+    clipped yet.
+    """
     truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
     truth["hip"], truth["name"] = stars.hip[star], stars.names(star)
     truth["x_px"], truth["y_px"] = x_px, y_px
@@ -73,7 +75,9 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
 def with_columns(
     truth: npt.NDArray[np.void], added: Mapping[str, npt.NDArray[Any]], rows: IntArray | None = None
 ) -> npt.NDArray[np.void]:
-    """Rows (n,) with columns more, of values of all rows or of `rows` (k,); others have NaN or False."""
+    """Rows (n,) with columns more, of values of all rows or of `rows` (k,); others have NaN or
+    False.
+    """
     where = np.arange(len(truth)) if rows is None else rows
     found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())])
     for name in truth.dtype.names or ():
@@ -85,7 +89,8 @@ def with_columns(
 
 
 def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> npt.NDArray[np.void]:
-    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares (n, 3) of a star's.
+    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares
+    (n, 3) of a star's.
 
     `colours` None, of a tracker with one channel: the rows themselves.
     """
@@ -98,13 +103,15 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
 
 
 def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:
-    """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`, rms of its two axes.
+    """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`,
+    rms of its two axes.
 
     Both stay NaN for bodies, and for stars that have no errors in their `catalog`, whose facts are
     read here.
     """
     listed = np.flatnonzero(truth["hip"] > 0)
-    near = np.flatnonzero(np.isin(catalog.hip, truth["hip"][listed]))  # a tenth of the time that sorting a catalogue takes
+    # a tenth of the time that sorting a catalogue takes
+    near = np.flatnonzero(np.isin(catalog.hip, truth["hip"][listed]))
     order = near[np.argsort(catalog.hip[near])]
     stars = catalog.taken(order[np.searchsorted(catalog.hip[order], truth["hip"][listed])])
     facts = errors_of(stars)
@@ -116,7 +123,9 @@ def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: floa
 
 
 def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
-    """The stars of the sprites at positions `which` (n,), each once: HIP numbers, or names without one."""
+    """The stars of the sprites at positions `which` (n,), each once: HIP numbers, or names
+    without one.
+    """
     star = np.unique(sprites.star[which])
     added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
     return (*stars.designations(star[star >= 0]), *added)
@@ -129,7 +138,8 @@ def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
 
 
 def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
-    """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped` are positions of sprites.
+    """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped`
+    are positions of sprites.
 
     Light that a fault adds has a row too, with its name, at the middle of its sprites.
     """
@@ -152,7 +162,9 @@ def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt
 
 
 def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
-    """Rows of TRUTH_DTYPE for the light that faults add, by the index of each; `over` (n,) says which sprites clip."""
+    """Rows of TRUTH_DTYPE for the light that faults add, by the index of each; `over` (n,) says
+    which sprites clip.
+    """
     of_added = np.flatnonzero(sprites.star < 0)
     star, line = np.unique(sprites.star[of_added], return_inverse=True)
     light = sprites.data["electrons_per_s"][of_added].astype(np.float64)
@@ -172,7 +184,8 @@ def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np
 
 @dataclass(frozen=True, slots=True)
 class StarInView:
-    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from the boresight.
+    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from
+    the boresight.
 
     A body has a `name`, and 0 for `hip`.
     """
@@ -189,7 +202,8 @@ class StarInView:
 
 
 def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
-    """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the brightest first.
+    """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the
+    brightest first.
 
     `stars` are those of the light, as seen at the attitude.
     """
@@ -205,7 +219,8 @@ def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_ca
     ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
     constellations: list[str] = []
     if len(found):
-        from astropy.coordinates import SkyCoord, get_constellation  # takes half a second, which only this needs
+        # takes half a second, which only this needs
+        from astropy.coordinates import SkyCoord, get_constellation
 
         # IAU boundaries of 1930
         constellations = [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]

@@ -31,12 +31,14 @@ class Observer(NamedTuple):
 class View:
     """From where, when and for how long one looks.
 
-    `rate_cam_rad_s` (3,) is the rate of cam in icrs in cam components, constant while light arrives; None for a still picture,
-    whose light has its middle at the moment of the attitude. With a rate `q_icrs_to_cam` (4,) is the attitude when the middle
-    row of `scan` lights up, or, in a view that is `exposed`, the attitude in the middle of the exposure.
+    `rate_cam_rad_s` (3,) is the rate of cam in icrs in cam components, constant while light
+    arrives; None for a still picture, whose light has its middle at the moment of the attitude.
+    With a rate `q_icrs_to_cam` (4,) is the attitude when the middle row of `scan` lights up, or, in
+    a view that is `exposed`, the attitude in the middle of the exposure.
 
-    The sky is that of `t_ns` (None: the start) for an observer with `velocity_km_s` (3,), ICRS, relative to the bench's own
-    observer, and `place_km` (3,), ICRS axes from the Earth's centre; None for the bench's own (see `MovingSky.seen`).
+    The sky is that of `t_ns` (None: the start) for an observer with `velocity_km_s` (3,), ICRS,
+    relative to the bench's own observer, and `place_km` (3,), ICRS axes from the Earth's centre;
+    None for the bench's own (see `MovingSky.seen`).
     """
 
     q_icrs_to_cam: FloatArray
@@ -57,7 +59,9 @@ class View:
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
     ) -> "View":
-        """The view of a detector whose pixels all collect light for `exposure_s`; `t_ns` is the middle of that time."""
+        """The view of a detector whose pixels all collect light for `exposure_s`; `t_ns` is the
+        middle of that time.
+        """
         scan = Scan(hold_s=exposure_s)
         return cls(q_icrs_to_cam, rate_cam_rad_s, t_ns, velocity_km_s, place_km, scan, exposed=True)
 
@@ -105,8 +109,8 @@ class View:
 class Canvas:
     """An image on which layers draw: its camera, and how a point is spread on it.
 
-    A pixel shows up to `white_e_per_s` on a screen, or `full_e` electrons in a detector's exposure. A screen shows nothing of
-    less light than its `first_step_e_per_s`.
+    A pixel shows up to `white_e_per_s` on a screen, or `full_e` electrons in a detector's exposure.
+    A screen shows nothing of less light than its `first_step_e_per_s`.
     """
 
     camera: Camera
@@ -121,7 +125,11 @@ class Canvas:
 
 
 class Layer(Protocol):
-    """One kind of light in an image, or what takes light away. Layers are applied in order (see `layers.light_of`)."""
+    """One kind of light in an image, or what takes light away. Layers are applied in order (see
+    `layers.light_of`).
+    """
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light of the layers before, together with this layer's; `stars` are as seen in the view."""
+        """The light of the layers before, together with this layer's; `stars` are as seen in the
+        view.
+        """

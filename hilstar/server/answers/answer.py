@@ -1,4 +1,6 @@
-"""An answer of a star tracker, whatever its format: when, which attitude, and what the tracker says of itself."""
+"""An answer of a star tracker, whatever its format: when, which attitude, and what the tracker
+says of itself.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -6,11 +8,14 @@ from typing import NamedTuple, Protocol
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import NS_PER_S
 
-JUMP_NS = NS_PER_S  # a stamp that is off by more is of a clock that was set, not of an answer that was overtaken
+# a stamp that is off by more is of a clock that was set, not of an answer that was overtaken
+JUMP_NS = NS_PER_S
 
 
 class ReportedStar(NamedTuple):
-    """A star that the tracker reports: its centroid in the tracker's pixels, its signal, and its Hipparcos number, if given."""
+    """A star that the tracker reports: its centroid in the tracker's pixels, its signal, and its
+    Hipparcos number, if given.
+    """
 
     x_px: float
     y_px: float
@@ -22,8 +27,9 @@ class ReportedStar(NamedTuple):
 class Answer:
     """One answer, after the bench file's conventions were applied.
 
-    `host_ns`: the host's monotonic clock at its last byte. `t_ns`: the tracker's own stamp on its own clock, None where it
-    sends none. `q_icrs_to_cam`: unit quaternion (w, x, y, z), None where it has no attitude. `mode` is the tracker's own word.
+    `host_ns`: the host's monotonic clock at its last byte. `t_ns`: the tracker's own stamp on its
+    own clock, None where it sends none. `q_icrs_to_cam`: unit quaternion (w, x, y, z), None where
+    it has no attitude. `mode` is the tracker's own word.
     """
 
     host_ns: int
@@ -39,14 +45,18 @@ class Answer:
 
 
 class StampOrder:
-    """Counts the stamps that are before an earlier answer's (`fallen`): a datagram was overtaken by another."""
+    """Counts the stamps that are before an earlier answer's (`fallen`): a datagram was overtaken
+    by another.
+    """
 
     def __init__(self) -> None:
         self.fallen = 0
         self._newest_ns: int | None = None
 
     def take(self, t_ns: int) -> None:
-        """Take the stamp of the next answer. A step back by more than JUMP_NS begins anew: the clock was set."""
+        """Take the stamp of the next answer. A step back by more than JUMP_NS begins anew: the
+        clock was set.
+        """
         newest_ns = self._newest_ns
         if newest_ns is not None and 0 < newest_ns - t_ns <= JUMP_NS:
             self.fallen += 1
@@ -57,7 +67,8 @@ class StampOrder:
 class AnswerSource(Protocol):
     """Where answers come from. Never waits, never raises for what a tracker sends.
 
-    `unread` says why nothing is read, "" while answers are: then it is not the tracker that is silent.
+    `unread` says why nothing is read, "" while answers are: then it is not the tracker that is
+    silent.
     """
 
     @property

@@ -1,4 +1,6 @@
-"""An answer explained: which bytes became which field, why bytes were refused, and which convention makes it what is shown."""
+"""An answer explained: which bytes became which field, why bytes were refused, and which
+convention makes it what is shown.
+"""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -16,13 +18,16 @@ from hilstar.server.answers.formats import CHECKSUMS, AnswerDecoder, RefusedAnsw
 from hilstar.server.bench.config.answers import field_format
 
 MAX_SHOWN_BYTES = 96
-NEAR_RAD = np.radians(5.0)  # an answer this near to what is shown has its convention, whatever its bias
+# an answer this near to what is shown has its convention, whatever its bias
+NEAR_RAD = np.radians(5.0)
 APART = 20.0  # and other conventions are so many times further off
 
 
 @dataclass(frozen=True, slots=True)
 class UnderConvention:
-    """An answer under a convention: q_icrs_to_cam, and how far it is from what is shown, rad (None: not known)."""
+    """An answer under a convention: q_icrs_to_cam, and how far it is from what is shown, rad
+    (None: not known).
+    """
 
     convention: Convention
     q_icrs_to_cam: FloatArray
@@ -44,7 +49,9 @@ def _angle(off_rad: float) -> str:
 
 
 def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[UnderConvention]:
-    """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of what is shown."""
+    """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of
+    what is shown.
+    """
     mounted = decoder.q_body_to_cam
     if answer.q_icrs_to_cam is None:
         return []

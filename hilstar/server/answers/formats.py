@@ -1,8 +1,10 @@
 """The bytes of a tracker to answers: frames cut out of a stream, checked and decoded; no I/O.
 
 Laws:
-1. Nothing that a tracker sends raises. Bytes that are no answer give a `RefusedAnswer`, which says why.
-2. However a stream is cut into chunks, the answers are the same, while no pause lasts PAUSE_NS. After one a frame begins anew:
+1. Nothing that a tracker sends raises. Bytes that are no answer give a `RefusedAnswer`, which says
+   why.
+2. However a stream is cut into chunks, the answers are the same, while no pause lasts PAUSE_NS.
+   After one a frame begins anew:
    what was kept is then looked through for whole frames, and dropped.
 3. At most MAX_KEPT_BYTES are kept between chunks.
 4. A frame whose checksum is wrong is never an answer.
@@ -34,7 +36,8 @@ from hilstar.server.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
-MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64  # a number beyond its limit is left out, a word is cut
+# a number beyond its limit is left out, a word is cut
+MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64
 PAUSE_NS = NS_PER_S // 10
 CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
 SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
@@ -116,7 +119,9 @@ class Cut(NamedTuple):
 
 
 class Delimited:
-    """Frames that end with a delimiter: COBS, SLIP and lines. What precedes the first delimiter of a stream may be cut off."""
+    """Frames that end with a delimiter: COBS, SLIP and lines. What precedes the first delimiter
+    of a stream may be cut off.
+    """
 
     def __init__(self, end: bytes, max_bytes: int, unstuff: Callable[[bytes], bytes], word: str, whole: bool = False) -> None:
         self._end, self._max, self._unstuff, self._word = end, max_bytes, unstuff, word
@@ -166,9 +171,11 @@ def unslip(body: bytes) -> bytes:
 
 
 class Measured:
-    """Frames told apart by what they begin with and how long they are: sync bytes, Space Packets, or a fixed length.
+    """Frames told apart by what they begin with and how long they are: sync bytes, Space Packets,
+    or a fixed length.
 
-    A frame that is wrong may have begun at the wrong byte: the next is looked for from its second byte on.
+    A frame that is wrong may have begun at the wrong byte: the next is looked for from its second
+    byte on.
     """
 
     def __init__(self, settings: AnswersSettings, check: Callable[[bytes], str], certain: bool) -> None:
@@ -179,7 +186,9 @@ class Measured:
         self._silent_bytes = 0  # lost bytes of which nothing more is said
 
     def pause(self) -> Iterator[Cut]:
-        """Nothing came for a while: what is kept is no frame from its beginning on, or one whose end is lost."""
+        """Nothing came for a while: what is kept is no frame from its beginning on, or one whose
+        end is lost.
+        """
         if not self._certain and not self._sync and not self._ccsds:
             self._kept.clear()
         while self._kept:
@@ -221,7 +230,8 @@ class Measured:
         del kept[:at]
 
     def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
-        """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first of as many as a frame has.
+        """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first
+        of as many as a frame has.
 
         Where nothing tells where a frame begins, each of a damaged one's bytes is tried.
         """
@@ -233,7 +243,9 @@ class Measured:
             yield Cut(raw, "checksum" if of_checksum else "framing", detail)
 
     def _size(self, at: int) -> int | None:
-        """Bytes of the frame that begins there; 0 where none can, None where too few have come to tell."""
+        """Bytes of the frame that begins there; 0 where none can, None where too few have come
+        to tell.
+        """
         kept = self._kept
         if self._ccsds:
             if len(kept) - at < CCSDS_HEADER_BYTES:
@@ -296,7 +308,9 @@ class FrameDecoder:
         return said_by(found, body)
 
     def value(self, body: bytes, field: FrameField) -> int | float:
-        """The value of a field: whole where neither scale nor sum says otherwise. Raises IndexError beyond the frame's end."""
+        """The value of a field: whole where neither scale nor sum says otherwise. Raises
+        IndexError beyond the frame's end.
+        """
         raw = raw_number(body, field.at, field.type)
         if field.mask is not None and isinstance(raw, int):
             raw = (raw & field.mask) >> ((field.mask & -field.mask).bit_length() - 1)
@@ -320,7 +334,8 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     if not all(number is None or math.isfinite(number) for number in (stars, mode)):
         stars = mode = None
     valid = "valid" not in found or (math.isfinite(found["valid"]) and found["valid"] != 0)
-    # Numbers of another kind in a frame are the tracker's own affair; four and three of them are fixed by the bench file.
+    # Numbers of another kind in a frame are the tracker's own affair; four and three of them are
+    # fixed by the bench file.
     return JsonAnswer(
         t_ns, (q[0], q[1], q[2], q[3]), None if rate is None else (rate[0], rate[1], rate[2]), valid,
         None if mode is None else f"{mode:g}", None if stars is None else int(stars),
@@ -333,8 +348,8 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
 class AnswerDecoder:
     """Bytes in, answers and refusals out, by the format that a bench file names.
 
-    `messages` says that each chunk is whole by itself (UDP, ZeroMQ). Raises InputError where a Python function cannot be
-    loaded, whose module stands in `folder` or in a package of `trust`.
+    `messages` says that each chunk is whole by itself (UDP, ZeroMQ). Raises InputError where a
+    Python function cannot be loaded, whose module stands in `folder` or in a package of `trust`.
     """
 
     def __init__(

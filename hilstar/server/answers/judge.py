@@ -1,13 +1,17 @@
-"""A tracker's answers judged as they come: when each looked, how far it is off, and the figures of the last minute; no I/O.
+"""A tracker's answers judged as they come: when each looked, how far it is off, and the figures of
+the last minute; no I/O.
 
-**When.** A stamp on the tracker's own clock is followed as a sender's clock is (`SenderClock`), from arrivals alone. That tells
-times up to the shortest delay D from an exposure's middle to its answer. D is found from the motion: reading the lit attitude
-too late by delta turns a residual by omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the
-answers of the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and GUESSED_DELAY_S.
+**When.** A stamp on the tracker's own clock is followed as a sender's clock is (`SenderClock`),
+from arrivals alone. That tells times up to the shortest delay D from an exposure's middle to its
+answer. D is found from the motion: reading the lit attitude too late by delta turns a residual by
+omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the answers of
+the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and
+GUESSED_DELAY_S.
 
-**Laws.** Answers of finite numbers, however odd and in whatever order, never end the judging. No number that is not finite is
-stored. A fit that is not finite, that has too few answers near it, or whose delay is over MAX_DELAY_S is dropped, and the delay
-before it stays. A delay under which answers are no longer right is given up for the guess.
+**Laws.** Answers of finite numbers, however odd and in whatever order, never end the judging. No
+number that is not finite is stored. A fit that is not finite, that has too few answers near it, or
+whose delay is over MAX_DELAY_S is dropped, and the delay before it stays. A delay under which
+answers are no longer right is given up for the guess.
 """
 
 import math
@@ -38,9 +42,12 @@ GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
 FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
 MAX_ROUNDS = 8  # of the fit, which ends earlier where the same answers count as in the round before
 CUT_SIGMAS = 8.0
-MIN_NOISE_ARCSEC = 0.1  # least noise that the fit takes: answers without noise have errors of the pairing
-MAX_DELAY_S = KEPT_NS / NS_PER_S / 2  # under a longer one the frames of an exposure are soon forgotten
-SURE, MAX_EXCUSED_S = 3.0, 0.3  # sigmas of the time by which an answer may be off for its rate, and at most so long
+# least noise that the fit takes: answers without noise have errors of the pairing
+MIN_NOISE_ARCSEC = 0.1
+# under a longer one the frames of an exposure are soon forgotten
+MAX_DELAY_S = KEPT_NS / NS_PER_S / 2
+# sigmas of the time by which an answer may be off for its rate, and at most so long
+SURE, MAX_EXCUSED_S = 3.0, 0.3
 KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
 JUMPS = 3  # answers in a row that are later by JUMP_NS: the tracker's clock was set
 SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
@@ -48,7 +55,9 @@ SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before th
 
 @dataclass(frozen=True, slots=True)
 class AnswerRules:
-    """What the bench file says of answers' times, and from which angle on one is wrong. `latency_s` None: not known."""
+    """What the bench file says of answers' times, and from which angle on one is wrong.
+    `latency_s` None: not known.
+    """
 
     exposure_s: float
     stamp: Stamp = "middle"
@@ -67,7 +76,9 @@ class AnswerRules:
 
 
 class Judged(NamedTuple):
-    """An answer, its exposure's middle (host time, ns, with its sigma, s), what was lit, and the residual (3,), arcsec, cam."""
+    """An answer, its exposure's middle (host time, ns, with its sigma, s), what was lit, and the
+    residual (3,), arcsec, cam.
+    """
 
     answer: Answer
     verdict: Verdict
@@ -78,18 +89,23 @@ class Judged(NamedTuple):
 
 
 def unjudged(answer: Answer) -> Judged:
-    """An answer that is compared with nothing: its exposure is not known, and its arrival stands for it."""
+    """An answer that is compared with nothing: its exposure is not known, and its arrival stands
+    for it.
+    """
     return Judged(answer, "unjudged", answer.host_ns, 0.0)
 
 
 class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """A tracker's answers: counts of the run, the newest answer, and the last minute's figures; arcsec about x, y, z (cam).
+    """A tracker's answers: counts of the run, the newest answer, and the last minute's figures;
+    arcsec about x, y, z (cam).
 
-    `out_of_order` counts answers whose stamp is before that of one that came earlier, `unjudged` those that judging failed on.
-    `rms_arcsec` is about zero, `sigma3_arcsec` three standard deviations about the mean, both of right answers.
-    `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null: not known). `availability`
-    is right answers over those due while a sky was shown. `silent` says that no answer comes, "" while they do, and `trouble`
-    what is wrong with the tracker's line for as long as it lasts.
+    `out_of_order` counts answers whose stamp is before that of one that came earlier, `unjudged`
+    those that judging failed on. `rms_arcsec` is about zero, `sigma3_arcsec` three standard
+    deviations about the mean, both of right answers.
+    `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null:
+    not known). `availability` is right answers over those due while a sky was shown. `silent` says
+    that no answer comes, "" while they do, and `trouble` what is wrong with the tracker's line for
+    as long as it lasts.
     """
 
     answers: int = 0
@@ -171,10 +187,12 @@ class DelayFit(NamedTuple):
 
 
 def fitted_delay(error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float) -> DelayFit | None:
-    """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they tell none.
+    """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they
+    tell none.
 
-    `pull_s` is from the present delay to the guessed one, which is known to GUESSED_SIGMA_S. An axis has its own noise: a
-    tracker's roll is many times as noisy as its cross axes. Answers far from the others, by their axes' noise, do not count.
+    `pull_s` is from the present delay to the guessed one, which is known to GUESSED_SIGMA_S. An
+    axis has its own noise: a tracker's roll is many times as noisy as its cross axes. Answers far
+    from the others, by their axes' noise, do not count.
     """
     design = np.zeros((len(error_arcsec), 3, 4))
     design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate_arcsec_s
@@ -203,7 +221,8 @@ def fitted_delay(error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: fl
 
 
 VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
-# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s; residual; rate, arcsec/s.
+# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s;
+# residual; rate, arcsec/s.
 HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
 
 
@@ -248,7 +267,9 @@ class AnswerJudge:
         return found
 
     def _verdict(self, residual: FloatArray, lit: Lit, sigma_s: float) -> Verdict:
-        """Whether a residual is an attitude of the sky that was lit, by a time known to `sigma_s`."""
+        """Whether a residual is an attitude of the sky that was lit, by a time known to
+        `sigma_s`.
+        """
         off_arcsec = float(np.linalg.norm(residual))
         rate_arcsec_s = ARCSEC_PER_RAD * float(np.linalg.norm(lit.rate_rad_s))
         if not math.isfinite(off_arcsec) or not math.isfinite(rate_arcsec_s):
@@ -258,7 +279,9 @@ class AnswerJudge:
         return "wrong" if off_arcsec > bound_arcsec else "right"
 
     def _keep(self, found: Judged) -> None:
-        """Count an answer, and keep its row; without a comparison its error and rate are 0, which nothing reads."""
+        """Count an answer, and keep its row; without a comparison its error and rate are 0,
+        which nothing reads.
+        """
         row = self._rows[self._count % MAX_IN_WINDOW]
         row[:] = 0.0
         row[:3] = found.answer.host_ns / NS_PER_S, VERDICTS.index(found.verdict), self._frames.dark_ns / NS_PER_S
@@ -296,7 +319,8 @@ class AnswerJudge:
         self._rows[:, ERROR] -= self._rows[:, RATE] * shift_s
 
     def figures(self, now_ns: int, refused: dict[str, int], trouble: str = "") -> TrackerFigures:
-        """The figures at a host time; `refused` counts bytes or messages that were no answer, by reason.
+        """The figures at a host time; `refused` counts bytes or messages that were no answer, by
+        reason.
 
         `trouble` is what is wrong with the tracker's line.
         """

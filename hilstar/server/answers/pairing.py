@@ -1,4 +1,6 @@
-"""An answer and what was lit while the tracker looked: the mean attitude over an exposure, frame by frame."""
+"""An answer and what was lit while the tracker looked: the mean attitude over an exposure, frame
+by frame.
+"""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,14 +12,18 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, propagate, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 
-KEPT_NS = 20 * NS_PER_S  # how long a frame is kept: an answer that comes later than that is not compared
+# how long a frame is kept: an answer that comes later than that is not compared
+KEPT_NS = 20 * NS_PER_S
 MAX_HELD_NS = NS_PER_S // 2  # a frame without a following one is taken to stay for so long
 MIN_LIT_SHARE = 0.5  # an exposure that was darker shows no commanded attitude
-MAX_STEP_RAD = np.radians(2.0)  # between two frames of an exposure: a larger step is a jump, and the exposure has two skies
+# between two frames of an exposure: a larger step is a jump, and the exposure has two skies
+MAX_STEP_RAD = np.radians(2.0)
 
 
 class LitFrame(NamedTuple):
-    """A frame: its light's begin on the host's and on the sender's clock, ns, and what it shows; `q` None shows no sky."""
+    """A frame: its light's begin on the host's and on the sender's clock, ns, and what it shows;
+    `q` None shows no sky.
+    """
 
     number: int
     host_ns: int
@@ -28,7 +34,8 @@ class LitFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Lit:
-    """What was lit over an exposure: the mean `q_icrs_to_cam`, the rate (3,), rad/s, cam, and its first and last frames.
+    """What was lit over an exposure: the mean `q_icrs_to_cam`, the rate (3,), rad/s, cam, and its
+    first and last frames.
 
     `light_ns` is the exposure's middle on the sender's clock.
     """
@@ -43,8 +50,9 @@ class Lit:
 class LitFrames:
     """The frames of the last seconds. One thread adds them, another asks.
 
-    A frame is lit until the next one. `centred`: frames stand for the time about their moment, as without a screen that holds
-    them; `hold_s` is how long a row of a screen stays lit, through the middle of which a frame drawn in motion passes.
+    A frame is lit until the next one. `centred`: frames stand for the time about their moment, as
+    without a screen that holds them; `hold_s` is how long a row of a screen stays lit, through the
+    middle of which a frame drawn in motion passes.
     """
 
     def __init__(self, period_ns: float, hold_s: float = 0.0, *, centred: bool = True) -> None:
@@ -64,7 +72,9 @@ class LitFrames:
         return self._frames[-1] if self._frames else None
 
     def over(self, start_ns: int, end_ns: int) -> Lit | None:
-        """What was lit from `start_ns` to `end_ns` of the host's clock; None where that was no one sky, or is forgotten."""
+        """What was lit from `start_ns` to `end_ns` of the host's clock; None where that was no
+        one sky, or is forgotten.
+        """
         frames = list(self._frames)
         first = len(frames) - 1
         while first >= 0 and self._begin_ns(frames[first]) > start_ns:
@@ -91,7 +101,9 @@ class LitFrames:
         return frame.host_ns - (self._early_ns if frame.rate_rad_s is None else 0)
 
     def _mean(self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int) -> Lit | None:
-        """The mean rotation of the frames `kept`, weighted by how long each was lit; None across a jump."""
+        """The mean rotation of the frames `kept`, weighted by how long each was lit; None across
+        a jump.
+        """
         # The rate needs two frames: of a short exposure a neighbour too.
         near = kept if len(kept) > 1 else [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
         near = [k for k in near if frames[k].q is not None]
@@ -112,11 +124,15 @@ class LitFrames:
         return Lit(q_mean, rate, light_ns, frames[kept[0]].number, frames[kept[-1]].number)
 
     def _shown(self, frame: LitFrame) -> FloatArray:
-        """The mean attitude of what a frame shows: of one drawn in motion that of the middle of its light."""
+        """The mean attitude of what a frame shows: of one drawn in motion that of the middle of
+        its light.
+        """
         assert frame.q is not None
         return frame.q if frame.rate_rad_s is None else propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
 
 
 def residual_arcsec(reported: FloatArray, lit: FloatArray) -> FloatArray:
-    """The rotation vector (3,) from a lit to a reported attitude, cam, as `hilstar assess` has it."""
+    """The rotation vector (3,) from a lit to a reported attitude, cam, as `hilstar assess` has
+    it.
+    """
     return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(reported, conjugate(lit))))

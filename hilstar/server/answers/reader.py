@@ -1,9 +1,11 @@
-"""A tracker's answers, read by a process apart: a tracker that is dead, silent, babbling or lying never disturbs a frame.
+"""A tracker's answers, read by a process apart: a tracker that is dead, silent, babbling or lying
+never disturbs a frame.
 
-The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and hands over answers and counts
-of what it refused. It decodes at most MAX_BYTES_PER_S, for at most WORK_SHARE of the time, and gives at most MAX_ANSWERS_PER_S;
-the rest is counted as `flood`: noise in which a frame may begin at every byte would otherwise take a whole core. What cannot
-end is read no faster than a chunk each FLOOD_REST_S: a core that only reads and drops is missing to the frames.
+The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and
+hands over answers and counts of what it refused. It decodes at most MAX_BYTES_PER_S, for at most
+WORK_SHARE of the time, and gives at most MAX_ANSWERS_PER_S; the rest is counted as `flood`: noise
+in which a frame may begin at every byte would otherwise take a whole core. What cannot end is read
+no faster than a chunk each FLOOD_REST_S: a core that only reads and drops is missing to the frames.
 """
 
 from collections import Counter
@@ -46,7 +48,8 @@ ZMQ_ENDPOINT = "tcp://127.0.0.1:5562"
 MAX_BYTES_PER_S, MAX_BURST_BYTES = 500_000, 250_000
 WORK_SHARE, MAX_WORK_S = 0.2, 0.1
 PIECE_BYTES = 4096  # decoded in one go, of what is no message
-MAX_ANSWERS_PER_S = 200  # no tracker says more; 1000 decoded here would delay one frame in ten by a millisecond or two
+# no tracker says more; 1000 decoded here would delay one frame in ten by a millisecond or two
+MAX_ANSWERS_PER_S = 200
 FLOOD = "flood"
 FLOOD_REST_S = 0.01
 CHUNK_BYTES, LOOK_MS = 65_536, 100
@@ -56,7 +59,8 @@ MAX_DETAILS = 20  # reasons whose newest example is kept
 class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
     """What the other process decoded: an answer, or counts of refusals with an example of each.
 
-    `trouble` is what is wrong with the line from now on, "" for nothing; None where that is as before.
+    `trouble` is what is wrong with the line from now on, "" for nothing; None where that is as
+    before.
     """
 
     answer: Answer | None = None
@@ -100,7 +104,9 @@ class ReadPlan:
         return (TcpBytes if settings.source == "tcp" else UdpBytes)(place, allowed, notices)
 
     def open_first(self, notices: Notices) -> ByteLink:
-        """The road, at a run's start: where a file is to come, nothing else may be there. Raises InputError as `open`."""
+        """The road, at a run's start: where a file is to come, nothing else may be there. Raises
+        InputError as `open`.
+        """
         if self.settings.source == "file":
             refuse_no_file(self.folder / str(self.settings.path))
         return self.open(notices)
@@ -111,7 +117,9 @@ class ReadPlan:
 
 
 class DecodingLink:
-    """In the other process: the road, its bounds, its questions, and what the bytes say, each message a `HandedOver`."""
+    """In the other process: the road, its bounds, its questions, and what the bytes say, each
+    message a `HandedOver`.
+    """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._link, self._clock = plan.open(notices), clock
@@ -193,7 +201,8 @@ class DecodingLink:
 
 
 class AnswersApart(Closing):
-    """A bench's answers, an `AnswerSource`: the other process is started at once, and restarted where it ends.
+    """A bench's answers, an `AnswerSource`: the other process is started at once, and restarted
+    where it ends.
 
     Raises InputError where the road cannot be opened, or a Python function cannot be loaded.
     """
@@ -213,7 +222,9 @@ class AnswersApart(Closing):
 
     @property
     def unread(self) -> str:
-        """Why nothing is read now, "" while answers are: then it is not the tracker that is silent."""
+        """Why nothing is read now, "" while answers are: then it is not the tracker that is
+        silent.
+        """
         return self._process.trouble
 
     def await_ready(self) -> None:
@@ -221,7 +232,9 @@ class AnswersApart(Closing):
         self._process.await_ready()
 
     def take(self, timeout_ms: float = 0.0) -> list[Answer]:
-        """The answers since the last call, oldest first; waits at most `timeout_ms` for the first."""
+        """The answers since the last call, oldest first; waits at most `timeout_ms` for the
+        first.
+        """
         found: list[Answer] = []
         for record in self._process.take() if self._process.wait(timeout_ms) else ():
             if record.message is None:
@@ -265,7 +278,9 @@ def live_answers(
     stopped: Callable[[], bool],
     clock: HostClock = HOST_CLOCK,
 ) -> Iterator[Answer | RefusedAnswer]:
-    """The answers of an open road, read in this process for so long; the tracker is asked where it has to be."""
+    """The answers of an open road, read in this process for so long; the tracker is asked where
+    it has to be.
+    """
     settings, begun_ns = plan.settings, clock.now_ns()
     question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
     due = clock.within(0.0)
@@ -278,7 +293,9 @@ def live_answers(
 
 
 def open_answers(config: BenchConfig, folder: Path, notices: Notices) -> AnswersApart:
-    """The answers that a bench file in `folder` names. Raises InputError where it names none, or they cannot be opened."""
+    """The answers that a bench file in `folder` names. Raises InputError where it names none, or
+    they cannot be opened.
+    """
     if config.answers is None:
         raise InputError('the bench file has no [answers]; write [answers] with source = "serial" or the like')
     return AnswersApart(ReadPlan(config.answers, folder, config.tracker.q_body_to_cam), notices)

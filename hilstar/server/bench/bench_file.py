@@ -1,4 +1,5 @@
-"""The bench file of a run: read once, so that the whole run uses the bytes that were checked; and one key of it set.
+"""The bench file of a run: read once, so that the whole run uses the bytes that were checked; and
+one key of it set.
 
 A file may also name several bench files, one for each head of an attitude determination unit:
 
@@ -45,7 +46,8 @@ EXAMPLE = 'write heads = ["a.toml", "b.toml"], a bench file for each'
 class BenchFile:
     """A bench file at the moment it was read: its text, and the checked configuration in that text.
 
-    `sha256` covers everything that makes the bench's frames: its settings, defaults included, and the files it names.
+    `sha256` covers everything that makes the bench's frames: its settings, defaults included, and
+    the files it names.
     """
 
     path: Path
@@ -60,18 +62,23 @@ class BenchFile:
 
 
 def read_bench_file(path: Path) -> BenchFile:
-    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to
+    write.
+    """
     return bench_file_of(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
 
 
 def bench_file_of(path: Path, text: str) -> BenchFile:
-    """The bench file that `path` would be with this text. Raises InputError as `read_bench_file` does."""
+    """The bench file that `path` would be with this text. Raises InputError as `read_bench_file`
+    does.
+    """
     config = parse_config(path, text)
     return BenchFile(path, text, today(config), _sha256(config, path.parent))
 
 
 def changed_file(file: BenchFile, tables: dict[str, Any]) -> BenchFile:
-    """The file as it would be with these tables, as TOML gives them. Raises InputError as `read_bench_file` does.
+    """The file as it would be with these tables, as TOML gives them. Raises InputError as
+    `read_bench_file` does.
 
     Its text stays that of `file`; its hash is that of a bench file with these tables.
     """
@@ -80,7 +87,9 @@ def changed_file(file: BenchFile, tables: dict[str, Any]) -> BenchFile:
 
 
 def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:
-    """The file for a source whose first time is `first_ns` of a time scale. Raises InputError (see `with_dates`)."""
+    """The file for a source whose first time is `first_ns` of a time scale. Raises InputError
+    (see `with_dates`).
+    """
     try:
         return replace(file, config=with_dates(file.config, scale, first_ns))
     except InputError as error:
@@ -88,7 +97,9 @@ def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:
 
 
 def with_codes_ms(file: BenchFile, codes_ms: tuple[float, float] | None) -> BenchFile:
-    """The file for frames of a run that measured what codes cost: it chooses as that run did. The hash stays that of `file`."""
+    """The file for frames of a run that measured what codes cost: it chooses as that run did.
+    The hash stays that of `file`.
+    """
     if codes_ms is None or file.config.render.codes_ms is not None:
         return file
     render = msgspec.structs.replace(file.config.render, codes_ms=codes_ms)
@@ -96,7 +107,9 @@ def with_codes_ms(file: BenchFile, codes_ms: tuple[float, float] | None) -> Benc
 
 
 def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
-    """The file for a moment that a person names: its stars are those of that day where t_ns counts from 1970."""
+    """The file for a moment that a person names: its stars are those of that day where t_ns
+    counts from 1970.
+    """
     return file if t_ns is None or file.config.sky.epoch_utc != UNIX else dated(file, None, t_ns)
 
 
@@ -111,7 +124,8 @@ def stated_in(config: BenchConfig) -> "Stated":
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
-    kept = {name: value for name, value in msgspec.to_builtins(config).items() if name != "certify"}  # changes no frame
+    # changes no frame
+    kept = {name: value for name, value in msgspec.to_builtins(config).items() if name != "certify"}
     kept["render"] |= _hashed_tolerance(config.render)
     digest = hashlib.sha256(msgspec.json.encode(kept, order="sorted"))
     tracker = config.tracker
@@ -141,7 +155,9 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
 
 
 def _hashed_tolerance(render: RenderSettings) -> dict[str, float]:
-    """The tolerance as the hash has it: its default changes no frame of a bench that leaves nothing to it."""
+    """The tolerance as the hash has it: its default changes no frame of a bench that leaves
+    nothing to it.
+    """
     if render.effort == "auto" or render.quantisation == "auto" or render.psf != GAUSSIAN:
         return {}
     defaults = {"tolerance_mag": DEFAULT_TOLERANCE_MAG, "tolerance_px": DEFAULT_TOLERANCE_PX}
@@ -150,7 +166,9 @@ def _hashed_tolerance(render: RenderSettings) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class HeadsFile:
-    """A file with `heads`: each head's name, that of its bench file, and its bench, with the common source's settings."""
+    """A file with `heads`: each head's name, that of its bench file, and its bench, with the
+    common source's settings.
+    """
 
     path: Path
     names: tuple[str, ...]
@@ -168,7 +186,9 @@ class HeadsFile:
 
 
 def read_bench_or_heads(path: Path) -> BenchFile | HeadsFile:
-    """A bench file, or a file with `heads`, opened once. Raises InputError as `read_bench_file` and `read_heads` do."""
+    """A bench file, or a file with `heads`, opened once. Raises InputError as `read_bench_file`
+    and `read_heads` do.
+    """
     text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
     tables = parse_toml(path, text)
     return _heads_of(path, tables) if HEADS in tables else bench_file_of(path, text)
@@ -179,7 +199,9 @@ def _tables(path: Path) -> dict[str, Any]:
 
 
 def read_heads(path: Path) -> HeadsFile:
-    """Read and check a file with `heads` and the bench files it names. Raises InputError: file, key, what to write instead."""
+    """Read and check a file with `heads` and the bench files it names. Raises InputError: file,
+    key, what to write instead.
+    """
     return _heads_of(path, _tables(path))
 
 
@@ -201,7 +223,8 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     if twice is not None:
         raise InputError(f"{path}: heads: two are called {twice}; give each a file of its own name")
     files = tuple(_head(head, tables.get("attitude", {})) for head in paths)
-    # Two names of one file, by a link, would show one bench twice and write over each other's ledger.
+    # Two names of one file, by a link, would show one bench twice and write over each other's
+    # ledger.
     places = [place_of(head) for head in paths]
     for k, place in enumerate(places):
         if place in places[:k]:
@@ -230,18 +253,23 @@ def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
 
 
 def as_head(head: Path, heads: Path) -> BenchFile:
-    """A head's bench file with the common source of the file `heads`. Raises InputError as `read_heads` does."""
+    """A head's bench file with the common source of the file `heads`. Raises InputError as
+    `read_heads` does.
+    """
     return _head(head, _tables(heads).get("attitude", {}))
 
 
 def with_key(
     text: str, table: str, key: str, value: float | str | bool | Sequence[float], instead_of: tuple[str, ...] = ()
 ) -> str:
-    """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in `instead_of`, or one added.
+    """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in
+    `instead_of`, or one added.
 
-    Where the table is written in another TOML form, the result means something else: parse it again to see.
+    Where the table is written in another TOML form, the result means something else: parse it again
+    to see.
     """
-    line = f"{key} = {json.dumps(value)}"  # JSON and TOML write numbers, truth values and plain text alike
+    # JSON and TOML write numbers, truth values and plain text alike
+    line = f"{key} = {json.dumps(value)}"
     header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
     if header is None:
         return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()

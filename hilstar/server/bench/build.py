@@ -1,4 +1,6 @@
-"""From a bench file to the parts that it describes: stars, geometry, light, effort and a renderer."""
+"""From a bench file to the parts that it describes: stars, geometry, light, effort and a
+renderer.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +61,8 @@ S_PER_MS = 1e-3
 # Bands of a star's light as a glass sees it: twice as fine moves no share by over 1e-3
 # (tests/unit/instruments/simulate/test_glass.py)
 BAND_NM, KNOT_NM = 25.0, 5.0
-# Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times allow. The fastest frame of
-# each field counts.
+# Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times
+# allow. The fastest frame of each field counts.
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
@@ -69,15 +71,18 @@ TIMED_EXACT_S, TIMED_ROUND_S, MAX_TIMED = 0.1, 0.05, 10
 
 
 def load(path: str | Path) -> Bench:
-    """Assemble the bench that a file describes; NumPy draws where OpenGL is missing. Raises InputError."""
+    """Assemble the bench that a file describes; NumPy draws where OpenGL is missing. Raises
+    InputError.
+    """
     return open_bench(read_bench_file(Path(path)))
 
 
 def open_bench(file: BenchFile, context: Context | None = None, *, timed: bool = False, on_screen: bool = False) -> Bench:
-    """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is missing. Raises InputError.
+    """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is
+    missing. Raises InputError.
 
-    `on_screen` is for runs whose frames a screen lights row by row. `timed` is for runs that a clock paces: where
-    `quantisation = "auto"` depends on what codes cost, that is measured here.
+    `on_screen` is for runs whose frames a screen lights row by row. `timed` is for runs that a
+    clock paces: where `quantisation = "auto"` depends on what codes cost, that is measured here.
     """
     sources = bench_sources(file.config, file.folder)
     stars = bench_stars(file.config, file.folder, sources.moving)
@@ -93,7 +98,9 @@ def assembled(
     timed: bool = False,
     on_screen: bool = False,
 ) -> Bench:
-    """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError."""
+    """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises
+    InputError.
+    """
     if context is not None:  # a window's context, which the window frees
         return _assembled(file, stars, context, sources, timed, on_screen)
     context = headless_context(file.config.render.gpu)
@@ -106,7 +113,9 @@ def assembled(
 
 
 class Scene(NamedTuple):
-    """What a bench's light is planned for: how its stars are drawn, full scale with that, and the light of both."""
+    """What a bench's light is planned for: how its stars are drawn, full scale with that, and
+    the light of both.
+    """
 
     psf: Psf
     choice: Choice | None
@@ -115,7 +124,9 @@ class Scene(NamedTuple):
 
 
 class Display(NamedTuple):
-    """What shows a bench's stars: its light, its geometry, its GL; how much of white each star asks for; see `turning_of`."""
+    """What shows a bench's stars: its light, its geometry, its GL; how much of white each star
+    asks for; see `turning_of`.
+    """
 
     calibration: Calibration
     camera: Camera
@@ -132,10 +143,12 @@ def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
         white_e_per_s = white_of(render, stars, psf, drive)
         light = Light(
             response=display.calibration.response,
-            # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
+            # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets
+            # a code.
             white_e_per_s=white_e_per_s * display.darkest,
             rates_e_per_s=stars.electrons_per_s,
-            sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
+            # about
+            sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),
             refresh_hz=file.config.monitor.refresh_hz,
             seen=seen_by(file, camera),
             centroider=file.config.verify.judge,
@@ -149,7 +162,9 @@ def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
 
 
 def _planned(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, Effort]:
-    """The first scene whose plan is within the tolerance; where none is, the first whose PSF alone is within it."""
+    """The first scene whose plan is within the tolerance; where none is, the first whose PSF
+    alone is within it.
+    """
     near: list[tuple[Scene, Effort]] = []
     for scene in scenes:
         effort, choice = plan_effort(render, scene.light), scene.choice
@@ -165,14 +180,18 @@ def _planned(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, Ef
 
 
 def white_of(render: RenderSettings, stars: Stars, psf: Psf, drive: FloatArray | float = 1.0) -> float:
-    """Full scale, electrons per second of a pixel. Raises InputError as `brightest_peak_e_per_s`."""
+    """Full scale, electrons per second of a pixel. Raises InputError as
+    `brightest_peak_e_per_s`.
+    """
     return render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
 
 
 def turning_of(config: BenchConfig, on_screen: bool) -> float:
-    """How far stars without paths are from the mean of their light at most, in units of their motion; 0 at rest.
+    """How far stars without paths are from the mean of their light at most, in units of their
+    motion; 0 at rest.
 
-    A frame has them where they are at the middle row's first light, and its motion counts to the end of its light.
+    A frame has them where they are at the middle row's first light, and its motion counts to the
+    end of its light.
     """
     motion, scan = config.render.motion, scan_of(config.monitor)
     moves = motion == "on" or (motion == "auto" and on_screen)
@@ -280,7 +299,9 @@ def measured_cost(frame_ms: Callable[[Quantisation, float], float], table: Field
 
 
 def timed_frame_ms(bench: Bench, for_s: float, now_ns: Callable[[], int] = time.monotonic_ns) -> float:
-    """The time of a frame of an average field that turns at 1 deg/s, ms, by drawing for about `for_s` after a warm-up."""
+    """The time of a frame of an average field that turns at 1 deg/s, ms, by drawing for about
+    `for_s` after a warm-up.
+    """
     bench.warm_up()
     took_ms: dict[int, float] = {}
     end_ns = now_ns() + round(for_s * NS_PER_S)
@@ -296,7 +317,9 @@ def timed_frame_ms(bench: Bench, for_s: float, now_ns: Callable[[], int] = time.
 
 
 def seen_by(file: BenchFile, camera: Camera) -> Seen:
-    """How the tracker sees the monitor at the boresight: its blur and its pixel in monitor pixels."""
+    """How the tracker sees the monitor at the boresight: its blur and its pixel in monitor
+    pixels.
+    """
     tracker = file.config.tracker
     pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
     blur_px = math.sqrt(math.prod(before_detector(file.config, file.folder, camera).width_px)) * pixel_px
@@ -304,7 +327,9 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
 
 
 def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
-    """The tracker's light-gathering part by channel: what it tells apart; curve paths are relative to `folder`."""
+    """The tracker's light-gathering part by channel: what it tells apart; curve paths are
+    relative to `folder`.
+    """
     given = tracker.quantum_efficiencies.items()
     efficiencies = [load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES) for key, source in given]
     transmission = glass_transmission(tracker, folder)
@@ -332,7 +357,8 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     moving, diffuse = bench_moving(config, folder), config.sky.diffuse
     if diffuse.map is None:
         return Sources(moving)
-    from hilstar.sky.diffuse import read_diffuse_map  # WCS and coordinates take 200 ms, which only a map needs
+    # WCS and coordinates take 200 ms, which only a map needs
+    from hilstar.sky.diffuse import read_diffuse_map
 
     one, bv_mag = np.ones(1), diffuse.bv_mag
     v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, bv_mag * one, np.nan * one)[0])
@@ -341,7 +367,9 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
-    """The bodies and the observer of a bench, None where its file has neither. Raises InputError or MachineError."""
+    """The bodies and the observer of a bench, None where its file has neither. Raises InputError
+    or MachineError.
+    """
     if not has_observer(config):
         return None
     from hilstar.server.bench.moving import (
@@ -352,7 +380,9 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
 
 
 def moved(stars: Stars, moving: MovingSky | None) -> Stars:
-    """The stars with bodies among them at t = 0, in arrays that `moving` may change; without `moving` the stars themselves."""
+    """The stars with bodies among them at t = 0, in arrays that `moving` may change; without
+    `moving` the stars themselves.
+    """
     return stars if moving is None else moving.among(stars)
 
 
@@ -364,7 +394,9 @@ def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
 
 
 def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
-    """The stars of a bench with their electron rates, which are computed only here, as `moving`'s observer sees them."""
+    """The stars of a bench with their electron rates, which are computed only here, as
+    `moving`'s observer sees them.
+    """
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
     faintest = math.inf if sky.variables == "phase" else sky.faintest_v_mag
@@ -387,14 +419,16 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     flux, by_bv = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind), None
     if flux.shape[1] > 1:
         by_bv = total_and_colours(through(0 * BV_MAG, BV_MAG, np.full_like(BV_MAG, np.nan))).colours
-    if config.site is not None and moving is not None:  # the air takes of each star by its own spectrum
+    # the air takes of each star by its own spectrum
+    if config.site is not None and moving is not None:
         moving.air = site_air(config, folder, catalog, kind)
     return dataclasses.replace(make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv)
 
 
 def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None) -> SiteAir:
     """The air over `[site]` for stars of a catalogue. Raises InputError."""
-    from hilstar.server.bench.site import Ground, site_extinction, site_glow_e_per_s_sr, site_refraction  # ERFA takes 30 ms
+    # ERFA takes 30 ms
+    from hilstar.server.bench.site import Ground, site_extinction, site_glow_e_per_s_sr, site_refraction
 
     if config.site is None:
         raise AssertionError("the file has a site")
@@ -417,7 +451,8 @@ def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArr
 
 
 def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
-    """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest first.
+    """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest
+    first.
 
     Raises InputError or MachineError (see `bench_sources`).
     """
@@ -430,7 +465,9 @@ def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
 
 
 class StarRates(Protocol):
-    """Electron rates of stars (n,) by their V, B-V, V-I (NaN where unknown) and, if it is used, `kind` of `star_kinds`."""
+    """Electron rates of stars (n,) by their V, B-V, V-I (NaN where unknown) and, if it is used,
+    `kind` of `star_kinds`.
+    """
 
     def __call__(
         self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None = None, /
@@ -439,7 +476,9 @@ class StarRates(Protocol):
 
 
 def star_kinds(config: BenchConfig, catalog: Catalog) -> FloatArray | None:
-    """The types (n, 2) of stars, as `star_types` reads them, where a bench's spectra follow types; None elsewhere."""
+    """The types (n, 2) of stars, as `star_types` reads them, where a bench's spectra follow
+    types; None elsewhere.
+    """
     return star_types(catalog) if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk") else None
 
 
@@ -450,13 +489,17 @@ def star_rates(config: BenchConfig, folder: Path) -> StarRates:
 
 
 def star_flux(config: BenchConfig, folder: Path) -> StarRates:
-    """The electron rates (n, channels) of stars on a bench's tracker, by tables that are made here, once."""
+    """The electron rates (n, channels) of stars on a bench's tracker, by tables that are made
+    here, once.
+    """
     rates = [channel_rates(config.sky, optics) for optics in bench_channels(config.tracker, folder)]
     return lambda *columns: np.stack([channel(*columns) for channel in rates], axis=1)
 
 
 def channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
-    """The electron rates (n,) of stars in one channel, by a table that is made here, once. Raises InputError."""
+    """The electron rates (n,) of stars in one channel, by a table that is made here, once.
+    Raises InputError.
+    """
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
         by_colour = tabulate_pickles(optics, photometry)
@@ -495,7 +538,9 @@ def named_channels(tracker: Tracker, folder: Path) -> dict[str, Optics]:
 
 
 def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colours | None:
-    """What a bench mixes its primaries for; None where all three have one code, or stolen bits. Raises InputError."""
+    """What a bench mixes its primaries for; None where all three have one code, or stolen bits.
+    Raises InputError.
+    """
     if not drives_apart(config):
         return None
     primaries, monitor = bench_primaries(config.monitor, folder), config.monitor
@@ -513,7 +558,9 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
 def primary_panels(
     file: BenchFile, colours: Colours, white_e_per_s: float, uniformity: Float32Array | None, name: str | None = None
 ) -> tuple[Panel, ...]:
-    """The panel of each primary of a monitor, of the calibration `name` (by default the bench's). Raises InputError."""
+    """The panel of each primary of a monitor, of the calibration `name` (by default the
+    bench's). Raises InputError.
+    """
     monitor = file.config.monitor
     name = name or monitor.calibration
     responses = primary_responses(name if name in BUILT_IN else file.folder / name, monitor.bits)
@@ -524,10 +571,12 @@ def primary_panels(
 def brightest_peak_e_per_s(
     stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG, drive: FloatArray | float = 1.0
 ) -> float:
-    """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at or below that magnitude.
+    """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at
+    or below that magnitude.
 
-    A star counts `drive` (n,) times, as much of white as its colour asks for. Brighter stars may clip. With the default
-    magnitude and a catalogue of brighter stars alone, none does. Raises InputError when no star remains.
+    A star counts `drive` (n,) times, as much of white as its colour asks for. Brighter stars may
+    clip. With the default magnitude and a catalogue of brighter stars alone, none does. Raises
+    InputError when no star remains.
     """
     magnitude = DEFAULT_BRIGHTEST_V_MAG if brightest_v_mag is None else brightest_v_mag
     rates = stars.electrons_per_s * drive
@@ -557,9 +606,11 @@ def scan_of(monitor: Monitor) -> Scan:
 
 
 class StarGlass:
-    """The shares that a `psf`'s wavelengths have of the light of a bench's stars, through one channel's `optics` or all.
+    """The shares that a `psf`'s wavelengths have of the light of a bench's stars, through one
+    channel's `optics` or all.
 
-    The band is cut into narrow ones, whose electrons come from the same tables as a star's total, so every model of
+    The band is cut into narrow ones, whose electrons come from the same tables as a star's total,
+    so every model of
     spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
     """
 
@@ -575,7 +626,9 @@ class StarGlass:
                 self._mean = flat @ self._of_band / flat.sum()
 
     def _cut(self, file: BenchFile, optics: Optics, band_nm: float) -> FloatArray:
-        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's response to even photons."""
+        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's
+        response to even photons.
+        """
         low_nm, high_nm = optics.range_nm
         nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
         fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
@@ -590,7 +643,8 @@ class StarGlass:
                 continue
             try:
                 rates = channel_rates(file.config.sky, dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)))
-            except InputError:  # so little light that some spectrum has none: the bands beside it stand for it
+            except InputError:
+                # so little light that some spectrum has none: the bands beside it stand for it
                 continue
             self._bands.append(rates)
             flat.append(response.sum())
@@ -599,7 +653,9 @@ class StarGlass:
         return np.array(flat)
 
     def shares(self, stars: Stars, which: IntArray) -> FloatArray:
-        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a spectrum where a place is negative."""
+        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a
+        spectrum where a place is negative.
+        """
         if not self._bands:
             return self._mean
         if self._catalog is not stars.catalog:

@@ -1,6 +1,7 @@
 """The two cameras of a bench file: the monitor behind its collimator, and the tracker.
 
-The fields of view tell a length in the wrong unit: no lens and no pixel is ten times as large as the others imply.
+The fields of view tell a length in the wrong unit: no lens and no pixel is ten times as large as
+the others imply.
 """
 
 import dataclasses
@@ -24,13 +25,14 @@ from hilstar.server.bench.glass import Onto, bench_glass_psf, decentre_px, glass
 from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, Choice, first_within, least_psf, psf_choices
 
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
-# Share of the screen that the tracker sees, and of the tracker's field that the screen fills. A bench may have 2 % of the one,
-# or a field of ten screens; a length in another unit changes them a hundred times.
+# Share of the screen that the tracker sees, and of the tracker's field that the screen fills. A
+# bench may have 2 % of the one, or a field of ten screens; a length in another unit changes them a
+# hundred times.
 MIN_SEEN, MIN_FILLED = 0.015, 0.08
 MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
-# Limits of any bench: lenses are f/0.5 to f/21 (a factor of ten in one length mostly leaves this), the widest sees 100 degrees,
-# collimators are not shorter than a microscope's objective and not longer than a room, pixels are those of the smallest
-# sensors and of LED walls.
+# Limits of any bench: lenses are f/0.5 to f/21 (a factor of ten in one length mostly leaves this),
+# the widest sees 100 degrees, collimators are not shorter than a microscope's objective and not
+# longer than a room, pixels are those of the smallest sensors and of LED walls.
 F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (0.5, 21.0), 100.0, (0.3, 2000.0), (2.0, 50_000.0)
 TRACKER_PITCHES_UM, MONITOR_PITCHES_UM = (0.5, 100.0), (1.0, 10_000.0)
 TRUE_RATIOS = (0.5, 2.0)  # a length of [verify] to the same length elsewhere in the file
@@ -47,17 +49,21 @@ MM = {"um": 1e-3, "cm": 10.0, "inches": 25.4, "m": 1000.0}
 UM = {"nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 GRID = 64  # places along each side
 MAX_MENDS = 3
-# A unit is named where it leaves nothing implausible; where none does, one that takes away three quarters of it (in decades),
-# if no other takes away much more.
+# A unit is named where it leaves nothing implausible; where none does, one that takes away three
+# quarters of it (in decades), if no other takes away much more.
 MAX_LEFT, AS_GOOD = 0.25, 0.6
-FIELD_PLACES = 5  # along each side of the detector, where the PSFs that a display may draw are compared
+# along each side of the detector, where the PSFs that a display may draw are compared
+FIELD_PLACES = 5
 OBLIQUE, UM_PER_MM = 1e-3, 1e3
 TINY = 1e-12  # a share of none, so that it has a logarithm
-NO_OBJECTIVE_PX = 1e-3, 1e-3  # far under a monitor pixel on the detector, by whose own squares light is spread
+# far under a monitor pixel on the detector, by whose own squares light is spread
+NO_OBJECTIVE_PX = 1e-3, 1e-3
 
 
 def bench_camera(config: BenchConfig, folder: Path) -> Camera:
-    """The monitor behind its collimator, by its geometry file where it has one. Raises InputError."""
+    """The monitor behind its collimator, by its geometry file where it has one. Raises
+    InputError.
+    """
     if config.collimator.geometry is None:
         return ideal_monitor(config)
     return real_monitor(config, folder, config.collimator.geometry)
@@ -75,14 +81,17 @@ def ideal_monitor(config: BenchConfig) -> Camera:
 
 
 def display_psf(config: BenchConfig, folder: Path, display: Camera) -> Psf:
-    """How a star is drawn on the monitor; where the tolerance decides, as if all of it were the PSF's. Raises InputError."""
+    """How a star is drawn on the monitor; where the tolerance decides, as if all of it were the
+    PSF's. Raises InputError.
+    """
     render = config.render
     tolerance = render.tolerance_mag, render.tolerance_px
     return first_within(display_psfs(config, folder, display), tolerance)[0]
 
 
 def display_psfs(config: BenchConfig, folder: Path, display: Camera) -> Iterator[tuple[Psf, Choice | None]]:
-    """How a star may be drawn on the monitor, from the cheapest to the file's own; None where there is no choice.
+    """How a star may be drawn on the monitor, from the cheapest to the file's own; None where there
+    is no choice.
 
     Raises InputError.
     """
@@ -120,7 +129,8 @@ def display_psfs(config: BenchConfig, folder: Path, display: Camera) -> Iterator
 
 
 def before_detector(config: BenchConfig, folder: Path, display: Camera) -> Psf:
-    """How what lies between display and detector spreads a point, tracker pixels: the collimator, and the tracker's optics.
+    """How what lies between display and detector spreads a point, tracker pixels: the collimator,
+    and the tracker's optics.
 
     A display that draws the tracker's PSF has a detector without its objective before it.
     """
@@ -131,7 +141,9 @@ def before_detector(config: BenchConfig, folder: Path, display: Camera) -> Psf:
 
 
 def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
-    """How the tracker's optics spread a star over its detector. Raises InputError for a file that is no PSF."""
+    """How the tracker's optics spread a star over its detector. Raises InputError for a file
+    that is no PSF.
+    """
     if tracker.optics.psf == GAUSSIAN:
         return GaussianPsf(tracker.psf_sigma_px)
     if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
@@ -153,7 +165,9 @@ def least_tracker_psf(own: SampledPsf, size_px: tuple[int, int], tolerance: tupl
 
 
 def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
-    """The monitor as a geometry file has it, bounded to what sprites on it need. Raises InputError."""
+    """The monitor as a geometry file has it, bounded to what sprites on it need. Raises
+    InputError.
+    """
     camera = load_geometry(folder / path, config.monitor.resolution_px)
     if config.render.psf == GAUSSIAN:
         footprint_px = GaussianPsf(config.render.sprite_sigma_px).footprint_px
@@ -165,7 +179,9 @@ def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
 
 
 def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
-    """The tracker, with its flight model where it has one, else its glass's distortion. Raises InputError."""
+    """The tracker, with its flight model where it has one, else its glass's distortion. Raises
+    InputError.
+    """
     optics = tracker.optics
     if optics.focus_um_per_k and optics.psf == GAUSSIAN:
         raise InputError("[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave it out")
@@ -188,7 +204,9 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
 
 
 def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
-    """The `true` tracker as its software knows it: at the reference temperature, the lens in its place. Raises InputError."""
+    """The `true` tracker as its software knows it: at the reference temperature, the lens in its
+    place. Raises InputError.
+    """
     optics = replace(tracker.optics, temperature_k=tracker.optics.reference_temperature_k, decentre_x_um=0.0, decentre_y_um=0.0)
     return true if optics == tracker.optics else tracker_camera(replace(tracker, optics=optics), folder)
 
@@ -202,10 +220,11 @@ def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class FieldsOfView:
-    """Width and height of what screen and tracker see, the monitor's pixel in the tracker's, the parts that they share.
+    """Width and height of what screen and tracker see, the monitor's pixel in the tracker's, the
+    parts that they share.
 
-    `screen_seen` is the share of the screen in the tracker's field, `field_on_screen` that of the field on the screen.
-    `warning` says which length cannot be right; None where all may be.
+    `screen_seen` is the share of the screen in the tracker's field, `field_on_screen` that of the
+    field on the screen. `warning` says which length cannot be right; None where all may be.
     """
 
     screen_deg: tuple[float, float]
@@ -228,7 +247,9 @@ class FieldsOfView:
 
 
 def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
-    """The fields of view of a bench's screen and tracker, with a warning where a length cannot be right. Raises InputError."""
+    """The fields of view of a bench's screen and tracker, with a warning where a length cannot
+    be right. Raises InputError.
+    """
     found = _measured(config, folder)
     odd = list(_oddities(config, found))
     if not odd:
@@ -256,7 +277,8 @@ def _sides_deg(camera: Camera) -> tuple[float, float]:
     places = np.array([(-0.5, y), (width - 0.5, y), (x, -0.5), (x, height - 0.5)])
     rays = camera.rays(*places.T)
     angles = [math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)) for a, b in (rays[:2], rays[2:])]
-    sides = [2 * math.atan(size / 2 / camera.focal_length_px) for size in (width, height)]  # beyond a lens that is known so far
+    # beyond a lens that is known so far
+    sides = [2 * math.atan(size / 2 / camera.focal_length_px) for size in (width, height)]
     across, down = (math.degrees(side if math.isnan(angle) else angle) for angle, side in zip(angles, sides, strict=True))
     return across, down
 
@@ -320,9 +342,11 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
 
 
 def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
-    """Each length that makes the bench plausible, or nearly so, if it is another quantity, or in another unit, with that.
+    """Each length that makes the bench plausible, or nearly so, if it is another quantity, or in
+    another unit, with that.
 
-    What else is odd of a bench may stay: the length that takes most away is named, and those that take as much.
+    What else is odd of a bench may stay: the length that takes most away is named, and those that
+    take as much.
     """
     rest_decades: dict[str, float] = {}
     for text, changed in _readings(config):
@@ -336,7 +360,9 @@ def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
 
 
 def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
-    """The bench with one length read as another quantity or in another unit, and what was written then."""
+    """The bench with one length read as another quantity or in another unit, and what was
+    written then.
+    """
     tracker = config.tracker
     if F_NUMBERS[0] <= tracker.aperture_mm < F_NUMBERS[1]:
         aperture_mm = tracker.focal_length_mm / tracker.aperture_mm

@@ -1,4 +1,6 @@
-"""A bench's catalogue as its tracker sees it: a row a star, with errors, origins and synthetic magnitudes; and its files."""
+"""A bench's catalogue as its tracker sees it: a row a star, with errors, origins and synthetic
+magnitudes; and its files.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +29,8 @@ FAINTER_MAG = 3.0  # by this a neighbour may be fainter
 COLOUR_STEP_MAG = 0.01  # step of the derivative of a rate by a colour
 DECIMALS = 9  # places in degrees: 4 microarcseconds
 PASSBANDS = {"u": "Bessell's U", "b": "Bessell's B", "r": "Bessell's R", "i": "Bessell's I", "g": "Gaia's G"}
-# A star's spectrum is chosen by its V-I, or its type: what it has in B is then not what was measured.
+# A star's spectrum is chosen by its V-I, or its type: what it has in B is then not what was
+# measured.
 NOT_MEASURED = {
     "b": "; not V + (B-V), which is b_measured_mag: the spectrum is chosen by V-I or by type",
     "i": "; V - (V-I) is i_measured_mag",
@@ -58,7 +61,8 @@ class InstrumentCatalogue:
 
 
 def bench_catalogue(file: BenchFile, faintest_v_mag: float | None, epoch_jyear: float | None) -> InstrumentCatalogue:
-    """The catalogue of a bench to V = `faintest_v_mag` (None: the bench's) at an epoch (None: the bench's).
+    """The catalogue of a bench to V = `faintest_v_mag` (None: the bench's) at an epoch (None: the
+    bench's).
 
     Places are barycentric ICRS, without aberration or parallax. Raises InputError.
     """
@@ -130,7 +134,8 @@ def _photometry(stars: Catalog, facts: dict[str, Any]) -> dict[str, Column]:
 
 
 def _decimals(values: npt.NDArray[np.float32]) -> FloatArray:
-    return np.asarray(np.round(values.astype(np.float64), 3), dtype=np.float64)  # back to the catalogue's from float32
+    # back to the catalogue's from float32
+    return np.asarray(np.round(values.astype(np.float64), 3), dtype=np.float64)
 
 
 def _light(file: BenchFile, stars: Catalog, facts: dict[str, Any]) -> tuple[dict[str, Column], dict[str, float]]:
@@ -173,7 +178,8 @@ def _light(file: BenchFile, stars: Catalog, facts: dict[str, Any]) -> tuple[dict
 
 
 def sigma_instrument_mag(stars: Catalog, facts: dict[str, Any], rates: StarRates, kind: FloatArray | None = None) -> FloatArray:
-    """The error of each star's magnitude in the tracker (n,), by the errors of V, B-V and V-I taken as independent.
+    """The error of each star's magnitude in the tracker (n,), by the errors of V, B-V and V-I taken
+    as independent.
 
     That of the step from colours to a spectrum is not in it.
     """
@@ -220,7 +226,8 @@ def _company(every: Catalog, rows: npt.NDArray[np.intp], facts: dict[str, Any], 
 def nearest_neighbours(
     every: Catalog, rows: npt.NDArray[np.intp], epoch_jyear: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """For the stars at `rows` (n,) the nearest other star brighter than their V + FAINTER_MAG, and its distance, arcsec.
+    """For the stars at `rows` (n,) the nearest other star brighter than their V + FAINTER_MAG, and
+    its distance, arcsec.
 
     A star without one has itself, at NaN.
     """
@@ -245,7 +252,9 @@ def nearest_neighbours(
 
 
 def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
-    """Write a CSV, a FITS table, a VOTable or a Parquet file by the name's ending. Raises InputError or MachineError."""
+    """Write a CSV, a FITS table, a VOTable or a Parquet file by the name's ending. Raises
+    InputError or MachineError.
+    """
     from astropy.table import Table
 
     ending = ".csv" if path == STDOUT else path.suffix.lower()
@@ -259,7 +268,8 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
         formats = dict.fromkeys(("ra_deg", "dec_deg"), f".{DECIMALS}f")
         formats |= {n: ".6g" for n, c in catalogue.columns.items() if c.values.dtype.kind == "f" and n not in formats}
         texts = [[format(v, formats.get(n, "")) for v in c.values.tolist()] for n, c in catalogue.columns.items()]
-        write_csv(path, list(catalogue.columns), zip(*texts, strict=True))  # MK types such as "S5,1" have commas
+        # MK types such as "S5,1" have commas
+        write_csv(path, list(catalogue.columns), zip(*texts, strict=True))
     elif ending == ".vot":
         from astropy.io.votable import from_table
 

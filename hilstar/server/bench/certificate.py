@@ -1,4 +1,6 @@
-"""certificate.json: how sure a bench is, as `hilstar certify` states it and `serve`, `assess` and requirements read it."""
+"""certificate.json: how sure a bench is, as `hilstar certify` states it and `serve`, `assess`
+and requirements read it.
+"""
 
 import datetime
 from collections.abc import Iterable
@@ -19,7 +21,9 @@ ADVICE = "give the certificate.json that `hilstar certify BENCH.toml -o DIR` wro
 
 
 class Contribution(msgspec.Struct, frozen=True, kw_only=True):
-    """What an input adds to a figure: its standard uncertainty in the figure's unit, and its share of the variance."""
+    """What an input adds to a figure: its standard uncertainty in the figure's unit, and its
+    share of the variance.
+    """
 
     input: str
     standard_uncertainty: float
@@ -27,7 +31,9 @@ class Contribution(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ByTrials(msgspec.Struct, frozen=True, kw_only=True):
-    """The same figure by Supplement 1, and why its interval differs from that of first order; "" where it does not."""
+    """The same figure by Supplement 1, and why its interval differs from that of first order; ""
+    where it does not.
+    """
 
     standard_uncertainty: float
     lower: float
@@ -36,7 +42,8 @@ class ByTrials(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CertifiedFigure(msgspec.Struct, frozen=True, kw_only=True):
-    """A figure with its 95 % interval. `region` is a third of the screen, a field or the screen; `star` a HIP number.
+    """A figure with its 95 % interval. `region` is a third of the screen, a field or the screen;
+    `star` a HIP number.
 
     `conforms` is None without a limit, and `truth` is known of a virtual bench alone.
     """
@@ -71,7 +78,9 @@ class InputRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Certificate(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole certificate. Times are UTC; `files` has the SHA-256 of the bench file and of each file that it names."""
+    """A whole certificate. Times are UTC; `files` has the SHA-256 of the bench file and of each
+    file that it names.
+    """
 
     kind: str
     number: str
@@ -101,13 +110,17 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
     replaces: str | None = None
 
     def expanded(self, quantities: Iterable[str]) -> float | None:
-        """The largest |value| + half width of the interval of some quantities; None where it has none of them."""
+        """The largest |value| + half width of the interval of some quantities; None where it has
+        none of them.
+        """
         found = [max(abs(each.lower), abs(each.upper)) for each in self.figures if each.quantity in set(quantities)]
         return max(found) if found else None
 
     @property
     def attitude_arcsec(self) -> tuple[float, float] | None:
-        """How far the bench's own attitude may be off at 95 %, across the boresight and about it; None where not assessed."""
+        """How far the bench's own attitude may be off at 95 %, across the boresight and about
+        it; None where not assessed.
+        """
         cross, roll = self.expanded(("attitude_x", "attitude_y")), self.expanded(("attitude_z",))
         return None if cross is None or roll is None else (cross, roll)
 
@@ -130,7 +143,8 @@ def read_certificate(path: Path) -> Certificate:
 
 
 def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Certificate | None:
-    """The certificate that a bench file names, None where it names none; a notice where it is not this bench's, or is over.
+    """The certificate that a bench file names, None where it names none; a notice where it is not
+    this bench's, or is over.
 
     Raises InputError for a file that is none.
     """

@@ -1,4 +1,5 @@
-"""The worst errors of a quantisation: over a catalogue's magnitudes, and over places within a pixel.
+"""The worst errors of a quantisation: over a catalogue's magnitudes, and over places within a
+pixel.
 
 An error rises towards faint stars, and jumps from one magnitude to the next: `exact` leaves half a
 step of a star's light at one, and nothing at the next. So the magnitudes are cut into SPANS, and
@@ -35,14 +36,17 @@ IN_SPAN = np.append((np.arange(PHASES**2 - 1) * GOLDEN) % 1.0, 1.0)
 # A pixel at the threshold of a box falls in or out by any change of light: 0.01 px of a box of 5
 # that no display takes away (0.013 px at 16 bits, in place of 0.002).
 NO_THRESHOLD = 0.0
-# What 2000 to 5000 stars miss of the worst: on nine benches the largest error of 27 000 was 0.8 to 1.5
-# times theirs of light and 0.95 to 1.4 times of place. tests/authority/test_effort.py holds the claim.
+# What 2000 to 5000 stars miss of the worst: on nine benches the largest error of 27 000 was 0.8 to
+# 1.5
+# times theirs of light and 0.95 to 1.4 times of place. tests/authority/test_effort.py holds the
+# claim.
 BEYOND_MAG, BEYOND_PX = 1.4, 1.3
 
 
 @dataclass(frozen=True, slots=True)
 class CodeErrors:
-    """The worst errors of a quantisation, and by whom a place is measured; infinite for a dark star.
+    """The worst errors of a quantisation, and by whom a place is measured; infinite for a dark
+    star.
 
     `centroider` is None where the flux alone was looked at. `by_span` are the same of the spans
     that were looked at: the brighter end of each, mag, with its flux and place.
@@ -58,7 +62,9 @@ class CodeErrors:
         return self.flux_mag <= limit[0] and self.place_px <= limit[1]
 
     def brighter_than(self, mag: float) -> tuple[float, float]:
-        """The worst flux and place of stars up to a magnitude: of the spans up to the next beyond it."""
+        """The worst flux and place of stars up to a magnitude: of the spans up to the next
+        beyond it.
+        """
         fainter = [begin for begin, _, _ in self.by_span if begin >= mag]
         last = min(fainter, default=math.inf)
         among = [(flux_mag, place_px) for begin, flux_mag, place_px in self.by_span if begin <= last]
@@ -67,7 +73,8 @@ class CodeErrors:
 
 @dataclass(frozen=True, slots=True)
 class CodeStars:
-    """The stars of a bench by their magnitudes below full scale, and the tracker that looks at them.
+    """The stars of a bench by their magnitudes below full scale, and the tracker that looks at
+    them.
 
     `spans` are the ends of each span of magnitudes, the brighter first, by rising magnitudes.
     `tables` are the response's arrays, by whose content two benches' stars are the same.
@@ -84,7 +91,9 @@ class CodeStars:
 
 @dataclass(frozen=True, slots=True)
 class PhaseGrid:
-    """Stars as bright as full scale at sub-pixel phases, their light, and the tracker that looks at them."""
+    """Stars as bright as full scale at sub-pixel phases, their light, and the tracker that looks
+    at them.
+    """
 
     sprites: Sprites
     bright: FloatArray
@@ -100,7 +109,8 @@ def code_stars(
     response: Response,
     peaks: FloatArray,
 ) -> CodeStars:
-    """The stars of a catalogue for `worst_errors`, by what their brightest pixels have of white, `peaks` (n,).
+    """The stars of a catalogue for `worst_errors`, by what their brightest pixels have of white,
+    `peaks` (n,).
 
     Those brighter than white clip, which is told elsewhere. Up to SPANS magnitudes are looked at as
     they are; more are many stars, which have any magnitude between the first and the last.
@@ -128,7 +138,9 @@ def _grid(psf: Psf, seen: Seen, number: int) -> PhaseGrid:
 
 @lru_cache(maxsize=64)  # the benches of a campaign, a verdict or a study have few monitors
 def worst_errors(stars: CodeStars, method: Quantisation, limit: tuple[float, float] = (math.inf, math.inf)) -> CodeErrors:
-    """The worst errors of a method; of one beyond the limit (mag, px) the first that are over it."""
+    """The worst errors of a method; of one beyond the limit (mag, px) the first that are over
+    it.
+    """
     search = _Search(stars, method, limit)
     faintest_first = range(len(stars.spans) - 1, -1, -1)
     for place in faintest_first[::COARSE]:
@@ -152,7 +164,9 @@ class _Search:
         self._found: dict[tuple[int, int], CodeErrors] = {}
 
     def is_over(self, place: int, phases: int | None = None) -> bool:
-        """Whether the errors of the span at a place are over the limit, by its own or another grid."""
+        """Whether the errors of the span at a place are over the limit, by its own or another
+        grid.
+        """
         key = place, (place if phases is None else phases) % len(GRIDS)
         if key not in self._found:
             self._found[key] = self._errors(*key)

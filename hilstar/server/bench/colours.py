@@ -1,12 +1,16 @@
-"""What a bench mixes its primaries for, star by star: with each channel's electrons, or the nearest spectrum of one channel.
+"""What a bench mixes its primaries for, star by star: with each channel's electrons, or the nearest
+spectrum of one channel.
 
-Three channels: the mixture has the star's electrons in each, or is the nearest in electrons (non-negative least squares).
+Three channels: the mixture has the star's electrons in each, or is the nearest in electrons
+(non-negative least squares).
 
-One channel has one number of electrons, and three primaries to make it of. The mixture is the one with the star's own mean
-wavelength of detected photons, so that lateral colour acts as in the sky; of those, the one whose cumulative spectrum of
-detected photons is nearest to the star's (Cramer's distance, which is finite for the lines of a laser too). Its sum is held.
-Of a lens whose lateral colour is known, that comes first: see `Lateral`.
-Both ask the same of a star: its electrons through some curves of wavelength, which the tables of its rates give.
+One channel has one number of electrons, and three primaries to make it of. The mixture is the one
+with the star's own mean wavelength of detected photons, so that lateral colour acts as in the sky;
+of those, the one whose cumulative spectrum of detected photons is nearest to the star's (Cramer's
+distance, which is finite for the lines of a laser too). Its sum is held. Of a lens whose lateral
+colour is known, that comes first: see `Lateral`.
+Both ask the same of a star: its electrons through some curves of wavelength, which the tables of
+its rates give.
 """
 
 import math
@@ -33,12 +37,15 @@ from hilstar.sky.stars import BV_MAG, Stars
 STEP_NM = 0.25  # in the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
-LATERAL_WEIGHT = 1e3  # times that, of a lens's lateral colour against as much of the mean wavelength
+# times that, of a lens's lateral colour against as much of the mean wavelength
+LATERAL_WEIGHT = 1e3
 LEAST_PX, LEAST_PART = 1e-5, 1e-2  # lateral colour, and its first part, that counts
-ASIDE_STARS, ASIDE_COST = 500, 1e-3  # stars by colour, and a square px of all against one of those that are out of reach
+# stars by colour, and a square px of all against one of those that are out of reach
+ASIDE_STARS, ASIDE_COST = 500, 1e-3
 MOVED = 1 + len(PRIMARIES)  # the first column of what is wanted that is a lens's
 UNSEEN = 1e-6  # share of white
-TINY = 1e-30  # electrons per second: a primary that a star has nothing of is chosen with the others all the same
+# electrons per second: a primary that a star has nothing of is chosen with the others all the same
+TINY = 1e-30
 # Within the gamut: of a star's electrons, of its mean wavelength, and of its place through a lens
 WITHIN, WITHIN_NM, WITHIN_PX = 1e-6, 0.1, 1e-4
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
@@ -49,11 +56,12 @@ RatesBy = Callable[[Optics], Callable[..., FloatArray]]
 
 @dataclass(frozen=True, slots=True)
 class Lateral:
-    """A lens's lateral colour: by how much wavelengths `nm` (L,) move light, px rms over the field, in parts `px` (L, k).
+    """A lens's lateral colour: by how much wavelengths `nm` (L,) move light, px rms over the field,
+    in parts `px` (L, k).
 
-    All stars together may be shown `aside` (k,) of their places, by a pattern over the field that is the same for all, as a
-    distortion is: then more of what parts them is within the primaries' reach. `by_primary` (3, k) is a primary's, and
-    `weight` that of a square px.
+    All stars together may be shown `aside` (k,) of their places, by a pattern over the field that
+    is the same for all, as a distortion is: then more of what parts them is within the primaries'
+    reach. `by_primary` (3, k) is a primary's, and `weight` that of a square px.
     """
 
     nm: FloatArray
@@ -79,7 +87,9 @@ class Lateral:
 
     @property
     def lifted(self) -> FloatArray:
-        """By how much the curves that are asked of stars lie over the lens's own, px (k,): none of them may be below 0."""
+        """By how much the curves that are asked of stars lie over the lens's own, px (k,): none
+        of them may be below 0.
+        """
         return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
 
 
@@ -87,9 +97,10 @@ class Lateral:
 class Colours:
     """The primaries of a bench's monitor before its tracker.
 
-    `matrix` is that of a white of 1 electron per second, `of_white` (3,) each primary's share of that, and `by_primary`
-    (channels, 3) each channel's share of the electrons of a primary. `places_px` (3, 2) is where a primary's light lies within
-    a pixel of the image. `density` (3, n) are the spectra of the photons that the tracker detects of each, of
+    `matrix` is that of a white of 1 electron per second, `of_white` (3,) each primary's share of
+    that, and `by_primary` (channels, 3) each channel's share of the electrons of a primary.
+    `places_px` (3, 2) is where a primary's light lies within a pixel of the image. `density` (3, n)
+    are the spectra of the photons that the tracker detects of each, of
     sum 1, at `nm` (n,).
     """
 
@@ -102,7 +113,8 @@ class Colours:
     _kinds: FloatArray | None
     _scale: FloatArray
     lateral: Lateral | None = None
-    _kept: list[Any] = field(default_factory=list)  # the last frame's extended light, and each primary's of it
+    # the last frame's extended light, and each primary's of it
+    _kept: list[Any] = field(default_factory=list)
 
     @property
     def of_white(self) -> FloatArray:
@@ -125,10 +137,11 @@ class Colours:
         return len(self.matrix.channels) == 1
 
     def wanted(self, stars: Stars, which: IntArray | None = None) -> FloatArray:
-        """What the mixtures of stars are made for: shares of channels (n, channels), or means of a star's photons (n, 4 + k).
+        """What the mixtures of stars are made for: shares of channels (n, channels), or means of a
+        star's photons (n, 4 + k).
 
-        Those are wavelength, the cumulative spectra's products with the primaries', and where a lens moves them. Bodies count
-        by their B-V.
+        Those are wavelength, the cumulative spectra's products with the primaries', and where a
+        lens moves them. Bodies count by their B-V.
         """
         which = np.arange(len(stars)) if which is None else which
         if stars.colours is not None:
@@ -149,7 +162,9 @@ class Colours:
         return np.asarray(means)
 
     def for_stars(self, catalog: Catalog) -> "Colours":
-        """The same with the place aside by which a catalogue's stars part by colour as their lens parts them."""
+        """The same with the place aside by which a catalogue's stars part by colour as their
+        lens parts them.
+        """
         if self.lateral is None or not len(catalog):
             return self
         some = np.argsort(catalog.bv_mag)[:: math.ceil(len(catalog) / ASIDE_STARS)]
@@ -158,7 +173,8 @@ class Colours:
 
         lens, size_px = self.lateral, float(np.abs(self.lateral.px).max())
 
-        def left(aside: FloatArray) -> tuple[float, FloatArray]:  # the mean square of what is out of reach, and its gradient
+        # the mean square of what is out of reach, and its gradient
+        def left(aside: FloatArray) -> tuple[float, FloatArray]:
             tried = replace(lens, aside=aside * size_px)
             rest = replace(self, lateral=tried).shares(wanted) @ lens.by_primary - wanted[:, MOVED:] - tried.aside
             square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
@@ -168,7 +184,9 @@ class Colours:
         return replace(self, lateral=replace(lens, aside=found))
 
     def shares(self, wanted: FloatArray) -> FloatArray:
-        """The light of each primary (n, 3) for what is `wanted`, as shares of a star's electrons."""
+        """The light of each primary (n, 3) for what is `wanted`, as shares of a star's
+        electrons.
+        """
         if not self.mono:
             return nearest_mixtures(self._gram, wanted @ self.by_primary)
         away = self.mean_nm - self.mean_nm.mean()
@@ -195,15 +213,20 @@ class Colours:
         return self.shares(self.wanted(stars)), self.shares(by_bv)
 
     def drive(self, shares: FloatArray) -> FloatArray:
-        """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
+        """How much of white stars of so much light of each primary (n, 3) ask for, relative to a
+        white star, (n,).
+        """
         return np.asarray((shares / self.of_white).max(axis=1))
 
     def shown(self, shares: FloatArray) -> FloatArray:
-        """What mixtures (n, 3) have of what is `wanted`: shares of channels (n, channels), or the mean wavelength (n, 1)."""
+        """What mixtures (n, 3) have of what is `wanted`: shares of channels (n, channels), or
+        the mean wavelength (n, 1).
+        """
         return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
 
     def off(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
-        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or the mean wavelength's nm.
+        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or
+        the mean wavelength's nm.
 
         Before a lens of known lateral colour, px rms over the field.
         """
@@ -217,7 +240,8 @@ class Colours:
         return np.asarray(off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX))
 
     def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
-        """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of the same colour.
+        """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of
+        the same colour.
 
         The colour is blue's electrons over red's, or the mean wavelength.
         """
@@ -225,14 +249,17 @@ class Colours:
         return np.asarray(found[0] / found[1])
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
-        """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
+        """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where
+        light is none's, their mean.
+        """
         return shares_at(self._shares_of_all(stars)[0], stars, star)
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
-        """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
+        """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by
+        channel, and how far off.
 
-        `off_gamut` is the share of electrons in the wrong channel; of one channel the mean wavelengths wanted and shown stand
-        for it. Light that is no star's has NaN.
+        `off_gamut` is the share of electrons in the wrong channel; of one channel the mean
+        wavelengths wanted and shown stand for it. Light that is no star's has NaN.
         """
         own = np.flatnonzero(star >= 0)
         wanted, shares = self.wanted(stars, star[own]), self.shares_of(stars, star[own])
@@ -254,7 +281,8 @@ class Colours:
         light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
         if not sprites.extended:
             return replace(sprites, primaries=light)
-        if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+        # the same objects are the same light: it is moved once
+        if not self._kept or self._kept[0] != sprites.extended:
             each = extended_by_share(sprites, stars, primaries, by_bv)
             moved = zip(each, self.places_px.tolist(), strict=True)
             self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved)]
@@ -262,7 +290,9 @@ class Colours:
 
 
 def warmth(colour: FloatArray) -> FloatArray:
-    """A number that rises with temperature, of shares of channels (n, 3) or means (n, 1 or more)."""
+    """A number that rises with temperature, of shares of channels (n, 3) or means (n, 1 or
+    more).
+    """
     if colour.shape[1] != len(PRIMARIES):
         return -colour[:, 0]
     tiny = np.finfo(np.float64).tiny
@@ -277,10 +307,11 @@ def mixed_for(
     kinds: FloatArray | None = None,
     psf: Psf | None = None,
 ) -> Colours:
-    """The colours of a monitor's primaries before a tracker of these channels, and a lens with a `psf`.
+    """The colours of a monitor's primaries before a tracker of these channels, and a lens with a
+    `psf`.
 
-    `kinds` (catalogue, 2) are the types by which `rates_by` counts, if it does. Raises InputError where the tracker sees
-    nothing of a primary.
+    `kinds` (catalogue, 2) are the types by which `rates_by` counts, if it does. Raises InputError
+    where the tracker sees nothing of a primary.
     """
     matrix = channel_matrix(primaries, channels, 1.0)
     of_white = matrix.e_per_s.sum(axis=0)
@@ -300,7 +331,8 @@ def mixed_for(
         return Colours(matrix, places, nm, density, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
     up_to = np.cumsum(density, axis=1)
     gram = up_to @ up_to.T * STEP_NM
-    # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's product with it.
+    # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's
+    # product with it.
     above = np.cumsum(up_to[:, ::-1], axis=1)[:, ::-1] * STEP_NM
     knots = nm[::KNOT_STEPS]
     plain = optics.quantum_efficiency

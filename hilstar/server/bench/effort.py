@@ -52,7 +52,8 @@ NO_ERROR = (0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class FieldCost:
-    """Milliseconds that a frame of an average field, turning at 1 deg/s, takes by `round` and by `exact`.
+    """Milliseconds that a frame of an average field, turning at 1 deg/s, takes by `round` and by
+    `exact`.
 
     `where` says on which machine, `why` why `exact` takes long ("" where it does not).
     """
@@ -69,7 +70,8 @@ class FieldCost:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """The light of a bench: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
+    """The light of a bench: the panel's response, its minimum white (electrons per second), the
+    stars' rates (n,).
 
     `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees
     the monitor, `centroider` what it finds stars by: None where the bench does not say, and then
@@ -143,7 +145,9 @@ class Sides:
     cut_to_mag: float = math.inf
 
     def beside(self, codes: CodeErrors) -> Choice:
-        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones rounded."""
+        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones
+        rounded.
+        """
         flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
         more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
         more_px = place_px + self.choice.error_px - codes.place_px
@@ -177,7 +181,8 @@ class Combination:
 
 @dataclass(frozen=True)
 class Effort:
-    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion drawn.
+    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion
+    drawn.
 
     `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked`
     and `light` what the choice was made for. Errors are the worst of all choices together, of the
@@ -206,7 +211,9 @@ class Effort:
 
     @cached_property
     def _found(self) -> CodeErrors:
-        """The codes' worst errors if they are within the tolerance; else the first that are over it."""
+        """The codes' worst errors if they are within the tolerance; else the first that are over
+        it.
+        """
         return worst_errors(self.light.code_stars(), self.quantisation, self._tolerance)
 
     @property
@@ -287,7 +294,9 @@ def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
 
 
 def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
-    """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit, and else by the table's."""
+    """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit,
+    and else by the table's.
+    """
     if measured is not None:
         clear = {measured.in_time(limit_ms * factor) for factor in (SURELY_IN_TIME, 1.0, SURELY_LATE)}
         if len(clear) == 1:
@@ -320,7 +329,9 @@ def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Comb
 
 
 def _is_slight(render: RenderSettings, one: Combination) -> bool:
-    """Whether sprites and paths add next to nothing to the codes' error, or as little as they can."""
+    """Whether sprites and paths add next to nothing to the codes' error, or as little as they
+    can.
+    """
     sprites, motion = one.sprites.choice, one.motion
     share = max(sprites.error_mag / render.tolerance_mag, sprites.error_px / render.tolerance_px)
     is_whole = sprites.error_mag <= MAG_PER_SHARE * MAX_CUT
@@ -439,7 +450,9 @@ def cut_mag(size_px: int, psf: Psf) -> float:
 
 
 def cut_px(size_px: int, psf: Psf) -> float:
-    """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes combined."""
+    """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes
+    combined.
+    """
     worst, offsets = np.zeros(2), np.arange(size_px) - (size_px - 1) // 2
     for fraction in np.linspace(0.0, 1.0, CUT_PHASES) - (0.5 if size_px % 2 else 0.0):
         at = offsets - fraction

@@ -1,4 +1,6 @@
-"""The choices of a bench's effort, for a person (a table) and for a program ("effort" of --json)."""
+"""The choices of a bench's effort, for a person (a table) and for a program ("effort" of
+--json).
+"""
 
 import json
 import math
@@ -13,7 +15,9 @@ HEAD = ("part", "choice", "error", "of the tolerance", "saves")
 
 
 def effort_lines(bench: Bench) -> list[str]:
-    """A table of the choices and their sum, notes, and what would do where that is over the tolerance."""
+    """A table of the choices and their sum, notes, and what would do where that is over the
+    tolerance.
+    """
     effort = bench.effort
     rows = [HEAD]
     for choice in effort.choices:

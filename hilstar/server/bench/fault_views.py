@@ -32,7 +32,9 @@ def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
 def tracker_view(
     file: BenchFile, canvas: Canvas, stars: Stars, moving: "MovingSky | None", scenario: Scenario = NO_SCENARIO
 ) -> FaultView:
-    """The faults of a scenario as they fall on the virtual tracker's detector, which is `canvas`."""
+    """The faults of a scenario as they fall on the virtual tracker's detector, which is
+    `canvas`.
+    """
     camera = _fault_camera(file, canvas, bench_camera(file.config, file.folder), canvas.camera, stars, moving)
     return FaultView(camera, scenario.seed, scenario.folder if scenario.faults else None, frozenset(scenario.faults))
 
@@ -57,7 +59,9 @@ def _fault_camera(
 
 
 def faults_at(bench: Bench, scenario: Scenario, t_ns: int) -> FaultLayer:
-    """The faults of one frame shown at a moment of a scenario. Raises InputError (see `FaultSchedule`)."""
+    """The faults of one frame shown at a moment of a scenario. Raises InputError (see
+    `FaultSchedule`).
+    """
     view = display_view(bench, scenario)
     schedule = FaultSchedule(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare)
     schedule.begin(0)

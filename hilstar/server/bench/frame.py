@@ -1,4 +1,6 @@
-"""From an attitude to a frame: sprites, the linear image, code values; and the lines about a bench's light at a run's start."""
+"""From an attitude to a frame: sprites, the linear image, code values; and the lines about a
+bench's light at a run's start.
+"""
 
 from __future__ import annotations
 
@@ -57,14 +59,17 @@ def without_errors(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
+    """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars
+    behind it.
 
-    `light` is float32 (channels, height, width), electrons per second, and `linear` (height, width) all channels together;
-    `levels`, uint8 or uint16 (height, width), are indices into the response's table; `codes` are the code values, the same
-    array or with bit stealing (height, width, 3). Where the primaries are driven apart, levels and codes are one array
-    (height, width, 3). `rows` is a structured array of TRUTH_DTYPE, a row for each star whose
-    sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's, negative for light that a fault
-    adds. `t_ns` is the moment for which bodies were placed. `truth` is `rows` with the errors of
+    `light` is float32 (channels, height, width), electrons per second, and `linear` (height, width)
+    all channels together; `levels`, uint8 or uint16 (height, width), are indices into the
+    response's table; `codes` are the code values, the same array or with bit stealing (height,
+    width, 3). Where the primaries are driven apart, levels and codes are one array (height, width,
+    3). `rows` is a structured array of TRUTH_DTYPE, a row for each star whose
+    sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's,
+    negative for light that a fault adds. `t_ns` is the moment for which bodies were placed. `truth`
+    is `rows` with the errors of
     the stars, which `errors` reads when they are first asked for.
     """
 
@@ -91,7 +96,9 @@ class Frame:
 
 
 class Drawn:
-    """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by HIP number or a body's name."""
+    """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by
+    HIP number or a body's name.
+    """
 
     def __init__(self, renderer: Backend, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()) -> None:
         self.sprites = sprites
@@ -106,27 +113,34 @@ class Drawn:
 
     @property
     def rate_cam_rad_s(self) -> FloatArray | None:
-        """The turn along which the stars' paths were drawn (3,), cam components; None where they are points."""
+        """The turn along which the stars' paths were drawn (3,), cam components; None where they
+        are points.
+        """
         return None if self.sprites is None else self.sprites.rate_cam_rad_s
 
     @cached_property
     def levels(self) -> Levels:
-        """The levels (see `Bench.code_values`), read back when they are first asked for; the next draw overwrites them."""
+        """The levels (see `Bench.code_values`), read back when they are first asked for; the
+        next draw overwrites them.
+        """
         return self._renderer.levels()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bench:
-    """A bench, assembled (see `build`): stars, geometry, light and a renderer. Free it with `close`.
+    """A bench, assembled (see `build`): stars, geometry, light and a renderer. Free it with
+    `close`.
 
-    `config` is that of `file` with everything chosen that the file left to its tolerance, by `effort`. Of `stars` those from
-    `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are `faint_stars`. `uniformity`, float32
-    (height, width), is each pixel's share of white, None where that is 1 everywhere, and `darkest` its minimum. `tracker_psf`
-    is how collimator and tracker spread a monitor's point. `drawn` says which PSF stars are drawn by where the display brings
-    the tracker's; `spectra` are their shares of its wavelengths, by place. `sources` are the sky's light beside stars, whose
-    bodies have places among `stars` and `shown_stars`. `output` says how the display's output is set that its frames are shown
-    on; {} without one. `panel` is the monitor's light by its levels. Where its primaries are driven apart, `colours` says what
-    for, and stars have the light of each.
+    `config` is that of `file` with everything chosen that the file left to its tolerance, by
+    `effort`. Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`;
+    the others are `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of
+    white, None where that is 1 everywhere, and `darkest` its minimum. `tracker_psf` is how
+    collimator and tracker spread a monitor's point. `drawn` says which PSF stars are drawn by where
+    the display brings the tracker's; `spectra` are their shares of its wavelengths, by place.
+    `sources` are the sky's light beside stars, whose bodies have places among `stars` and
+    `shown_stars`. `output` says how the display's output is set that its frames are shown on; {}
+    without one. `panel` is the monitor's light by its levels. Where its primaries are driven apart,
+    `colours` says what for, and stars have the light of each.
     """
 
     file: BenchFile
@@ -163,7 +177,9 @@ class Bench:
 
     @cached_property
     def drive(self) -> FloatArray | float:
-        """How much of white each of `stars` asks for by its colour, relative to a white star as bright; 1 for all in grey."""
+        """How much of white each of `stars` asks for by its colour, relative to a white star as
+        bright; 1 for all in grey.
+        """
         return (
             1.0 if self.colours is None else self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
         )
@@ -187,7 +203,9 @@ class Bench:
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
-        """The layers of what the monitor can show: `shown_stars`, bodies, and satellites as bright."""
+        """The layers of what the monitor can show: `shown_stars`, bodies, and satellites as
+        bright.
+        """
         return sky_layers(self.canvas, self.sources, self.faintest_shown_e_per_s, self.shown_stars)
 
     @cached_property
@@ -236,7 +254,9 @@ class Bench:
         return sprites if self.spectra is None else replace(sprites, spectra=self.spectra(stars, sprites.star))
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
-        """The sprites of `stars` (by default those bright enough to show) as points, at an attitude (unit quaternion)."""
+        """The sprites of `stars` (by default those bright enough to show) as points, at an
+        attitude (unit quaternion).
+        """
         stars = self.shown_stars if stars is None else stars
         return self._coloured(light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam)), stars)
 
@@ -247,18 +267,22 @@ class Bench:
         rate_cam_rad_s: Vector | FloatArray | None = None,
         t_ns: int | None = None,
     ) -> Drawn:
-        """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
+        """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no
+        table.
 
-        `frame` counts the frames shown, for `temporal`: a number not above the last one's begins anew. With a rate that moves
-        stars by more than `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is
-        then that at the middle row's first light. Bodies are where they are at `t_ns`, by default at the start; without a
-        rate satellites' paths have their middle there.
+        `frame` counts the frames shown, for `temporal`: a number not above the last one's begins
+        anew. With a rate that moves stars by more than `[render] motion_above_px`, each star is
+        drawn along its path while its row is lit; the attitude is then that at the middle row's
+        first light. Bodies are where they are at `t_ns`, by default at the start; without a rate
+        satellites' paths have their middle there.
         """
         light = None if q_icrs_to_cam is None else self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
         return self.draw_sprites(light, frame)
 
     def discs(self, view: View) -> list[Disc]:
-        """The bodies and satellites on the image that are drawn as discs, at rest: bodies nearest first, after satellites."""
+        """The bodies and satellites on the image that are drawn as discs, at rest: bodies
+        nearest first, after satellites.
+        """
         from hilstar.optics.layers.satellites import SatelliteLayer  # no other frame needs it
 
         found: list[Disc] = []
@@ -279,7 +303,9 @@ class Bench:
         return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
 
     def _driven(self, sprites: Sprites | None, stars: Stars) -> Sprites | None:
-        """Sprites with the light of each primary, where those are driven apart; `sprites.star` has places among `stars`."""
+        """Sprites with the light of each primary, where those are driven apart; `sprites.star`
+        has places among `stars`.
+        """
         return sprites if sprites is None or self.colours is None else self.colours.driven(sprites, stars)
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
@@ -287,7 +313,9 @@ class Bench:
         return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
 
     def warm_up(self) -> None:
-        """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
+        """Draw once with paths, with stars and with none: a driver compiles its shaders at first
+        use, 60 ms on llvmpipe.
+        """
         lights = () if self._bodies is None else self._bodies.any_lights()
         if self.sources.diffuse:
             lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
@@ -307,9 +335,9 @@ class Bench:
     ) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
-        Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames; with
-        `temporal` this is the first frame of a sequence. Bodies are where they are at `t_ns`. Raises InputError for a
-        quaternion that is not unit within 1e-3.
+        Stars too faint for the monitor are in the linear image and the truth, and not drawn.
+        `number` counts frames; with `temporal` this is the first frame of a sequence. Bodies are
+        where they are at `t_ns`. Raises InputError for a quaternion that is not unit within 1e-3.
         """
         view = self.view(checked_quaternion(q_icrs_to_cam), None, t_ns)
         view = view if faults is None else faults.turned(view)
@@ -343,7 +371,8 @@ class Bench:
         return with_errors(rows, self.stars.catalog, self.config.sky.epoch_jyear)
 
     def losses_mag(self, frame: Frame, faults: FaultLayer | None = None) -> dict[int | str, float]:
-        """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
+        """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes
+        too faint it is.
 
         That is summed over its own pixels. `faults` are those of the frame.
         """
@@ -368,7 +397,9 @@ class Bench:
         return {name: losses[name] for name in clipped if name in losses}
 
     def code_values(self, levels: Levels) -> Codes:
-        """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""
+        """The monitor's code values of levels (height, width): the same, or (height, width, 3)
+        with bit stealing.
+        """
         rgb = self.calibration.response.rgb
         if rgb is None:  # codes of primaries that are driven apart are their levels, too
             return levels
@@ -377,7 +408,8 @@ class Bench:
     def _clipped(self, sprites: Sprites) -> IntArray:
         """Places of the sprites that are over white: of light as a whole, or of any primary."""
         psf, spectra = self.psf, sprites.spectra
-        if isinstance(psf, GlassPsf) and spectra is not None:  # as bright as the mean PSF's stars with the same peaks
+        # as bright as the mean PSF's stars with the same peaks
+        if isinstance(psf, GlassPsf) and spectra is not None:
             data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
             bright = np.flatnonzero(data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white)
             x_px, y_px, rate = sprites.x_px[bright], sprites.y_px[bright], data["electrons_per_s"][bright]
@@ -390,7 +422,8 @@ class Bench:
         over, places_px = [np.empty(0, dtype=np.intp)], self.renderer.target.places_px
         most_e_per_s = sprites.primaries.max(axis=0, initial=0.0) * (sprites.per_star * psf.peak_share)
         for k, one in enumerate(self.panel.primaries):
-            if most_e_per_s[k] > 0.5 * one.flux_at_white_e_per_s * self.darkest:  # as in `clipped_sprites`
+            # as in `clipped_sprites`
+            if most_e_per_s[k] > 0.5 * one.flux_at_white_e_per_s * self.darkest:
                 over.append(clipped_sprites(by_primary(sprites, places_px, k), psf, one.flux_at_white_e_per_s, *screen))
         return np.unique(np.concatenate(over))
 
@@ -406,7 +439,9 @@ class Bench:
 
 
 def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
-    """`q` (w, x, y, z) as a float64 unit array. Raises InputError where it is not unit within 1e-3."""
+    """`q` (w, x, y, z) as a float64 unit array. Raises InputError where it is not unit within
+    1e-3.
+    """
     array = np.asarray(q, dtype=np.float64)
     if array.shape != (4,):
         raise InputError(f"quaternion of shape {array.shape}: write four numbers w, x, y, z")
@@ -417,7 +452,9 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def clipping_hip(bench: Bench) -> list[int | str]:
-    """Stars and bodies that clip when centred on the darkest pixel, brightest first: HIP numbers, and names of bodies."""
+    """Stars and bodies that clip when centred on the darkest pixel, brightest first: HIP
+    numbers, and names of bodies.
+    """
     peak_e_per_s = bench.stars.electrons_per_s * bench.psf.peak_share * bench.drive
     order = np.argsort(-peak_e_per_s, kind="stable")
     clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * bench.darkest * (1 + CLIP_TOLERANCE)
@@ -448,12 +485,16 @@ def clipping_line(bench: Bench) -> str | None:
 
 
 def drawn_line(bench: Bench) -> str | None:
-    """One line on the PSF by which stars are drawn, where the display brings the tracker's; otherwise None."""
+    """One line on the PSF by which stars are drawn, where the display brings the tracker's;
+    otherwise None.
+    """
     return None if bench.drawn is None else f"[render] {bench.drawn.line()}"
 
 
 def shares_line(bench: Bench) -> str | None:
-    """One line where bit stealing weighs the primaries by a formula's shares of white, not the tracker's; otherwise None."""
+    """One line where bit stealing weighs the primaries by a formula's shares of white, not the
+    tracker's; otherwise None.
+    """
     calibration = bench.calibration
     if not bench.config.render.bit_stealing or not calibration.is_formula or calibration.weights is None:
         return None
@@ -465,7 +506,9 @@ def shares_line(bench: Bench) -> str | None:
 
 
 def colour_line(bench: Bench) -> str | None:
-    """One line where the primaries' spectra are guessed from their chromaticities; otherwise None."""
+    """One line where the primaries' spectra are guessed from their chromaticities; otherwise
+    None.
+    """
     if bench.colours is None or bench.config.monitor.primaries.xy_r is None:
         return None
     return (

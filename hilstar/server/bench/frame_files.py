@@ -1,8 +1,8 @@
 """Frames as files: FITS with a world coordinate system, CSV and PNG.
 
-The world coordinate system is a tangent plane with the lens as SIP polynomials (Shupe et al. 2005): a pixel at (X, Y) from
-CRPIX is at CD (X + A(X, Y), Y + B(X, Y)) on the tangent plane, and AP and BP lead back. Their degree is the smallest that is
-right to GOOD_PX at pixels that were held out.
+The world coordinate system is a tangent plane with the lens as SIP polynomials (Shupe et al. 2005):
+a pixel at (X, Y) from CRPIX is at CD (X + A(X, Y), Y + B(X, Y)) on the tangent plane, and AP and BP
+lead back. Their degree is the smallest that is right to GOOD_PX at pixels that were held out.
 """
 
 import csv
@@ -29,14 +29,16 @@ from hilstar.server.bench.frame import Bench, Frame
 GOOD_PX = 0.01
 MAX_SIP_PX = 0.1  # a polynomial with a larger error is not written
 MAX_DEGREE = 9  # the convention's
-FITTED, HELD_OUT = 28, 25  # places along each side of the image; the latter have its edges among them
+# places along each side of the image; the latter have its edges among them
+FITTED, HELD_OUT = 28, 25
 
 Keywords = dict[str, str | float]
 AFTER_HEADER = 33  # bytes of a PNG up to the end of its first chunk
 PREVIEW_RADIUS_PX = 9  # the brightest star's
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
-# Light as bright over a square of this side is a body's or a map's, which is drawn as it is: at its size. A star's
+# Light as bright over a square of this side is a body's or a map's, which is drawn as it is: at its
+# size. A star's
 # brightest pixels are fewer.
 BODY_SIDE_PX = 9
 BODY_EDGE_PX = 3  # a round limb goes beyond the squares within it by so much
@@ -45,9 +47,11 @@ BODY_SHARE = 1.5  # to this multiple of the square's light
 
 @dataclass(frozen=True, slots=True)
 class Sip:
-    """SIP of one degree, about `origin_px`: the linear part (2, 2), of pixels to those of an ideal image, and all other terms.
+    """SIP of one degree, about `origin_px`: the linear part (2, 2), of pixels to those of an ideal
+    image, and all other terms.
 
-    `forward` and `back` (terms, 2) are A, B and AP, BP by `_powers`. `error_px` is their largest error over the image.
+    `forward` and `back` (terms, 2) are A, B and AP, BP by `_powers`. `error_px` is their largest
+    error over the image.
     """
 
     degree: int
@@ -59,9 +63,11 @@ class Sip:
 
 
 def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
-    """The FITS keywords of an image: TAN, exact for a pinhole; behind a lens with SIP, or TAN alone where no SIP fits.
+    """The FITS keywords of an image: TAN, exact for a pinhole; behind a lens with SIP, or TAN alone
+    where no SIP fits.
 
-    `LENSERR` is the largest distance, px, on the image between where they and the camera have a star.
+    `LENSERR` is the largest distance, px, on the image between where they and the camera have a
+    star.
     """
     if camera.lens is None:
         return _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
@@ -107,7 +113,9 @@ def _tangent_plane(camera: Camera, q_icrs_to_cam: FloatArray, origin_px: tuple[f
 
 @lru_cache(maxsize=4)
 def fit_sip(camera: Camera) -> Sip | None:
-    """The SIP of a camera with a lens, by least squares over its image; None where no degree is within MAX_SIP_PX."""
+    """The SIP of a camera with a lens, by least squares over its image; None where no degree is
+    within MAX_SIP_PX.
+    """
     x_px, y_px = camera.places_px(np.zeros(1), np.zeros(1))
     origin_px = float(x_px[0]), float(y_px[0])
     fitted, held_out = (_pairs(camera, origin_px, count) for count in (FITTED, HELD_OUT))
@@ -133,7 +141,9 @@ def fit_sip(camera: Camera) -> Sip | None:
 
 
 def _pairs(camera: Camera, origin_px: tuple[float, float], count: int) -> tuple[FloatArray, FloatArray]:
-    """Pixels and their places on the ideal image, both (n, 2) px from the origin; those that the lens knows."""
+    """Pixels and their places on the ideal image, both (n, 2) px from the origin; those that the
+    lens knows.
+    """
     x, y = camera.grid_px(count)
     u, v = camera.tangents(x, y)
     seen = np.isfinite(u)
@@ -142,7 +152,9 @@ def _pairs(camera: Camera, origin_px: tuple[float, float], count: int) -> tuple[
 
 
 def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
-    """The coefficients (terms, 2), without a constant, by least squares; scaled, because powers of pixels are large."""
+    """The coefficients (terms, 2), without a constant, by least squares; scaled, because powers
+    of pixels are large.
+    """
     terms = _terms(at, degree, 1)
     scale = np.abs(terms).max(axis=0)
     return np.asarray(np.linalg.lstsq(terms / scale, wanted, rcond=None)[0] / scale[:, None])
@@ -162,9 +174,11 @@ def _terms(at: FloatArray, degree: int, first: int) -> FloatArray:
 
 
 def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
-    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a world coordinate system.
+    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a world
+    coordinate system.
 
-    The first row of the array is the top of the monitor. Light of several channels is a cube, whose third axis is CHANNEL.
+    The first row of the array is the top of the monitor. Light of several channels is a cube, whose
+    third axis is CHANNEL.
     """
     from astropy.io import fits
 
@@ -194,7 +208,9 @@ def write_fits(path: Path, hdus: Any) -> None:
 
 
 def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
-    """A FITS header with the attitude, the epoch, the bench's hash and a world coordinate system."""
+    """A FITS header with the attitude, the epoch, the bench's hash and a world coordinate
+    system.
+    """
     from astropy.io import fits
 
     header = fits.Header()
@@ -227,7 +243,8 @@ def write_truth_csv(path: Path, frame: Frame) -> None:
 
 
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
-    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as they are.
+    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as
+    they are.
 
     Codes of three channels (height, width, 3) become an RGB picture.
     """
@@ -238,9 +255,11 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
 
 
 def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
-    """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits` mean something (sBIT).
+    """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits`
+    mean something (sBIT).
 
-    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's PNG, and 12 % fewer bytes.
+    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's
+    PNG, and 12 % fewer bytes.
     """
     import png
 
@@ -255,7 +274,8 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
-    """A preview for the eye: each star a disc that grows with its code, as on a star chart; a body has its own size.
+    """A preview for the eye: each star a disc that grows with its code, as on a star chart; a body
+    has its own size.
 
     It is stretched to the brightest pixel of the frame.
     """
@@ -277,7 +297,8 @@ def _bodies(signal: Float32Array) -> BoolArray:
 
 
 def _discs(signal: Float32Array) -> Float32Array:
-    """Each pixel of (height, width), 0 to 1, as a disc of its value; the brightest of those that overlap.
+    """Each pixel of (height, width), 0 to 1, as a disc of its value; the brightest of those that
+    overlap.
 
     Only lit pixels are looked at, of which a frame of stars has few.
     """

@@ -1,4 +1,6 @@
-"""A bench's glass: the PSFs of `[tracker.optics] psf` at its focus, and the lens and transmission that belong with them."""
+"""A bench's glass: the PSFs of `[tracker.optics] psf` at its focus, and the lens and
+transmission that belong with them.
+"""
 
 import logging
 from dataclasses import dataclass, replace
@@ -23,7 +25,9 @@ GRID = 9  # places along each side at which two lenses are compared
 
 
 def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
-    """The glass of a tracker's file; None where its PSF is a Gaussian or one image. Raises InputError."""
+    """The glass of a tracker's file; None where its PSF is a Gaussian or one image. Raises
+    InputError.
+    """
     if tracker.optics.psf == GAUSSIAN:
         return None
     found = read_glass(folder / tracker.optics.psf)
@@ -43,14 +47,18 @@ class Onto:
 
     @property
     def matrix(self) -> FloatArray:
-        """Takes offsets of tracker pixels to display pixels (2, 2): by places half a pixel beside the principal point."""
+        """Takes offsets of tracker pixels to display pixels (2, 2): by places half a pixel
+        beside the principal point.
+        """
         sides = np.array([(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
         ends = self.places_px(np.array(self.tracker.principal_point_px) + sides)
         return np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1)
 
 
 def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path, onto: Onto | None = None) -> GlassPsf:
-    """A tracker's glass at its focus, or as a display draws it; the same again is the same object. Says what is not covered."""
+    """A tracker's glass at its focus, or as a display draws it; the same again is the same
+    object. Says what is not covered.
+    """
     shares = _mean_shares(glass, tracker, folder)
     optics = tracker.optics
     focus_um = optics.focus_um + optics.focus_um_per_k * optics.warmer_k
@@ -79,7 +87,8 @@ def _glass_psf(
         places_px, lateral_px = np.round(onto.places_px(glass.places_px), 6), glass.lateral_px @ onto.matrix.T
         each = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
         each |= {"illumination": glass.illumination, "outside": glass.outside}
-        known = np.isfinite(places_px).all(axis=1)  # points far beyond the detector may lie beyond either lens
+        # points far beyond the detector may lie beyond either lens
+        known = np.isfinite(places_px).all(axis=1)
         if not known.any():
             raise InputError("none of its points lies before the display's lens")
         fine = {name: values[known] for name, values in each.items()}
@@ -98,12 +107,16 @@ def _glass_psf(
 
 @lru_cache(maxsize=32)
 def say_once(line: str, about: str = "[tracker.optics] psf") -> None:
-    """Warn of what a glass does not cover or is not taken for, or of what else a tracker is `about`, each line once."""
+    """Warn of what a glass does not cover or is not taken for, or of what else a tracker is
+    `about`, each line once.
+    """
     log.warning("%s: %s", about, line)
 
 
 def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
-    """The shares (L,) that a file's wavelengths have of as many photons at each wavelength, as the tracker detects them."""
+    """The shares (L,) that a file's wavelengths have of as many photons at each wavelength, as
+    the tracker detects them.
+    """
     if len(glass.wavelengths_nm) == 1:
         return np.ones(1)
     nm, weight = np.concatenate([_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1)
@@ -125,7 +138,9 @@ def _detected(tracker: Tracker, key: str, folder: Path) -> FloatArray:
 
 
 def glass_transmission(tracker: Tracker, folder: Path) -> Curve:
-    """The transmission of a tracker's optics: its own key where that is given, else its glass's, else 1. Raises InputError."""
+    """The transmission of a tracker's optics: its own key where that is given, else its glass's,
+    else 1. Raises InputError.
+    """
     glass = glass_in(tracker, folder)
     if glass is None or glass.transmission is None:
         return load_curve(tracker.transmission, "[tracker] transmission", folder, TRANSMISSIONS)
@@ -136,7 +151,9 @@ def glass_transmission(tracker: Tracker, folder: Path) -> Curve:
 
 
 def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:
-    """The camera with its glass's distortion; one that has a lens keeps it, and a contradiction is said."""
+    """The camera with its glass's distortion; one that has a lens keeps it, and a contradiction
+    is said.
+    """
     glass = glass_in(tracker, folder)
     if glass is None or glass.lens is None:
         return camera

@@ -1,7 +1,8 @@
-"""The least PSF that a tolerance allows: a Gaussian, one PSF for all stars, Gaussians over the field, few basis images, or all.
+"""The least PSF that a tolerance allows: a Gaussian, one PSF for all stars, Gaussians over the
+field, few basis images, or all.
 
-Candidates are compared with the whole glass at places all over the field, for two spectra: by a star's light and centroid, in
-all of its pixels and in a Gaussian window as wide as the star.
+Candidates are compared with the whole glass at places all over the field, for two spectra: by a
+star's light and centroid, in all of its pixels and in a Gaussian window as wide as the star.
 """
 
 import math
@@ -25,7 +26,8 @@ COMPONENTS = (3, 6, 12)
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One choice of a part of a frame: its largest errors, its time in a frame of an average field, and what that saves.
+    """One choice of a part of a frame: its largest errors, its time in a frame of an average field,
+    and what that saves.
 
     `note` is what else there is to know of it, "" for nothing.
     """
@@ -48,7 +50,9 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class PsfErrors:
-    """How far stars drawn by another PSF are from those of a glass, at most: of their light and of their centroid."""
+    """How far stars drawn by another PSF are from those of a glass, at most: of their light and
+    of their centroid.
+    """
 
     mag: float
     px: float
@@ -72,7 +76,8 @@ def candidates(psf: SampledPsf) -> Iterator[tuple[str, Callable[[], Psf]]]:
 
 
 def psf_choices(psf: SampledPsf, places_px: FloatArray, among: frozenset[str] | None = None) -> Iterator[tuple[Psf, Choice]]:
-    """Each of `candidates` (by name those `among` them) with its errors at places (n, 2) of the field, itself at last.
+    """Each of `candidates` (by name those `among` them) with its errors at places (n, 2) of the
+    field, itself at last.
 
     A choice's note says how far off those before it are.
     """
@@ -103,7 +108,9 @@ def least_psf(
 def first_within(
     found: Iterator[tuple[Psf, Choice]] | Iterator[tuple[Psf, Choice | None]], tolerance: tuple[float, float]
 ) -> tuple[Psf, Choice | None]:
-    """The first PSF whose own errors are within a tolerance, mag and px, or that is no choice; the last where none is."""
+    """The first PSF whose own errors are within a tolerance, mag and px, or that is no choice;
+    the last where none is.
+    """
     last: tuple[Psf, Choice | None] | None = None
     for last in found:
         choice = last[1]
@@ -116,14 +123,17 @@ def first_within(
 
 def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:
     """The largest errors of stars at places (n, 2) that are drawn by another PSF."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # where a field's corner has no light, nothing but the whole will do
+    # where a field's corner has no light, nothing but the whole will do
+    with np.errstate(divide="ignore", invalid="ignore"):
         wanted, found = (_measured(one, psf, places_px) for one in (psf, other))
         mag = MAG_PER_SHARE * float(np.abs(found[..., 0] / wanted[..., 0] - 1).max())
     return PsfErrors(mag, float(np.hypot(*np.moveaxis(found[..., 1:] - wanted[..., 1:], 2, 0)).max()))
 
 
 def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
-    """Flux and centroid, px from the star (windows, n, 3), of stars of each spectrum at places, drawn by `one`."""
+    """Flux and centroid, px from the star (windows, n, 3), of stars of each spectrum at places,
+    drawn by `one`.
+    """
     side, x, y = psf.footprint_px, *np.repeat(places_px, len(SPECTRA_K), axis=0).T
     fraction = np.stack([place - np.floor(place + 0.5) for place in (x, y)])
     if isinstance(one, GlassPsf):

@@ -1,4 +1,6 @@
-"""Whether a bench's calibration files are of the monitor that is there: another monitor, mode or setting, or too old a file."""
+"""Whether a bench's calibration files are of the monitor that is there: another monitor, mode or
+setting, or too old a file.
+"""
 
 import contextlib
 import datetime
@@ -21,7 +23,9 @@ SHOWN_ANYWAY = "shown anyway (--force)"
 
 @dataclass(frozen=True, slots=True)
 class MeasuredOn:
-    """What a calibration or geometry file says of its origin: the monitor, and the date; None for what it does not say."""
+    """What a calibration or geometry file says of its origin: the monitor, and the date; None
+    for what it does not say.
+    """
 
     name: str
     identity: MonitorIdentity | None = None
@@ -39,7 +43,9 @@ class MeasuredOn:
 
 @dataclass(frozen=True, slots=True)
 class MonitorCheck:
-    """The monitor that is there (None: not known), what is wrong with a bench's files for it, and what cannot be told."""
+    """The monitor that is there (None: not known), what is wrong with a bench's files for it,
+    and what cannot be told.
+    """
 
     now: MonitorIdentity | None
     fault: str = ""
@@ -58,9 +64,12 @@ class MonitorCheck:
 
 
 def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
-    """The origins of a bench's calibration and geometry files; a built-in curve has none. Raises InputError."""
+    """The origins of a bench's calibration and geometry files; a built-in curve has none. Raises
+    InputError.
+    """
     certificate = bench_certificate(file)
-    # Whoever certified it by readings looked at that monitor; one made from the files alone would make old files fresh.
+    # Whoever certified it by readings looked at that monitor; one made from the files alone would
+    # make old files fresh.
     if certificate is not None and certificate.reference_sha256 and certificate.monitor.get("identity"):
         identity = msgspec.convert(certificate.monitor["identity"], MonitorIdentity)
         yield MeasuredOn(f"certificate {certificate.number}", identity, _date(certificate.made))
@@ -77,7 +86,8 @@ def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
 
 
 def check_monitor(file: BenchFile, now: MonitorIdentity | None, today: datetime.date) -> MonitorCheck:
-    """Compare a bench's files with the monitor that is there (None: not known), and their dates with `today`.
+    """Compare a bench's files with the monitor that is there (None: not known), and their dates
+    with `today`.
 
     Raises InputError for a file that cannot be read.
     """

@@ -1,4 +1,6 @@
-"""The moving part of a bench's sky, from its file: bodies, satellites, the observer, and bodies wider than a point."""
+"""The moving part of a bench's sky, from its file: bodies, satellites, the observer, and bodies
+wider than a point.
+"""
 
 import logging
 from collections.abc import Sequence
@@ -24,15 +26,18 @@ from hilstar.sky.stars import total_and_colours
 log = logging.getLogger(__name__)
 
 MAX_ORBIT_BYTES = 20_000_000  # states for each minute of a year
-MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
+# 120 000 sets: several times as many as there are in orbit
+MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000
 MAX_TLE_AGE_DAYS = 7.0
-MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # wider bodies are given in degrees, and without a count of pixels
+# wider bodies are given in degrees, and without a count of pixels
+MAX_ARCSEC, MANY_PX = 7200.0, 1000.0
 
 
 def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) -> MovingSky:
     """The bodies and satellites of a bench file that has a date, and its observer.
 
-    Raises InputError for an orbit, a list or a date that cannot be used, MachineError where the extra is not installed.
+    Raises InputError for an orbit, a list or a date that cannot be used, MachineError where the
+    extra is not installed.
     """
     utc_ns = epoch_utc_ns(config)
     if utc_ns is None:
@@ -77,7 +82,8 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
 
 
 def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
-    """The orbit in a file, which is an OEM that covers that UTC, or elements: with a warning where they are of another week.
+    """The orbit in a file, which is an OEM that covers that UTC, or elements: with a warning where
+    they are of another week.
 
     The UTC may be the beginning of the `day` of what is shown.
 
@@ -89,7 +95,8 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
     orbit = TleOrbit(text, str(path))
     age_days = orbit.age_days(utc_ns)
     if abs(age_days) > MAX_TLE_AGE_DAYS:
-        # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6 arcsec a day.
+        # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6
+        # arcsec a day.
         log.warning(
             "%s: its elements are %.0f days from [sky] epoch_utc; a low orbit is then off by %.0f km or more",
             path,
@@ -108,7 +115,9 @@ def observer_lines(config: BenchConfig) -> list[str]:
 
 
 def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = None) -> list[str]:
-    """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest first."""
+    """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest
+    first.
+    """
     found = {} if moving is None else moving.diameters_arcsec(t_ns)
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
     widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)

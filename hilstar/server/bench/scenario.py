@@ -1,9 +1,12 @@
-"""A scenario: the file of faults with their times and the seed of their randomness, and which are on at a moment.
+"""A scenario: the file of faults with their times and the seed of their randomness, and which are
+on at a moment.
 
-`FaultSchedule` has the faults of a run: those of the scenario at their times, and those that somebody asked for. Anybody may
-ask, from any thread: the operator's console by name, the stream with a fault of its own. What was asked for begins
-and ends with the next frame, so that a ledger has one moment for it, and a replay the same light. Memory is bounded: at most
-MAX_ON faults are on at once, and MAX_ASKED requests wait; the others are refused.
+`FaultSchedule` has the faults of a run: those of the scenario at their times, and those that
+somebody asked for. Anybody may ask, from any thread: the operator's console by name, the stream
+with a fault of its own. What was asked for begins
+and ends with the next frame, so that a ledger has one moment for it, and a replay the same light.
+Memory is bounded: at most MAX_ON faults are on at once, and MAX_ASKED requests wait; the others are
+refused.
 """
 
 import threading
@@ -59,11 +62,15 @@ class Scenario:
 
     @property
     def end_s(self) -> float:
-        """When the last fault with a beginning and an end of its own is over; 0 where there is none."""
+        """When the last fault with a beginning and an end of its own is over; 0 where there is
+        none.
+        """
         return max((f.at_s + f.for_s for f in self.faults if f.at_s is not None and f.for_s is not None), default=0.0)
 
     def prepared(self, prepare: Callable[[Fault], Fault]) -> list[Fault]:
-        """The faults as `prepare` returns them. Raises InputError with the file and the fault where `prepare` does."""
+        """The faults as `prepare` returns them. Raises InputError with the file and the fault
+        where `prepare` does.
+        """
         found = []
         for fault in self.faults:
             try:
@@ -77,7 +84,9 @@ NO_SCENARIO = Scenario(Path(), "")
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read and check a scenario. Raises InputError: file, fault, key, what is wrong and what to write."""
+    """Read and check a scenario. Raises InputError: file, fault, key, what is wrong and what to
+    write.
+    """
     return parse_scenario(path, read_text(path, ADVICE, MAX_TOML_BYTES))
 
 
@@ -133,7 +142,8 @@ class ScheduledFault:
 
 
 class Timetable:
-    """When the faults of a scenario are on that begin by themselves, for whoever looks at moments and not at frames in a row.
+    """When the faults of a scenario are on that begin by themselves, for whoever looks at moments
+    and not at frames in a row.
 
     `prepare` is called with each fault. Raises InputError where that does.
     """
@@ -149,13 +159,17 @@ class Timetable:
                 )
 
     def on(self, t_ns: int, since_ns: int | None = None) -> tuple[Now, ...]:
-        """The faults that are on at a moment, each as long as it has been on at `since_ns` (by default then)."""
+        """The faults that are on at a moment, each as long as it has been on at `since_ns` (by
+        default then).
+        """
         at_ns = t_ns if since_ns is None else since_ns
         there = [e for e in self._entries if e.begin_ns <= t_ns and (e.end_ns is None or t_ns < e.end_ns)]
         return tuple(Now(e.number, e.fault, at_ns - e.begin_ns) for e in there)
 
     def edges_ns(self, begin_ns: int, end_ns: int) -> list[int]:
-        """The ends of the pieces of a time within which nothing begins, ends or is renewed; the time's own among them."""
+        """The ends of the pieces of a time within which nothing begins, ends or is renewed; the
+        time's own among them.
+        """
         found = {begin_ns, end_ns}
         for entry in self._entries:
             marks = [entry.begin_ns, *([] if entry.end_ns is None else [entry.end_ns])]
@@ -166,7 +180,9 @@ class Timetable:
         return sorted(found)[:MAX_EDGES]
 
     def stands_since_ns(self, t_ns: int) -> int | None:
-        """When the display began to show the same frame as at a moment, by faults that overlap; None where it goes on."""
+        """When the display began to show the same frame as at a moment, by faults that overlap;
+        None where it goes on.
+        """
         since_ns = None
         while True:
             at_ns = t_ns if since_ns is None else since_ns - 1
@@ -189,7 +205,9 @@ FILE = "file"  # who starts what a scenario has a time for
 
 @dataclass(frozen=True, slots=True)
 class FaultChange:
-    """A fault begins or ends at a moment of the run, ns from its zero, or falls between two frames; and who wanted that."""
+    """A fault begins or ends at a moment of the run, ns from its zero, or falls between two
+    frames; and who wanted that.
+    """
 
     what: Literal["start", "end", "missed"]
     number: int
@@ -200,7 +218,9 @@ class FaultChange:
 
 @dataclass(slots=True)
 class _Planned:
-    """A fault that is to begin: `start_ns` of the run; None: with the next frame. It has a number once it is on."""
+    """A fault that is to begin: `start_ns` of the run; None: with the next frame. It has a
+    number once it is on.
+    """
 
     fault: Fault
     who: str
@@ -211,9 +231,9 @@ class _Planned:
 class FaultSchedule:
     """The faults of a run whose frames last `frame_s` each.
 
-    `prepare` is called with each fault of the scenario at once, and with each that is asked for before it is taken; it
-    returns the fault that is to be drawn, and raises InputError for one that cannot be. `listen` hears of each beginning and
-    end, on the frames' thread.
+    `prepare` is called with each fault of the scenario at once, and with each that is asked for
+    before it is taken; it returns the fault that is to be drawn, and raises InputError for one that
+    cannot be. `listen` hears of each beginning and end, on the frames' thread.
     """
 
     def __init__(
@@ -252,7 +272,9 @@ class FaultSchedule:
             return [planned.fault.name for planned in (*self._on, *self._asked)]
 
     def start(self, name: str, who: str) -> None:
-        """Begin a fault of the scenario with the next frame. Raises InputError for a name that is unknown, or on already."""
+        """Begin a fault of the scenario with the next frame. Raises InputError for a name that
+        is unknown, or on already.
+        """
         fault = self._listed.get(name)
         if fault is None:
             known = ", ".join(self.names())
@@ -271,7 +293,9 @@ class FaultSchedule:
         self._ask(_Planned(fault, who, None if fault.at_s is None else round(fault.at_s * NS_PER_S)))
 
     def stop(self, name: str, who: str = "") -> None:
-        """End a fault with the next frame, whoever began it. Raises InputError for one that is not on."""
+        """End a fault with the next frame, whoever began it. Raises InputError for one that is
+        not on.
+        """
         with self._lock:
             waiting = [planned for planned in self._asked if planned.fault.name == name]
             for planned in waiting:
@@ -288,7 +312,9 @@ class FaultSchedule:
             self._asked.append(wanted)
 
     def _check_room(self, fault: Fault) -> None:
-        """Refuse (InputError) a fault whose name is on, and one too many; the caller has the lock."""
+        """Refuse (InputError) a fault whose name is on, and one too many; the caller has the
+        lock.
+        """
         there = [planned.fault for planned in (*self._on, *self._asked)]
         if any(other.name == fault.name for other in there) and fault.name not in self._stops:
             raise InputError(f"the fault {fault.name!r} is on already; stop it first, or give another name")
@@ -301,11 +327,15 @@ class FaultSchedule:
     # Called by the frames' thread
 
     def begin(self, t_ns: int) -> None:
-        """Say which time is the run's zero, from which `at_s` counts; by default that of the first frame."""
+        """Say which time is the run's zero, from which `at_s` counts; by default that of the
+        first frame.
+        """
         self._zero_ns = t_ns
 
     def at(self, t_ns: int) -> tuple[Now, ...]:
-        """The faults that are on in the frame whose light begins at `t_ns`; begins and ends what is due."""
+        """The faults that are on in the frame whose light begins at `t_ns`; begins and ends what
+        is due.
+        """
         if self._zero_ns is None:
             self._zero_ns = t_ns
         if not (self._asked or self._planned or self._on):
@@ -363,9 +393,11 @@ class FaultSchedule:
 
 
 def share_on(fault: Fault, since_ns: int, frame_ns: int) -> float:
-    """The part of a frame for which a fault is on that began `since_ns` before its light does; 0 where it is not.
+    """The part of a frame for which a fault is on that began `since_ns` before its light does; 0
+    where it is not.
 
-    Light is drawn in proportion; any other fault is on or off, in the frame nearest to its beginning at least.
+    Light is drawn in proportion; any other fault is on or off, in the frame nearest to its
+    beginning at least.
     """
     length_ns = lasts_ns(fault)
     if not fault.OF_LIGHT:

@@ -79,7 +79,9 @@ def site_refraction(site: SiteSettings, optics: Optics) -> tuple[float, float]:
 
 
 def site_glow_e_per_s_sr(config: BenchConfig, folder: Path, optics: Optics) -> float:
-    """The sky's glow at the zenith of `[site]`, electrons per second and steradian. Raises InputError."""
+    """The sky's glow at the zenith of `[site]`, electrons per second and steradian. Raises
+    InputError.
+    """
     site = config.site
     if site is None or site.sky_v_mag_arcsec2 is None:
         return 0.0

@@ -1,8 +1,10 @@
-"""How wide a star of the display is on the tracker's detector, against a star of the sky, and what would make it narrower.
+"""How wide a star of the display is on the tracker's detector, against a star of the sky, and what
+would make it narrower.
 
-A star of the display is a sprite of monitor pixels, each an evenly lit square, seen through the tracker's lens: where a monitor
-pixel is several of the tracker's, no focus makes that as narrow as a star of the sky. Its variance in tracker pixels is that of
-the sprite and of two monitor pixels (one in which the sprite is summed up, one that is lit), and the lens's.
+A star of the display is a sprite of monitor pixels, each an evenly lit square, seen through the
+tracker's lens: where a monitor pixel is several of the tracker's, no focus makes that as narrow as
+a star of the sky. Its variance in tracker pixels is that of the sprite and of two monitor pixels
+(one in which the sprite is summed up, one that is lit), and the lens's.
 """
 
 import math
@@ -24,7 +26,8 @@ MM_PER_INCH, UM_PER_MM = 25.4, 1e3
 NOTHING_PX2 = 1e-6  # of variance: no panel is that fine
 WHOLE = 0.999  # of the tracker's field: the rest is rounding
 UNSEEN_SHARE = 1e-4  # of a monitor pixel's light in the brightest one's: left out
-# Beyond so many tracker pixels to a monitor pixel, its light is summed up in coarser squares: it is even over most of them.
+# Beyond so many tracker pixels to a monitor pixel, its light is summed up in coarser squares: it is
+# even over most of them.
 FINEST = 12.0
 # Panels that are sold: diagonal in inches and pixels, from which the pitch follows.
 PANELS = (
@@ -45,10 +48,11 @@ PANELS = (
 
 @dataclass(frozen=True, slots=True)
 class PanelOption:
-    """A panel of today before this tracker, and between which focal lengths of a collimator it would do; None where none does.
+    """A panel of today before this tracker, and between which focal lengths of a collimator it
+    would do; None where none does.
 
-    At the shorter one the star is at the limit, at the longer one the tracker's field just fits on the screen. `sigma_ratio` is
-    the star's at the longer one.
+    At the shorter one the star is at the limit, at the longer one the tracker's field just fits on
+    the screen. `sigma_ratio` is the star's at the longer one.
     """
 
     panel: str
@@ -62,9 +66,10 @@ class PanelOption:
 class StarRemedy:
     """What would bring a star within the limit: one of these lengths in place of the bench's.
 
-    `collimator_mm` leaves `field_on_screen` of the tracker's field on the screen, and `field_fits` says whether that is no less
-    than now. A panel of `pixel_pitch_um` behind the same collimator has to have `resolution_px`. All are None where no length
-    does, because the limit is under what the lens makes of a point.
+    `collimator_mm` leaves `field_on_screen` of the tracker's field on the screen, and `field_fits`
+    says whether that is no less than now. A panel of `pixel_pitch_um` behind the same collimator
+    has to have `resolution_px`. All are None where no length does, because the limit is under what
+    the lens makes of a point.
     """
 
     tracker_px_a_monitor_px: float | None
@@ -102,9 +107,10 @@ class StarRemedy:
 class StarSize:
     """A star of the display as the tracker will see it, and one of the sky through the same lens.
 
-    Sigmas in tracker pixels, before the pixel; `sigma_ratio` has the pixel in both, and `limit` is `[verify] star_sigma_ratio`.
-    `peak_loss_mag` is how much fainter its brightest pixel is, both in the middle of a pixel. `shared_px` is over how many
-    pixels its light is shared out: 1 over the sum of the squares of their shares. `would_do` is None within the limit.
+    Sigmas in tracker pixels, before the pixel; `sigma_ratio` has the pixel in both, and `limit` is
+    `[verify] star_sigma_ratio`. `peak_loss_mag` is how much fainter its brightest pixel is, both in
+    the middle of a pixel. `shared_px` is over how many pixels its light is shared out: 1 over the
+    sum of the squares of their shares. `would_do` is None within the limit.
     """
 
     sigma_px: float
@@ -122,7 +128,9 @@ class StarSize:
         return self.sigma_ratio > self.limit
 
     def line(self) -> str:
-        """ "star 1.0 px sigma, of the sky 0.55; brightest pixel 1.1 mag fainter; 13.6 px share it, of the sky 4.5"."""
+        """ "star 1.0 px sigma, of the sky 0.55; brightest pixel 1.1 mag fainter; 13.6 px share
+        it, of the sky 4.5".
+        """
         return (
             f"star {figure(self.sigma_px)} px sigma, of the sky {figure(self.sky_sigma_px)};"
             f" brightest pixel {self.peak_loss_mag:.1f} mag fainter;"
@@ -144,15 +152,19 @@ class StarSize:
 
 @dataclass(frozen=True, slots=True)
 class _Widths:
-    """Variances in tracker pixels squared: of the sky's star, and of the display's: one that goes with the square of the
-    tracker pixels to a monitor pixel, per that square, and one that does not."""
+    """Variances in tracker pixels squared: of the sky's star, and of the display's: one that goes
+    with the square of the tracker pixels to a monitor pixel, per that square, and one that does
+    not.
+    """
 
     sky_px2: float
     by_ratio: float
     fixed_px2: float
 
     def sigma_ratio(self, ratio: float) -> float:
-        """The display's sigma to the sky's at so many tracker pixels to a monitor pixel, the tracker's pixel in both."""
+        """The display's sigma to the sky's at so many tracker pixels to a monitor pixel, the
+        tracker's pixel in both.
+        """
         shown_px2 = self.by_ratio * ratio**2 + self.fixed_px2
         return math.sqrt((shown_px2 + PIXEL_VARIANCE) / (self.sky_px2 + PIXEL_VARIANCE))
 
@@ -203,14 +215,18 @@ def _variance_px2(psf: Psf) -> float:
 
 
 class _Shares(NamedTuple):
-    """A star in the middle of a pixel: its brightest pixel's share, and over how many pixels its light is shared out."""
+    """A star in the middle of a pixel: its brightest pixel's share, and over how many pixels its
+    light is shared out.
+    """
 
     peak: float
     shared_px: float
 
 
 def _shown_shares(sprite: Psf, lens: Psf, ratio: float) -> _Shares:
-    """Those of a star in the middle of a monitor pixel that lies in the middle of a tracker pixel, side by side."""
+    """Those of a star in the middle of a monitor pixel that lies in the middle of a tracker
+    pixel, side by side.
+    """
     if ratio > FINEST:
         coarser = ratio / FINEST
         wide, high = lens.width_px
@@ -250,7 +266,9 @@ def _remedy(config: BenchConfig, display: Camera, tracker: Camera, widths: _Widt
     width, height = (size / 2 / tracker.focal_length_px for size in tracker.resolution_px)
 
     def share(longer: float) -> float:
-        """The share of the tracker's field on the screen behind a collimator so many times as long."""
+        """The share of the tracker's field on the screen behind a collimator so many times as
+        long.
+        """
         screen = [size / 2 / display.focal_length_px / longer for size in display.resolution_px]
         return min(1.0, screen[0] / width) * min(1.0, screen[1] / height)
 

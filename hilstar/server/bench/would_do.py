@@ -54,7 +54,9 @@ class _Trial:
 
 @dataclass(frozen=True, slots=True)
 class _Sky:
-    """The stars of a bench, how much of white each asks for, and the relative light of the darkest pixel."""
+    """The stars of a bench, how much of white each asks for, and the relative light of the
+    darkest pixel.
+    """
 
     stars: Stars
     drive: FloatArray | float

@@ -16,7 +16,8 @@ PORTS = {"--console": PORT, "--scpi": SCPI_PORT}
 FORM = "write HOST:PORT, such as 127.0.0.1:8765, or 0.0.0.0:8765 to be reached from elsewhere"
 BACKLOG = 512
 TOKEN_BYTES = 32
-TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what a URL and a WebSocket's subprotocol carry as it is
+# what a URL and a WebSocket's subprotocol carry as it is
+TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*(:\d{1,5})?")
 
 
@@ -67,10 +68,12 @@ def _form(option: str) -> str:
 
 
 class PageListener(Closing):
-    """The page's listening socket, its names and its token. Raises InputError where the address cannot be used.
+    """The page's listening socket, its names and its token. Raises InputError where the address
+    cannot be used.
 
-    Where the page can be reached from other machines and no token is given, one is made (`made`). `names` has further names
-    of the page, under which a proxy shows it. SCPI listens by the same rules.
+    Where the page can be reached from other machines and no token is given, one is made (`made`).
+    `names` has further names of the page, under which a proxy shows it. SCPI listens by the same
+    rules.
     """
 
     def __init__(
@@ -91,7 +94,9 @@ class PageListener(Closing):
 
     @property
     def hosts(self) -> list[str]:
-        """The host names under which a browser may ask for the page, besides numeric addresses where `any_address`."""
+        """The host names under which a browser may ask for the page, besides numeric addresses
+        where `any_address`.
+        """
         own = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
         if self.any_address:
             own += [socket.gethostname(), socket.getfqdn()]
@@ -103,9 +108,11 @@ class PageListener(Closing):
         host = self.host
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
-                # This machine's address on its route out, by which others most likely reach it. Nothing is sent.
+                # This machine's address on its route out, by which others most likely reach it.
+                # Nothing is sent.
                 is_v6 = self.socket.family == socket.AF_INET6
-                beyond, host = ("2001:db8::1", "::1") if is_v6 else ("192.0.2.1", HOST)  # documentation: RFC 3849, RFC 5737
+                # documentation: RFC 3849, RFC 5737
+                beyond, host = ("2001:db8::1", "::1") if is_v6 else ("192.0.2.1", HOST)
                 with contextlib.suppress(OSError), socket.socket(self.socket.family, socket.SOCK_DGRAM) as probe:
                     probe.connect((beyond, 9))
                     host = str(probe.getsockname()[0])

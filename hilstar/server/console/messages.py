@@ -1,8 +1,9 @@
 """Messages between a run and its page's process, and the memory that the two share.
 
-The memory has rings of numbered records, written without waiting and read without a lock. Each slot holds the number being
-written, the number that is complete (a seqlock) and a CRC, so that a reader notices a record that is incomplete or was
-overwritten. Each ring has one writer. The memory has no name (memfd): it is gone with the last process that has it open.
+The memory has rings of numbered records, written without waiting and read without a lock. Each slot
+holds the number being written, the number that is complete (a seqlock) and a CRC, so that a reader
+notices a record that is incomplete or was overwritten. Each ring has one writer. The memory has no
+name (memfd): it is gone with the last process that has it open.
 """
 
 import math
@@ -26,7 +27,9 @@ STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
 
 
 class FrameNumbers(NamedTuple):
-    """A frame and the counts up to it, packed by FRAME; host times, ns. `flags` combines STALE, MISSING, BLANK, HAS_AGE."""
+    """A frame and the counts up to it, packed by FRAME; host times, ns. `flags` combines STALE,
+    MISSING, BLANK, HAS_AGE.
+    """
 
     number: int
     draw_ns: int
@@ -44,7 +47,8 @@ class FrameNumbers(NamedTuple):
 
 
 class PictureHead(NamedTuple):
-    """The head of a picture, as PICTURE packs it: frame, swap (host time, ns), attitude `q_w` to `q_z`, NaN without one.
+    """The head of a picture, as PICTURE packs it: frame, swap (host time, ns), attitude `q_w` to
+    `q_z`, NaN without one.
 
     Levels of `item_bytes` each follow, `width` by `height`, then `sprites` records of SPRITE.
     """
@@ -63,7 +67,9 @@ class PictureHead(NamedTuple):
 
 
 class RunState(protocol.SkyState, frozen=True, kw_only=True):
-    """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
+    """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it
+    began.
+    """
 
     host_ns: int
     alive_ns: int = 0
@@ -79,7 +85,9 @@ class RunState(protocol.SkyState, frozen=True, kw_only=True):
 
 
 class NewAnswer(msgspec.Struct, frozen=True):
-    """The tracker's newest answer: its figures, the attitude that was lit, and places of stars in the tracker's pixels."""
+    """The tracker's newest answer: its figures, the attitude that was lit, and places of stars
+    in the tracker's pixels.
+    """
 
     figures: TrackerFigures
     q_lit: tuple[float, float, float, float] | None = None
@@ -118,7 +126,9 @@ Pace = Literal["clock", "asked", "session"]
 
 
 class ScpiSetup(msgspec.Struct, frozen=True):
-    """SCPI's token ("" for none), the run's source of attitudes, and the UDP port where SCPI steers the sky (0: it may not)."""
+    """SCPI's token ("" for none), the run's source of attitudes, and the UDP port where SCPI
+    steers the sky (0: it may not).
+    """
 
     token: str
     source: str
@@ -129,8 +139,9 @@ class ScpiSetup(msgspec.Struct, frozen=True):
 class Setup(msgspec.Struct, kw_only=True):
     """What the page's process is given at its start; `hello` is the first message to every page.
 
-    `pace` says when frames come: at their due time ("clock"), when a simulator asks or as fast as possible ("asked"), or not
-    at all, in a first-light session ("session"). Without a `token` anybody who reaches the page may see it.
+    `pace` says when frames come: at their due time ("clock"), when a simulator asks or as fast as
+    possible ("asked"), or not at all, in a first-light session ("session"). Without a `token`
+    anybody who reaches the page may see it.
     """
 
     hello: protocol.Hello
@@ -238,14 +249,18 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class PictureRequest:
-    """The interval at which the page wants pictures, and until when (host time), ns; 0 for never."""
+    """The interval at which the page wants pictures, and until when (host time), ns; 0 for
+    never.
+    """
 
     each_ns: int = 0
     until_ns: int = 0
 
 
 class SharedMemory:
-    """The rings of a run (frames, states, events, answers, pictures), and the page's request for pictures; `fd` is its file."""
+    """The rings of a run (frames, states, events, answers, pictures), and the page's request for
+    pictures; `fd` is its file.
+    """
 
     def __init__(self, fd: int, picture_bytes: int) -> None:
         self.fd = fd
@@ -272,7 +287,9 @@ class SharedMemory:
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 
     def put_picture(self, head: PictureHead, levels: np.ndarray, sprites: Sequence[np.ndarray] = ()) -> None:
-        """Write a picture: its levels (h, w), and the star, x and y of its sprites, (n,) each. Raises ValueError (size)."""
+        """Write a picture: its levels (h, w), and the star, x and y of its sprites, (n,) each.
+        Raises ValueError (size).
+        """
         end = PICTURE_HEAD_BYTES + levels.nbytes
         whole = end + head.sprites * SPRITE.itemsize
         self.pictures.begin()
@@ -295,7 +312,9 @@ class SharedMemory:
 
     @property
     def wrong_since_s(self) -> float:
-        """Since when the page has judged the run wrong (UTC, s), for a page that takes over; 0 while it is right."""
+        """Since when the page has judged the run wrong (UTC, s), for a page that takes over; 0
+        while it is right.
+        """
         return float(_WRONG_SINCE.unpack_from(self._memory, _REQUEST.size)[0])
 
     @wrong_since_s.setter

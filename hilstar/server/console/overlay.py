@@ -1,4 +1,6 @@
-"""What the page draws over a picture: stars, outline and grid, from the bench's stars and its two cameras."""
+"""What the page draws over a picture: stars, outline and grid, from the bench's stars and its
+two cameras.
+"""
 
 import math
 from collections.abc import Iterator
@@ -43,13 +45,17 @@ class AnswerMarks(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CameraMarks:
-    """Marks that need no stars: boresight, tracker's outline, lines of RA and Dec, by the two cameras of a bench."""
+    """Marks that need no stars: boresight, tracker's outline, lines of RA and Dec, by the two
+    cameras of a bench.
+    """
 
     monitor: Camera
     tracker: Camera
 
     def truth(self, frame: int, stars: list[StarMark], q_icrs_to_cam: FloatArray | None, grid: bool = False) -> Truth:
-        """The truth of a picture: its stars, the marks, and with `grid` and an attitude the lines of RA and Dec."""
+        """The truth of a picture: its stars, the marks, and with `grid` and an attitude the
+        lines of RA and Dec.
+        """
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
             lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
@@ -64,13 +70,15 @@ class CameraMarks:
     def answer(
         self, residual_arcsec: list[float] | None, lit: FloatArray, shown: FloatArray, centroids: list[tuple[float, float]]
     ) -> AnswerMarks:
-        """Where a tracker takes its field to be, and its centroids, in a picture of the attitude `shown`.
+        """Where a tracker takes its field to be, and its centroids, in a picture of the attitude
+        `shown`.
 
         `lit` is the attitude that the answer was compared with: its stars have moved on since.
         """
         field_px: list[list[float]] = []
         if residual_arcsec is not None:
-            # The reported attitude is E C: the field's rays, taken back by E, stand where the tracker says in the shown sky.
+            # The reported attitude is E C: the field's rays, taken back by E, stand where the
+            # tracker says in the shown sky.
             error = to_matrix(from_rotation_vector(np.array(residual_arcsec) / ARCSEC_PER_RAD))
             field_px = self._on_monitor(self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES)) @ error)
         places = np.array(centroids).reshape(-1, 2)
@@ -96,7 +104,8 @@ class CameraMarks:
         step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
         low_deg, high_deg = max(dec_deg - radius_deg, -90.0), min(dec_deg + radius_deg, 90.0)
         wide_deg, ra_step_deg = 180.0, 30.0
-        if max(-low_deg, high_deg) < 90.0:  # the widest circle of right ascension that the field touches
+        # the widest circle of right ascension that the field touches
+        if max(-low_deg, high_deg) < 90.0:
             share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
             wide_deg = math.degrees(math.asin(min(share, 1.0)))
             ra_step_deg = _step(RA_STEPS_DEG, wide_deg / LINES_ACROSS)
@@ -151,13 +160,17 @@ class Overlay:
         return [SkyPlace(*row) for row in zip(*places, v_mag, self._labels(which, ""), strict=True)]
 
     def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
-        """A star's label: a body's name, else its designation, else its HIP number, or `none` where that is given."""
+        """A star's label: a body's name, else its designation, else its HIP number, or `none`
+        where that is given.
+        """
         found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
         labels = [name or label_of(hip) for name, hip in found]
         return labels if none is None else [none if label.startswith("HIP ") else label for label in labels]
 
     def truth(self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()) -> Truth:
-        """What is where in a picture at an attitude, with the grid; `clipped` are HIP numbers, and names of what has none."""
+        """What is where in a picture at an attitude, with the grid; `clipped` are HIP numbers,
+        and names of what has none.
+        """
         turn = self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)
         near = self.stars.near(turn[2], self.monitor.field_radius_rad(0.0))
         x_px, y_px = self.monitor.project(self.stars.directions(near) @ turn.T)
@@ -218,9 +231,10 @@ def _digits(step_deg: float) -> int:
 class OverlayScene:
     """What the page's process draws over a bench's pictures, in a form that can be pickled.
 
-    `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP number are called, by place,
-    and `sky` is the map of the whole sky. `aids_in_levels` says that levels have the operator's aids in them already.
-    `colours` says of stars, by place, what the tracker sees of them and what a display that drives its primaries apart shows.
+    `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP
+    number are called, by place, and `sky` is the map of the whole sky. `aids_in_levels` says that
+    levels have the operator's aids in them already. `colours` says of stars, by place, what the
+    tracker sees of them and what a display that drives its primaries apart shows.
     """
 
     marks: CameraMarks
@@ -238,7 +252,9 @@ class OverlayScene:
 
 
 def colour_notes(bench: "Bench") -> dict[int, str]:
-    """The colours of a bench's brightest shown stars, where its primaries are driven apart: by channel, or mean wavelength."""
+    """The colours of a bench's brightest shown stars, where its primaries are driven apart: by
+    channel, or mean wavelength.
+    """
     colours, stars = bench.colours, bench.shown_stars
     if colours is None:
         return {}

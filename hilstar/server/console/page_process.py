@@ -1,4 +1,5 @@
-"""Keeps the process of the page and of SCPI alive beside a run: starts it again, publishes the run's state, takes its orders.
+"""Keeps the process of the page and of SCPI alive beside a run: starts it again, publishes the
+run's state, takes its orders.
 
 One thread does this ten times a second; the frame loop takes no part in it.
 """
@@ -54,7 +55,9 @@ class _Page:
 
 
 class PageProcess(Closing):
-    """The page of a run or session while this is open: `now` is its state, and `notices` are its events."""
+    """The page of a run or session while this is open: `now` is its state, and `notices` are its
+    events.
+    """
 
     def __init__(
         self, setup: Setup, memory: SharedMemory, listeners: Listeners, now: Callable[[], RunState], notices: Notices, do: Do
@@ -111,7 +114,8 @@ class PageProcess(Closing):
                 notice = self._events.popleft()
                 event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
                 self._memory.events.put(msgspec.json.encode(event))
-        except Exception as error:  # such as a container that changed while it was read: the next tick reads it again
+        except Exception as error:
+            # such as a container that changed while it was read: the next tick reads it again
             self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
         if page is None:

@@ -1,7 +1,8 @@
-"""What the page's server and a browser say to each other, as JSON: `docs/console-server.md` has the same for a reader.
+"""What the page's server and a browser say to each other, as JSON: `docs/console-server.md` has the
+same for a reader.
 
-`tools/make_page_protocol.py` makes the page's constants (`page/protocol.js`) from this file. Numbers that JSON does not know
-(NaN, infinity) are sent as null.
+`tools/make_page_protocol.py` makes the page's constants (`page/protocol.js`) from this file.
+Numbers that JSON does not know (NaN, infinity) are sent as null.
 """
 
 from typing import Annotated
@@ -11,8 +12,10 @@ from msgspec import UNSET, UnsetType
 
 from hilstar.server.answers.judge import TrackerFigures
 
-SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."  # the WebSocket's subprotocols; the token follows the second
-GIVES_WAY = 4013  # close code: the page waits before it comes back, so as not to displace the next one
+# the WebSocket's subprotocols; the token follows the second
+SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."
+# close code: the page waits before it comes back, so as not to displace the next one
+GIVES_WAY = 4013
 HISTORY_S = 60  # length of the charts
 KEPT_EVENTS = 200
 MIN_HZ, MAX_HZ = 0.1, 10.0  # bounds on a page's rate of pictures
@@ -50,7 +53,9 @@ class SkyHealth(msgspec.Struct, frozen=True):
 
 
 class ShownAttitude(msgspec.Struct, frozen=True, kw_only=True):
-    """The attitude of the newest frame: q_icrs_to_cam, its pointing, its rate in cam, and its age at light."""
+    """The attitude of the newest frame: q_icrs_to_cam, its pointing, its rate in cam, and its
+    age at light.
+    """
 
     q: tuple[float, float, float, float]
     ra_deg: float
@@ -78,7 +83,9 @@ class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames and packets since the run began; `refused` by reason; `lost` as gaps of their `sequence` show."""
+    """Frames and packets since the run began; `refused` by reason; `lost` as gaps of their
+    `sequence` show.
+    """
 
     frames: int = 0
     missed: int = 0
@@ -118,16 +125,20 @@ class LedgerState(msgspec.Struct, frozen=True):
 
 
 class WrongCondition(msgspec.Struct, frozen=True):
-    """A condition under which the sky that is shown is wrong: its kind, a line with figures and what to write instead."""
+    """A condition under which the sky that is shown is wrong: its kind, a line with figures and
+    what to write instead.
+    """
 
     kind: str
     line: str
 
 
 class SkyState(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults` those that are on.
+    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults`
+    those that are on.
 
-    `wrong_sky_s` is for how long the sky has been wrong in all, `pointing` where the first attitude points.
+    `wrong_sky_s` is for how long the sky has been wrong in all, `pointing` where the first attitude
+    points.
     """
 
     attitude: ShownAttitude | None = None
@@ -153,7 +164,8 @@ class PageState(SkyState, frozen=True, kw_only=True):
 
 
 class ChartPoint(msgspec.Struct, kw_only=True):
-    """What the frames since the point before add to the charts: the largest times, and how many went wrong.
+    """What the frames since the point before add to the charts: the largest times, and how many
+    went wrong.
 
     `x_arcsec`, `y_arcsec` and `z_arcsec` are the residual of the newest right answer since then.
     """
@@ -185,7 +197,9 @@ class EventLine(msgspec.Struct, frozen=True):
 
 
 class StarMark(msgspec.Struct, frozen=True, array_like=True):
-    """A star of a picture, as an array; `clipped` is 0 or 1, and `colour` what a coloured display shows of it."""
+    """A star of a picture, as an array; `clipped` is 0 or 1, and `colour` what a coloured
+    display shows of it.
+    """
 
     x_px: float
     y_px: float
@@ -197,16 +211,20 @@ class StarMark(msgspec.Struct, frozen=True, array_like=True):
 
 
 class GridLine(msgspec.Struct, frozen=True):
-    """A line of right ascension or declination, or a piece of one: its label and places, monitor px."""
+    """A line of right ascension or declination, or a piece of one: its label and places, monitor
+    px.
+    """
 
     label: str
     px: list[list[float]]
 
 
 class Truth(msgspec.Struct, frozen=True, kw_only=True):
-    """What is where in a picture: stars, the brightest first, and the marks of the two cameras; monitor px.
+    """What is where in a picture: stars, the brightest first, and the marks of the two cameras;
+    monitor px.
 
-    Of the tracker's newest answer: where it takes its field to be, and the centroids that it reports.
+    Of the tracker's newest answer: where it takes its field to be, and the centroids that it
+    reports.
     """
 
     frame: int
@@ -254,7 +272,9 @@ class SkyPlace(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SkyMap(msgspec.Struct, frozen=True):
-    """The answer of `GET /sky`: stars, bodies, and the screen's corners as directions in cam ([] where the lens ends)."""
+    """The answer of `GET /sky`: stars, bodies, and the screen's corners as directions in cam ([]
+    where the lens ends).
+    """
 
     stars: list[SkyPlace] = []
     moving: list[SkyPlace] = []
@@ -281,7 +301,9 @@ class PageMessage(msgspec.Struct):
 
 
 class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
-    """The body of `POST /control/NAME`. A key that is misspelt is refused: it must not act as if it were not there."""
+    """The body of `POST /control/NAME`. A key that is misspelt is refused: it must not act as if
+    it were not there.
+    """
 
     on: bool = True
     level: float = PATCH_SHARE

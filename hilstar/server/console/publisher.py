@@ -1,4 +1,6 @@
-"""What a run or a first-light session publishes to its page: frames, pictures, its state; and what operators order."""
+"""What a run or a first-light session publishes to its page: frames, pictures, its state; and
+what operators order.
+"""
 
 import contextlib
 import pickle
@@ -47,8 +49,8 @@ MIN_PICTURE_NS = NS_PER_S // 10
 class FramePublisher:
     """Writes each frame's numbers, and now and then its picture, into shared memory.
 
-    The frame loop's own thread does it, in microseconds: without a lock and without a call that waits. A picture is copied
-    at most ten times a second, and only while somebody looks at one.
+    The frame loop's own thread does it, in microseconds: without a lock and without a call that
+    waits. A picture is copied at most ten times a second, and only while somebody looks at one.
     """
 
     def __init__(self, memory: messages.SharedMemory) -> None:
@@ -106,7 +108,8 @@ class FramePublisher:
         want = self._memory.want
         if want.each_ns and self._picture_due_ns <= shown.swap_ns < want.until_ns:
             self._picture_due_ns = shown.swap_ns + max(want.each_ns, MIN_PICTURE_NS)
-            with contextlib.suppress(ValueError):  # levels of another size than the bench's: no picture, and the run goes on
+            # levels of another size than the bench's: no picture, and the run goes on
+            with contextlib.suppress(ValueError):
                 self._copy(shown)
 
     def _copy(self, shown: "Shown") -> None:
@@ -256,7 +259,8 @@ Done = tuple[int, str]  # what became of an order: an HTTP status and a line
 class OrderHandler:
     """Checks an operator's order, has it done by the frame loop or beside it, and records it.
 
-    Each call runs on its own thread and returns once the frame loop, or the disk, has taken the order.
+    Each call runs on its own thread and returns once the frame loop, or the disk, has taken the
+    order.
     """
 
     def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
@@ -274,7 +278,8 @@ class OrderHandler:
             status, line = doers[order.name](order, who)
         except HilstarError as error:
             status, line = 409, one_line(str(error))
-        return messages.OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
+        # a ledger may be called anything
+        return messages.OrderAnswer(id=order.id, status=status, line=printable(line))
 
     def _switch(self, order: messages.Order, who: str) -> Done:
         if order.name == "patch" and order.on and order.level not in PATCHES:
@@ -345,7 +350,9 @@ class OrderHandler:
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """What the page says of a run: command, source of attitudes, pace of frames; and the UDP port by which SCPI steers it."""
+    """What the page says of a run: command, source of attitudes, pace of frames; and the UDP
+    port by which SCPI steers it.
+    """
 
     command: str
     kind: str
@@ -390,7 +397,9 @@ MAX_NAMES = 5000  # the brightest stars without a HIP number
 
 
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
-    """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids already."""
+    """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids
+    already.
+    """
     stars, overlay = bench.shown_stars, overlay_of(bench)
     unnamed = np.flatnonzero(stars.hip == 0)
     unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
@@ -410,7 +419,9 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
 def opened_page(
     listeners: Listeners, control: bool, description: RunDescription, parts: PageParts
 ) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
-    """The page and the SCPI of a run while this is open: the publisher of its frames, and the queue of its requests."""
+    """The page and the SCPI of a run while this is open: the publisher of its frames, and the
+    queue of its requests.
+    """
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = messages.SharedMemory.make(picture_bytes)
@@ -451,7 +462,9 @@ class ShownPattern(Protocol):
 
 
 class SessionPublisher:
-    """Publishes a first-light session: the session's thread writes pictures, the page's keeper reads the state."""
+    """Publishes a first-light session: the session's thread writes pictures, the page's keeper
+    reads the state.
+    """
 
     def __init__(self, memory: messages.SharedMemory) -> None:
         self._memory, self.notices = memory, _SessionNotices()

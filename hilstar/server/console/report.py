@@ -1,4 +1,6 @@
-"""A run's report: the operator's page as one file with the whole run in it, and its figures as JSON."""
+"""A run's report: the operator's page as one file with the whole run in it, and its figures as
+JSON.
+"""
 
 import base64
 import hashlib
@@ -39,10 +41,12 @@ LINKS = re.compile(r'^<(?:link rel="(?:icon|stylesheet)"|script type="module").*
 
 
 def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
-    """The module `entry` and all that it imports, as one script. Raises ValueError for an import that it does not know.
+    """The module `entry` and all that it imports, as one script. Raises ValueError for an import
+    that it does not know.
 
-    A browser loads no module from a file beside a page that is itself a file, so each module becomes a function. The page's
-    modules keep to what this reads: imports and exports that begin a line, by name, and no default export.
+    A browser loads no module from a file beside a page that is itself a file, so each module
+    becomes a function. The page's modules keep to what this reads: imports and exports that begin a
+    line, by name, and no default export.
     """
     done: dict[str, str] = {}
     _take(entry, folder, done)
@@ -70,7 +74,9 @@ def _hash(text: str) -> str:
 
 
 def report_page(data: dict[str, Any]) -> str:
-    """The page with a run's data (see `run_data`), as HTML that needs no other file and no network."""
+    """The page with a run's data (see `run_data`), as HTML that needs no other file and no
+    network.
+    """
     html = (PAGE_DIR / "index.html").read_text(encoding="utf-8")
     style = palette_css() + (PAGE_DIR / "page.css").read_text(encoding="utf-8")
     script = one_script("report")
@@ -106,7 +112,9 @@ class _Unreported(Notices):
 
 
 def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
-    """The run's `pictures` and a `caution` where the bench has changed, or why `no_pictures`; `sky` is the map of the sky."""
+    """The run's `pictures` and a `caution` where the bench has changed, or why `no_pictures`;
+    `sky` is the map of the sky.
+    """
     try:
         file = with_codes_ms(_bench_file(run.head, ledger), codes_ms_of(run.head))
         with open_bench(file) as bench:
@@ -122,7 +130,8 @@ def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
 
 
 def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
-    """The bench file of a run: the text in the ledger's head with the files that it names, preferably unchanged.
+    """The bench file of a run: the text in the ledger's head with the files that it names,
+    preferably unchanged.
 
     Raises InputError where the head has none, or one that cannot be read.
     """
@@ -180,7 +189,8 @@ MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relat
 MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
 MAX_WHO_CHARACTERS = 60
 IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
-POLE_DEG = 88.0  # beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
+# beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
+POLE_DEG = 88.0
 NAMES = ("RA \N{MULTIPLICATION SIGN} cos Dec", "Dec", "roll")
 AXES = ("about x (right)", "about y (down)", "about z (boresight)")
 DISTRIBUTIONS = {
@@ -194,7 +204,9 @@ DISTRIBUTIONS = {
 
 
 def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
-    """The figures of a run for the page: lists of numbers, None for no value; times in s from the first swap."""
+    """The figures of a run for the page: lists of numbers, None for no value; times in s from
+    the first swap.
+    """
     config, rows = config_of(run.head), table_rows(summary)
     monitor = None if config is None else config.monitor
     about = {
@@ -229,7 +241,9 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
 
 
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
-    """Whether the sky was right throughout, in which share of the refresh periods it was, and why not in the others."""
+    """Whether the sky was right throughout, in which share of the refresh periods it was, and
+    why not in the others.
+    """
     counted = (
         (found.blank_frames, "without an attitude"),
         (late, "with a stale attitude"),
@@ -245,7 +259,8 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
     due = found.frames + found.missed_frames  # refresh periods in which a frame was due
     percent = 100 * found.right_frames / max(due, 1)
     digits = 3 if percent > 99.9 else 2 if percent > 99 else 1
-    share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"  # rounded down: only all of them are 100 %
+    # rounded down: only all of them are 100 %
+    share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
     return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
 
 
@@ -305,7 +320,9 @@ def _histograms(run: RunFigures) -> list[dict[str, Any]]:
 
 
 def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
-    """Residuals along the run, wrong answers, and what each fault did to the answers; None without answers."""
+    """Residuals along the run, wrong answers, and what each fault did to the answers; None
+    without answers.
+    """
     if not summary.answers:
         return None
     zero_s = run.first_swap_ns / NS_PER_S
@@ -343,7 +360,9 @@ def _path(rows: FloatArray) -> dict[str, Any]:
 
 
 def _motion(rows: FloatArray) -> dict[str, Any] | None:
-    """Three angles about their mean, and the turns about the camera's axes minus a steady motion."""
+    """Three angles about their mean, and the turns about the camera's axes minus a steady
+    motion.
+    """
     if not len(rows):
         return None
     turned_rad, at = rows[:, 6:9], rows[:, 1] - rows[:, 1].mean()

@@ -1,6 +1,8 @@
-"""The live status of a run on the terminal: a few lines that stay in place, or one plain line every ten seconds elsewhere.
+"""The live status of a run on the terminal: a few lines that stay in place, or one plain line every
+ten seconds elsewhere.
 
-The frame loop only leaves its newest frame here; a thread of the status words it, so that no terminal delays a frame.
+The frame loop only leaves its newest frame here; a thread of the status words it, so that no
+terminal delays a frame.
 """
 
 import logging
@@ -32,8 +34,9 @@ ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 @dataclass(frozen=True, slots=True)
 class RunSource:
-    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there will be, and what is wrong
-    with the screen that --force shows it on."""
+    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there
+    will be, and what is wrong with the screen that --force shows it on.
+    """
 
     attitudes: str
     renderer: str
@@ -59,7 +62,8 @@ class RunStatus:
         self._begun_ns = time.monotonic_ns()
         self._shown: Shown | None = None
         self._running: Running | None = None
-        self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
+        # when the lines were last made: host time, frames, packets
+        self._before = (self._begun_ns, 0, 0)
 
     def follow(self, running: "Running") -> None:
         """Take the run, which goes on counting."""
@@ -74,7 +78,9 @@ class RunStatus:
         return self._running is not None and self._running.loop.watch.alive_ns > 0
 
     def alive(self) -> bool:
-        """Whether the frame loop moves: its last step is not longer ago than ALIVE_NS, or a few frames where those are slow."""
+        """Whether the frame loop moves: its last step is not longer ago than ALIVE_NS, or a few
+        frames where those are slow.
+        """
         running = self._running
         limit_ns = max(ALIVE_NS, ALIVE_PERIODS / self._source.refresh_hz * NS_PER_S)
         return running is not None and time.monotonic_ns() - running.loop.watch.alive_ns < limit_ns
@@ -132,7 +138,8 @@ def _attitude_line(shown: "Shown") -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
         return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
-    from hilstar.basics.rotation import to_radec_roll_deg, turn_text  # with NumPy 0.1 s, which Tab and --help do not need
+    # with NumPy 0.1 s, which Tab and --help do not need
+    from hilstar.basics.rotation import to_radec_roll_deg, turn_text
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
     text = f"RA {turn_text(ra_deg)}, Dec {dec_deg:.4f}, roll {turn_text(roll_deg)} deg"
@@ -161,7 +168,9 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
 
 @contextmanager
 def on_terminal(status: RunStatus) -> Iterator[None]:
-    """Keep the status on stderr while the run lasts: in place on a terminal, else a line every PLAIN_EACH_S."""
+    """Keep the status on stderr while the run lasts: in place on a terminal, else a line every
+    PLAIN_EACH_S.
+    """
     stop = threading.Event()
     live = sys.stderr is not None and sys.stderr.isatty()
     if live:
@@ -205,7 +214,9 @@ def _table(lines: list[StatusLine]) -> "Table":
 
 @contextmanager
 def _logs_above() -> Iterator[None]:
-    """What is logged goes through the stream that the live lines have put in stderr's place, and so above them."""
+    """What is logged goes through the stream that the live lines have put in stderr's place, and
+    so above them.
+    """
     handlers = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
     before = [handler.setStream(sys.stderr) for handler in handlers]
     try:

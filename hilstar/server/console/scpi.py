@@ -1,11 +1,17 @@
-"""SCPI-1999 and IEEE 488.2 as a bench speaks them: a line in, program units out, and an instrument's status; no I/O.
+"""SCPI-1999 and IEEE 488.2 as a bench speaks them: a line in, program units out, and an
+instrument's status; no I/O.
 
 Laws:
-1. Every line gives units up to its end or its first syntax error (a standard number of the -100s). Nothing else raises.
-2. A keyword has two forms, short and long, in any case. Nodes in brackets may be left out. A header after `;` goes on from the
-   node before the last keyword of the header before; `:` goes back to the root, and a common command (`*`) moves nothing.
-3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then says that it is full.
-4. What no test stand sends ends the connection (`NotScpi`): a web page can have a browser send a line of SCPI, but only after
+1. Every line gives units up to its end or its first syntax error (a standard number of the -100s).
+   Nothing else raises.
+2. A keyword has two forms, short and long, in any case. Nodes in brackets may be left out. A header
+   after `;` goes on from the
+   node before the last keyword of the header before; `:` goes back to the root, and a common
+   command (`*`) moves nothing.
+3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then
+   says that it is full.
+4. What no test stand sends ends the connection (`NotScpi`): a web page can have a browser send a
+   line of SCPI, but only after
    the request line of HTTP, or after the first byte of TLS or STUN, which is a control character.
 """
 
@@ -65,7 +71,8 @@ EVENT_BITS = {1: 32, 2: 16, 3: 8, 4: 4}
 ERRORS_WAIT, QUESTIONABLE, MESSAGE_WAITS, STANDARD_EVENT, MASTER, OPERATION = 4, 8, 16, 32, 64, 128
 
 Kind = Literal["number", "word", "string"]
-KINDS: dict[Kind, int] = {"number": -128, "word": -148, "string": -158}  # the error where that kind does not belong
+# the error where that kind does not belong
+KINDS: dict[Kind, int] = {"number": -128, "word": -148, "string": -158}
 
 
 class ScpiError(Exception):
@@ -84,7 +91,9 @@ class ScpiError(Exception):
 
 
 class Parameter(NamedTuple):
-    """One parameter: a number with its suffix (upper case, "" for none), a word (upper case) or a string."""
+    """One parameter: a number with its suffix (upper case, "" for none), a word (upper case) or
+    a string.
+    """
 
     kind: Kind
     text: str
@@ -112,7 +121,9 @@ class Headers:
         self._patterns = {form: pattern for pattern in patterns for form in _forms(pattern)}
 
     def units(self, line: str) -> Iterator[Unit]:
-        """The program units of a line, without its end. Raises ScpiError at the first that is wrong."""
+        """The program units of a line, without its end. Raises ScpiError at the first that is
+        wrong.
+        """
         path: tuple[str, ...] = ()
         for text in _split(line, ";"):
             text = text.strip(" \t")
@@ -151,7 +162,9 @@ def _forms(pattern: str) -> Iterator[str]:
 
 
 def _split(text: str, at: str) -> Iterator[str]:
-    """The parts of a text between separators that stand in no string. Raises ScpiError (-151) where a string has no end."""
+    """The parts of a text between separators that stand in no string. Raises ScpiError (-151)
+    where a string has no end.
+    """
     quote, begin = "", 0
     for k, c in enumerate(text):
         if quote:
@@ -262,7 +275,9 @@ def boolean(parameter: Parameter) -> bool:
 
 @dataclass(slots=True)
 class Register:
-    """A SCPI status register: its condition now, what has become true since it was read, and what is summed up."""
+    """A SCPI status register: its condition now, what has become true since it was read, and
+    what is summed up.
+    """
 
     condition: int = 0
     event: int = 0
@@ -281,7 +296,9 @@ class Register:
 
 @dataclass(slots=True)
 class InstrumentStatus:
-    """What IEEE 488.2 and SCPI keep for a connection: the queue of errors, the registers, what `*OPC` waits for."""
+    """What IEEE 488.2 and SCPI keep for a connection: the queue of errors, the registers, what
+    `*OPC` waits for.
+    """
 
     errors: deque[str] = field(default_factory=deque)
     standard: Register = field(default_factory=Register)
@@ -323,28 +340,36 @@ class InstrumentStatus:
 
 
 class NotScpi(Exception):
-    """Something came that no test stand sends, and the connection has to be closed; the message says what."""
+    """Something came that no test stand sends, and the connection has to be closed; the message
+    says what.
+    """
 
 
 # All but tab, LF and CR.
 CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 WHITE = re.compile(rb"[ \t\r]+")
-# A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a version. Either end tells it from
-# SCPI, whose headers have a colon before what follows a blank, and whose lines never end with a version.
+# A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a
+# version. Either end tells it from SCPI, whose headers have a colon before what follows a blank,
+# and whose lines never end with a version.
 REQUEST_BEGINS = re.compile(rb"[ \t]*[A-Za-z][A-Za-z0-9_-]*[ \t]+(?:/|[A-Za-z][A-Za-z0-9+.-]*://)")
 REQUEST_ENDS = re.compile(rb"[ ]HTTP/\d+(?:\.\d+)?[ ]?\Z", re.IGNORECASE)
 
 
 class LineBuffer:
-    """Bytes to lines, however they are cut: a line ends with LF, before which a CR counts as a space."""
+    """Bytes to lines, however they are cut: a line ends with LF, before which a CR counts as a
+    space.
+    """
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        self._head, self._end = b"", b""  # of the line so far, also of one that is too long to be kept
+        # of the line so far, also of one that is too long to be kept
+        self._head, self._end = b"", b""
         self._too_long = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES. Raises NotScpi."""
+        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES. Raises
+        NotScpi.
+        """
         *whole, rest = data.split(b"\n")
         for part in whole:
             self._add(part)

@@ -40,12 +40,15 @@ def print_json(value: Any) -> None:
     """The one JSON object of --json; NumPy's numbers come out as plain ones."""
     try:
         typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
-    except UnicodeEncodeError:  # a file's name that is not UTF-8; Python's own writes its bytes as escapes
+    except UnicodeEncodeError:
+        # a file's name that is not UTF-8; Python's own writes its bytes as escapes
         typer.echo(json.dumps(msgspec.to_builtins(value, enc_hook=_plain)))
 
 
 def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
-    """What a command found: an object (a dictionary, dataclass or struct) for a program, or lines for a person."""
+    """What a command found: an object (a dictionary, dataclass or struct) for a program, or
+    lines for a person.
+    """
     if as_json:
         print_json(found)
     else:
@@ -88,7 +91,8 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }
     if summary.clock:
-        from hilstar.attitude.clock.sender_clock import KNOWN_MODES  # brings NumPy, which Tab and --help do not need
+        # brings NumPy, which Tab and --help do not need
+        from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 
         absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
         if summary.receive_latency_ms:
@@ -118,7 +122,9 @@ def _last_lines(summary: "RunSummary") -> Iterator[tuple[str, str]]:
 
 
 def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "") -> str:
-    """Why a run had no attitude, and what to change; `trouble` is what its link knows of the other side."""
+    """Why a run had no attitude, and what to change; `trouble` is what its link knows of the
+    other side.
+    """
     if not packets.received:
         advice = trouble.removeprefix(f"{endpoint}: ") or "start the sender, and check its address"
         return f"no attitude came from {endpoint}; {advice}"

@@ -1,6 +1,8 @@
-"""What a run's ledger says of the tracker's answers: over the whole run, and before, during and after each fault.
+"""What a run's ledger says of the tracker's answers: over the whole run, and before, during and
+after each fault.
 
-Answers are placed by the middle of their exposure. Memory does not grow with the run, except by up to MAX_FAULTS faults.
+Answers are placed by the middle of their exposure. Memory does not grow with the run, except by up
+to MAX_FAULTS faults.
 """
 
 import math
@@ -23,7 +25,9 @@ MAX_WRONG = 1000  # whose times are kept
 
 
 class AnswerSpan(msgspec.Struct, frozen=True, kw_only=True):
-    """The answers of a part of a run: `availability` is right answers over those due; right answers' errors, x, y, z (cam)."""
+    """The answers of a part of a run: `availability` is right answers over those due; right
+    answers' errors, x, y, z (cam).
+    """
 
     length_s: float
     right: int
@@ -37,9 +41,9 @@ class AnswerSpan(msgspec.Struct, frozen=True, kw_only=True):
 class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
     """A fault and the answers around it; times s after the run's first swap.
 
-    `first_wrong_s` is from its begin to the exposure of the first wrong answer before it was over and recovered from.
-    `recovered_s` is from its end to that of the first right answer; 0 where the last answer before its end was right, None
-    where none came.
+    `first_wrong_s` is from its begin to the exposure of the first wrong answer before it was over
+    and recovered from. `recovered_s` is from its end to that of the first right answer; 0 where the
+    last answer before its end was right, None where none came.
     """
 
     name: str
@@ -54,9 +58,11 @@ class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnswerReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The tracker's answers over a run. `rms_arcsec` is about zero, `sigma3_arcsec` about the mean; of right answers.
+    """The tracker's answers over a run. `rms_arcsec` is about zero, `sigma3_arcsec` about the mean;
+    of right answers.
 
-    `out_of_order` counts stamps before an earlier answer's, `unjudged` answers that were compared with nothing.
+    `out_of_order` counts stamps before an earlier answer's, `unjudged` answers that were compared
+    with nothing.
     """
 
     answers: int
@@ -180,7 +186,9 @@ class _Fault:
 
 
 class AnswerTally:
-    """The answers of a run, record by record. Faults older than the ledger's begin, `begun_ns`, are those of a replayed run."""
+    """The answers of a run, record by record. Faults older than the ledger's begin, `begun_ns`,
+    are those of a replayed run.
+    """
 
     def __init__(self, begun_ns: int = 0) -> None:
         self.whole, self._begun_ns = SpanTally(), begun_ns
@@ -199,7 +207,8 @@ class AnswerTally:
         self.whole.add(record)
         if record.t_ns is not None:
             self._order.take(record.t_ns)
-        if record.verdict == "unjudged":  # of more than are judged: the others stand for the rate and for what is due
+        # of more than are judged: the others stand for the rate and for what is due
+        if record.verdict == "unjudged":
             return
         if self._host_ns:
             self._interval_s.add((record.host_ns - self._host_ns) / NS_PER_S)
@@ -216,7 +225,9 @@ class AnswerTally:
         self._open = [fault for fault in self._open if not fault.over(record.middle_ns)]
 
     def fault(self, record: FaultRecord) -> None:
-        """Add a fault's begin or end. Those of a replayed run come before its frames, which say when they are on."""
+        """Add a fault's begin or end. Those of a replayed run come before its frames, which say
+        when they are on.
+        """
         if record.event == "start" and record.host_ns < self._begun_ns:
             self.replayed[record.number] = record
         elif record.event == "start":
@@ -251,14 +262,17 @@ class AnswerTally:
                 fault.end_ns = at_ns
 
     def report(self, zero_ns: int) -> AnswerReport | None:
-        """The figures, with times after `zero_ns` of the host's clock; None for a run without answers."""
+        """The figures, with times after `zero_ns` of the host's clock; None for a run without
+        answers.
+        """
         counts = self.whole.counts
         answers = sum(counts.values())
         if not answers:
             return None
         cycle_s = self._interval_s.percentile(50)
         due = 0 if not cycle_s else round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s) + 1 - counts["unpaired"]
-        end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)  # the last answer stands for the time to the next
+        # the last answer stands for the time to the next
+        end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)
         return AnswerReport(
             answers=answers,
             **{verdict: counts[verdict] for verdict in VERDICTS},

@@ -13,9 +13,11 @@ from hilstar.basics.rotation import conjugate, from_rotation_vectors, multiply, 
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.record.ledger_records import NO_FRAMES, frame_records
 
-# Two frames further apart than MAX_GAP_S and USUAL_INTERVALS median intervals do not say what was shown between them.
+# Two frames further apart than MAX_GAP_S and USUAL_INTERVALS median intervals do not say what was
+# shown between them.
 MAX_GAP_S, USUAL_INTERVALS = 0.5, 3.0
-# A jump: a larger step than MAX_STEP_RAD, or one over JUMP_RAD that is JUMP_RATIO times as fast as both of its neighbours.
+# A jump: a larger step than MAX_STEP_RAD, or one over JUMP_RAD that is JUMP_RATIO times as fast as
+# both of its neighbours.
 MAX_STEP_RAD = np.radians(2.0)
 JUMP_RAD, JUMP_RATIO = np.radians(0.02), 4.0
 SAME_RAD = 1e-9  # two frames of one attitude are joined whatever lies between them
@@ -25,10 +27,11 @@ NOT_SHOWN = (np.nan,) * 4
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """The commanded `q_icrs_to_cam` (n, 4) and rate (n, 3), rad/s, cam, at some moments; NaN where not `known` (n,).
+    """The commanded `q_icrs_to_cam` (n, 4) and rate (n, 3), rad/s, cam, at some moments; NaN where
+    not `known` (n,).
 
-    `held_s` (n,) is for how long a frame was held for missed ones about a moment, 0 where none was: what was lit then is not
-    what was commanded.
+    `held_s` (n,) is for how long a frame was held for missed ones about a moment, 0 where none was:
+    what was lit then is not what was commanded.
     """
 
     q: FloatArray
@@ -43,9 +46,10 @@ NO_SPANS = np.zeros((0, 2))
 class Commanded:
     """The attitudes of a run's frames, interpolated between them.
 
-    `t_s` (m,) rises; `q` (m, 4), unit q_icrs_to_cam, is NaN where the sky was not shown as commanded. `held_s` (k, 2), rising,
-    are the spans from a frame to the next in which refresh periods had no frame of their own, `hold_s` (k,) the longest time
-    in each for which one frame stood.
+    `t_s` (m,) rises; `q` (m, 4), unit q_icrs_to_cam, is NaN where the sky was not shown as
+    commanded. `held_s` (k, 2), rising, are the spans from a frame to the next in which refresh
+    periods had no frame of their own, `hold_s` (k,) the longest time in each for which one frame
+    stood.
     """
 
     def __init__(self, t_s: FloatArray, q: FloatArray, held_s: FloatArray = NO_SPANS, hold_s: FloatArray | None = None) -> None:
@@ -70,15 +74,18 @@ class Commanded:
         return np.asarray(np.isfinite(self.q[:, 0]))
 
     def at(self, t_s: FloatArray) -> Moments:
-        """The commanded attitudes at times (n,), s: a cubic through four frames, or the great arc between two.
+        """The commanded attitudes at times (n,), s: a cubic through four frames, or the great arc
+        between two.
 
-        Of a trajectory of angular acceleration change j (rad/s^3) the cubic is off by less than j dt^3 / 15.
+        Of a trajectory of angular acceleration change j (rad/s^3) the cubic is off by less than j
+        dt^3 / 15.
         """
         before = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.t_s) - 2)
         known = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & self.joined[before]
         gap_s, step = self._gap_s[before, None], self._step[before]
         share = np.clip((t_s - self.t_s[before]) / gap_s[:, 0], 0, 1)[:, None]
-        # Hermite's cubic of the rotation vector from the frame before; at its ends it turns by (step + bend) per interval.
+        # Hermite's cubic of the rotation vector from the frame before; at its ends it turns by
+        # (step + bend) per interval.
         start, end = step + self._bend(before, -1), step + self._bend(before, 1)
         squared, cubed = share**2, share**3
         moved = (cubed - 2 * squared + share) * start + (3 * squared - 2 * cubed) * step + (cubed - squared) * end
@@ -100,7 +107,9 @@ class Commanded:
         return Commanded(self.t_s, self.q, spans_s, np.maximum.reduceat(self.hold_s, first))
 
     def _held_about(self, t_s: FloatArray) -> FloatArray:
-        """How long a frame stood in the held span in which each time (n,) lies, s; 0 where it lies in none."""
+        """How long a frame stood in the held span in which each time (n,) lies, s; 0 where it
+        lies in none.
+        """
         if not len(self.held_s):
             return np.zeros(len(t_s))
         start_s, end_s = self.held_s.T
@@ -109,10 +118,12 @@ class Commanded:
         return np.where(inside, self.hold_s[span], 0.0)
 
     def _bend(self, interval: IntArray, side: int) -> FloatArray:
-        """How far the turn at one end of each interval, rad per interval, differs from the interval's own (n, 3).
+        """How far the turn at one end of each interval, rad per interval, differs from the
+        interval's own (n, 3).
 
-        `side` is -1 for the beginning and 1 for the end. Finite differences at the frame that the interval shares with its
-        neighbour, weighted for unequal lengths; 0 where the neighbour is missing, not joined, or of another length.
+        `side` is -1 for the beginning and 1 for the end. Finite differences at the frame that the
+        interval shares with its neighbour, weighted for unequal lengths; 0 where the neighbour is
+        missing, not joined, or of another length.
         """
         last = len(self._step) - 1
         other = interval + side
@@ -125,10 +136,11 @@ class Commanded:
 
 @dataclass(frozen=True, slots=True)
 class CommandedRun:
-    """A run's commanded attitudes by the moment of light, in seconds after `zero_ns` of the sender's clock.
+    """A run's commanded attitudes by the moment of light, in seconds after `zero_ns` of the
+    sender's clock.
 
-    `changed` counts the frames that the operator's keys or a hidden window changed: these show no commanded attitude.
-    `missed` counts the refresh periods without a frame of their own.
+    `changed` counts the frames that the operator's keys or a hidden window changed: these show no
+    commanded attitude. `missed` counts the refresh periods without a frame of their own.
     """
 
     commanded: Commanded
@@ -142,7 +154,9 @@ class CommandedRun:
 
 
 def read_commanded(ledger: Path) -> CommandedRun:
-    """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage, for under two frames."""
+    """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage,
+    for under two frames.
+    """
     light, shown, changed, missed = array("q"), array("d"), 0, array("q")
     for record in frame_records(ledger):
         plain = record.q is not None and not record.operator and not record.hidden

@@ -1,9 +1,11 @@
-"""The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that survives a kill.
+"""The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that
+survives a kill.
 
-A separate thread writes a complete chunk with its CRC five times a second, so that no disk delays a frame. In a flood the first
-messages are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
-last. A disk that fails is tried again and never ends the display. Where somebody deletes, truncates or overwrites the file, an
-event says so and the ledger continues in another file, because the rest of the first could not be read.
+A separate thread writes a complete chunk with its CRC five times a second, so that no disk delays a
+frame. In a flood the first messages are kept whole and the others counted second by second. When a
+disk fills up, frames are dropped first and packets last. A disk that fails is tried again and never
+ends the display. Where somebody deletes, truncates or overwrites the file, an event says so and the
+ledger continues in another file, because the rest of the first could not be read.
 """
 
 import contextlib
@@ -67,7 +69,9 @@ ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "ans
 
 @dataclass(frozen=True, slots=True)
 class QueueEntry:
-    """A message to be written: its host time, a sequence number, its JSON once the writer asks for it, and a packet's bytes."""
+    """A message to be written: its host time, a sequence number, its JSON once the writer asks
+    for it, and a packet's bytes.
+    """
 
     kind: Kind
     time_ns: int
@@ -82,7 +86,9 @@ class QueueEntry:
 
 
 class LedgerQueue:
-    """Entries in order of arrival, bounded by bytes. Never blocks; drops frames first when it is full."""
+    """Entries in order of arrival, bounded by bytes. Never blocks; drops frames first when it is
+    full.
+    """
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
@@ -132,7 +138,8 @@ class Allowance:
 class FloodFilter:
     """In a flood, passes the first messages of each kind and reason and counts the others."""
 
-    # Refused packets tell little after the first ones; no sender means to send more than 2000 good ones a second.
+    # Refused packets tell little after the first ones; no sender means to send more than 2000 good
+    # ones a second.
     ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
 
     def __init__(self) -> None:
@@ -165,7 +172,9 @@ class FloodFilter:
 
 
 class ProcessProbe:
-    """Measures this process's memory and CPU time. Opens /proc once, because later no descriptor may be free."""
+    """Measures this process's memory and CPU time. Opens /proc once, because later no descriptor
+    may be free.
+    """
 
     def __init__(self) -> None:
         self._fd: int | None = None
@@ -196,11 +205,13 @@ FLUSH_S = 0.2
 EACH_S = 1.0  # how often counts, the process and the disk are looked at
 MAX_CHUNK_BYTES = 1_000_000
 MAX_DETAIL_CHARACTERS = 200
-DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
+# for a disk that stalls at the end, without and with a signal
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4
 MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
 STALLED_S = 5.0  # since the writer's last pass
 LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
-FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for packets, the smaller of the two
+# reserved for packets, the smaller of the two
+FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +257,8 @@ class Ledger(Closing):
         self._lost = self._counted = self._part = 0
         self._thin = self._moved = False
         self._renewed_s, self._rest_s = -math.inf, EACH_S
-        self.standing: Callable[[], list[FaultRecord | EventRecord]] = list  # records that a file begun during a run repeats
+        # records that a file begun during a run repeats
+        self.standing: Callable[[], list[FaultRecord | EventRecord]] = list
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
@@ -478,7 +490,9 @@ class Ledger(Closing):
     # The end
 
     def close(self) -> None:
-        """Write what is queued and the end of the file; a disk that does not accept it in time has failed."""
+        """Write what is queued and the end of the file; a disk that does not accept it in time
+        has failed.
+        """
         self._closing.set()
         patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
         self._thread.join(patience_s)
@@ -488,7 +502,9 @@ class Ledger(Closing):
         self._probe.close()
 
     def summary(self) -> dict[str, str | int | None]:
-        """Its path, what went wrong, how many messages were lost, and how many of a flood were only counted."""
+        """Its path, what went wrong, how many messages were lost, and how many of a flood were
+        only counted.
+        """
         lost = self._lost + sum(self._queue.dropped.values())
         told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
         if self._counted:
@@ -510,14 +526,17 @@ def event_record(notice: Notice) -> EventRecord:
 
 
 class LedgerSwitch:
-    """Passes a run's records to the current ledger, which can be begun and ended during the run; drops them without one.
+    """Passes a run's records to the current ledger, which can be begun and ended during the run;
+    drops them without one.
 
-    Frames and packets come from any thread and never wait. `begin` and `end` are for one thread, which may wait for a disk.
+    Frames and packets come from any thread and never wait. `begin` and `end` are for one thread,
+    which may wait for a disk.
     """
 
     def __init__(self, ledger: Ledger | None = None) -> None:
         self.current = self.last = ledger  # `last` is the newest one
-        self._ending = threading.Lock()  # the end of a run waits for an end that an operator asked for
+        # the end of a run waits for an end that an operator asked for
+        self._ending = threading.Lock()
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
         self._wrong_sky: dict[str, EventRecord] = {}
@@ -545,7 +564,9 @@ class LedgerSwitch:
             ledger.frame(record)
 
     def notice(self, notice: Notice) -> None:
-        """Record an event of the run; a ledger that begins later repeats the conditions of a wrong sky that hold."""
+        """Record an event of the run; a ledger that begins later repeats the conditions of a
+        wrong sky that hold.
+        """
         if notice.kind in ENDS:
             self._wrong_sky[notice.kind] = event_record(notice)
         elif notice.kind in BEGINS:
@@ -569,7 +590,9 @@ class LedgerSwitch:
             ledger.pulse(what)
 
     def fault(self, record: FaultRecord) -> None:
-        """Record a fault's event; a ledger that begins later repeats the scenario and the faults that are on."""
+        """Record a fault's event; a ledger that begins later repeats the scenario and the faults
+        that are on.
+        """
         if record.event == "scenario":
             self._scenario.append(record)
         elif record.event == "start":
@@ -580,7 +603,9 @@ class LedgerSwitch:
             ledger.fault(record)
 
     def begin(self, make: Callable[[], Ledger]) -> Ledger:
-        """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot be made."""
+        """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot
+        be made.
+        """
         if (ledger := self.current) is None:
             ledger = make()
             ledger.standing = self._standing
@@ -597,7 +622,8 @@ class LedgerSwitch:
 
     def end(self) -> Ledger | None:
         """End the ledger and wait until it is complete on the disk; the ended ledger."""
-        with self._ending, stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+        # a signal that comes now does not interrupt this
+        with self._ending, stop_on_signal(threading.Event()):
             ledger, self.current = self.current, None
             if ledger is not None:
                 ledger.close()

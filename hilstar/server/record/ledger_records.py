@@ -1,6 +1,8 @@
-"""What a ledger holds, and how it is read: its head, its records in their order, and the frames to be drawn again.
+"""What a ledger holds, and how it is read: its head, its records in their order, and the frames to
+be drawn again.
 
-There is a record for each frame, each event, each second of the process, and for what was only counted.
+There is a record for each frame, each event, each second of the process, and for what was only
+counted.
 """
 
 import math
@@ -34,25 +36,31 @@ from hilstar.server.pacer import Shown
 
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
 ANSWER_TOPIC = "/answer"
-# What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
+# What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame
+# "skipped" too.
 PULSES = ("sent", "skipped", "lost")
 LOST = "sequence"  # why packets count as lost
-MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
+# kept of a message; every packet is shorter, a simulator's own messages may be cut
+MAX_RAW_BYTES = 1024
 MAX_CENTROIDS = 200  # kept of an answer
 HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
-AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
+# a sender's clock, or the difference to the host's
+AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
-    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
+    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of
+    this host's.
 
-    `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn along which stars are drawn
-    as paths, null for points. `velocity_km_s` (ICRS, for aberration) and `place_km` (about the Earth) are the observer's where
-    the source gives them, else null. `capped` counts stars with coarser paths. `missed_before` counts the refresh periods just
-    before it without a frame, `missed` those of the run. `marker` is the photodiode square. `operator` names the operator's
-    switches ("blank, grid"; under a blank or a patch `q` is null), `hidden` says why the window was not seen; "" for neither.
+    `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn
+    along which stars are drawn as paths, null for points. `velocity_km_s` (ICRS, for aberration)
+    and `place_km` (about the Earth) are the observer's where the source gives them, else null.
+    `capped` counts stars with coarser paths. `missed_before` counts the refresh periods just before
+    it without a frame, `missed` those of the run. `marker` is the photodiode square. `operator`
+    names the operator's switches ("blank, grid"; under a blank or a patch `q` is null), `hidden`
+    says why the window was not seen; "" for neither.
     """
 
     frame: Count
@@ -91,7 +99,9 @@ _KINDS: dict[Any, str] = {float: "number", float | None: "number", str: "string"
 
 
 def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
-    """The JSON schema of a record, of plain types only (see `attitude.logs.mcap_log.ATTITUDE_SCHEMA`)."""
+    """The JSON schema of a record, of plain types only (see
+    `attitude.logs.mcap_log.ATTITUDE_SCHEMA`).
+    """
     array = {"type": "array", "items": {"type": "number"}}
     fields = {f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array for f in msgspec.structs.fields(record)}
     if "centroids" in fields:
@@ -108,7 +118,8 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, kw_only=True):
-    """An event of a run (see `hilstar.basics.notices`): host time, ns, its kind, its text, and the person that it comes from.
+    """An event of a run (see `hilstar.basics.notices`): host time, ns, its kind, its text, and the
+    person that it comes from.
 
     `since_ns` is when that began of which it tells, where this was earlier.
     """
@@ -121,10 +132,13 @@ class EventRecord(msgspec.Struct, kw_only=True):
 
 
 class FaultRecord(msgspec.Struct, kw_only=True):
-    """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time, and `t_ns` of the run.
+    """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time,
+    and `t_ns` of the run.
 
-    `number` counts the starts of a run, `who` is "file", "stream" or a person. `table` is the fault as JSON, with the
-    keys of a scenario; `seed` that of its randomness, `folder` where its files are, and `file_sha256` that of its map.
+    `number` counts the starts of a run, `who` is "file", "stream" or a person. `table` is the fault
+    as JSON, with the
+    keys of a scenario; `seed` that of its randomness, `folder` where its files are, and
+    `file_sha256` that of its map.
     """
 
     host_ns: HostNs
@@ -141,14 +155,17 @@ class FaultRecord(msgspec.Struct, kw_only=True):
 
 
 class AnswerRecord(msgspec.Struct, kw_only=True):
-    """An answer of the tracker: its bytes (`raw`, hexadecimal), what they say, and what was lit while it looked.
+    """An answer of the tracker: its bytes (`raw`, hexadecimal), what they say, and what was lit
+    while it looked.
 
-    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then. `t_ns` is the tracker's
-    stamp on its own clock, `light_ns` the exposure's middle on the sender's clock. `centroids` are [x_px, y_px, dn, hip].
-    `verdict` is "right", "wrong" (see `[answers] wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no one sky was
-    lit) or "unjudged" (compared with nothing; `middle_ns` is then `host_ns`).
+    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then.
+    `t_ns` is the tracker's stamp on its own clock, `light_ns` the exposure's middle on the sender's
+    clock. `centroids` are [x_px, y_px, dn, hip]. `verdict` is "right", "wrong" (see `[answers]
+    wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no one sky was lit) or "unjudged"
+    (compared with nothing; `middle_ns` is then `host_ns`).
 
-    `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the rotation vector from
+    `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the
+    rotation vector from
     it to `q`, cam.
     """
 
@@ -172,10 +189,12 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
 
 
 class CountRecord(msgspec.Struct, kw_only=True):
-    """What was only counted, second by second (host time, ns): refused packets by reason, a flood, or pulses.
+    """What was only counted, second by second (host time, ns): refused packets by reason, a flood,
+    or pulses.
 
-    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost"; `reason` that of a refusal, "accepted" of other packets
-    and answers, the kind of an event, of a pulse one of PULSES, and LOST of packets that a gap of their `sequence` shows.
+    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost"; `reason` that of a refusal,
+    "accepted" of other packets and answers, the kind of an event, of a pulse one of PULSES, and
+    LOST of packets that a gap of their `sequence` shows.
     """
 
     host_ns: HostNs
@@ -209,7 +228,8 @@ _DECODERS[ATTITUDE_TOPIC] = msgspec.json.Decoder(PacketForm)
 
 
 def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
-    """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the run's missed frames
+    """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the
+    run's missed frames
     so far, and `below_step` the stars in view that are too faint for the monitor.
     """
     attitude, drawn = shown.attitude, shown.drawn
@@ -283,17 +303,23 @@ MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
 
 
 def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:
-    """The frames of a ledger as they were written, none if the file is no ledger. Raises InputError for damage."""
+    """The frames of a ledger as they were written, none if the file is no ledger. Raises
+    InputError for damage.
+    """
     return _records(path, FRAME_TOPIC, tell)
 
 
 def fault_records(path: Path) -> Iterator[FaultRecord]:
-    """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing of a missing end."""
+    """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing
+    of a missing end.
+    """
     return _records(path, FAULT_TOPIC)
 
 
 def event_records(path: Path) -> Iterator[EventRecord]:
-    """The events of a run in its ledger. Raises InputError for damage; says nothing of a missing end."""
+    """The events of a run in its ledger. Raises InputError for damage; says nothing of a missing
+    end.
+    """
     return _records(path, EVENT_TOPIC)
 
 
@@ -316,7 +342,9 @@ def _not_ours(path: Path, which: str, error: Exception) -> InputError:
 
 
 def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[FrameRecord]:
-    """The frames of a ledger, to be drawn again. Raises InputError for damage, and for what the wire would refuse."""
+    """The frames of a ledger, to be drawn again. Raises InputError for damage, and for what the
+    wire would refuse.
+    """
     for number, record in enumerate(frame_records(path), start=1):
         wrong = wrong_in_frame(record, max_rate_rad_s)
         if wrong:
@@ -339,7 +367,9 @@ def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str
 
 
 def run_records(path: Path) -> Iterator[RunRecord]:
-    """The records of a ledger, in order. Raises InputError for a file that is no ledger or is damaged."""
+    """The records of a ledger, in order. Raises InputError for a file that is no ledger or is
+    damaged.
+    """
     for block in run_blocks(path, 1):
         yield from block
 
@@ -418,7 +448,9 @@ def read_head(path: Path) -> dict[str, str]:
 
 
 def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
-    """What codes cost in a run (see `[render] codes_ms`), from its ledger's head; None where nothing was measured or fixed."""
+    """What codes cost in a run (see `[render] codes_ms`), from its ledger's head; None where
+    nothing was measured or fixed.
+    """
     try:
         return msgspec.json.decode(head.get("codes_ms", "null"), type=tuple[float, float] | None)
     except msgspec.MsgspecError:
@@ -442,7 +474,9 @@ def raw_convention(config: BenchConfig) -> str:
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:
-    """The configuration of a run, from its ledger's head; None if that holds none that can be read."""
+    """The configuration of a run, from its ledger's head; None if that holds none that can be
+    read.
+    """
     try:
         return msgspec.convert(parse_toml(Path("the ledger's head"), head.get("bench_text", "")), BenchConfig)
     except (InputError, msgspec.ValidationError, RecursionError):

@@ -1,4 +1,6 @@
-"""The figures of a run's report, from its ledger: added in blocks, in memory that does not grow with the run."""
+"""The figures of a run's report, from its ledger: added in blocks, in memory that does not grow
+with the run.
+"""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -80,7 +82,9 @@ class SpanColumn(NamedTuple):
 
 
 class SpanTable:
-    """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
+    """The minimum, maximum and sum of each column over equal numbers of frames: at most
+    `capacity` spans.
+    """
 
     def __init__(self, columns: int, capacity: int = SPANS) -> None:
         shape = (capacity, columns)
@@ -142,7 +146,9 @@ class TimeBins:
         self._used, self.width_ns = 0, NS_PER_S
 
     def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
-        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first counts in the first bin."""
+        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first
+        counts in the first bin.
+        """
         if not len(at_ns):
             return
         if self._first_ns is None:
@@ -157,7 +163,9 @@ class TimeBins:
         self._used = max(self._used, last + 1)
 
     def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
-        """The start of each bin, s after a host time, (n,), and the rate of each kind in it, 1/s, (n, kinds)."""
+        """The start of each bin, s after a host time, (n,), and the rate of each kind in it,
+        1/s, (n, kinds).
+        """
         if self._first_ns is None:
             return np.zeros(0), np.zeros((0, self._counts.shape[1]))
         begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(self._used, dtype=np.float64) * (self.width_ns / NS_PER_S)
@@ -169,11 +177,14 @@ WARM_UP_S = 60.0  # after this the process has allocated all the memory that it 
 KEYFRAMES = 16
 MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
 SMALL_RAD = 1e-8
-RECOUNTED = 8192  # newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
+# newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
+RECOUNTED = 8192
 
 
 class Keyframes:
-    """Frames of a run to be drawn in its report: some evenly over the run, and the first or worst of each kind."""
+    """Frames of a run to be drawn in its report: some evenly over the run, and the first or
+    worst of each kind.
+    """
 
     def __init__(self) -> None:
         self._even = ThinnedRows(1, KEYFRAMES, object)
@@ -214,7 +225,9 @@ NUMBERS, WORDS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", 
 
 @dataclass(slots=True)
 class FrameMarks:
-    """The newest frames (n,): when each was swapped, whether nothing else is wrong with it, and whether its sky was."""
+    """The newest frames (n,): when each was swapped, whether nothing else is wrong with it, and
+    whether its sky was.
+    """
 
     swap_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     plain: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -244,7 +257,8 @@ class RunFigures:
     packets: PacketTally = field(default_factory=PacketTally)
     events: dict[str, int] = field(default_factory=dict)
     pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
-    # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an attitude.
+    # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an
+    # attitude.
     counted: Counter[str] = field(default_factory=Counter)
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
@@ -254,12 +268,14 @@ class RunFigures:
     spans: SpanTable = field(default_factory=lambda: SpanTable(len(METRICS) + len(COUNTS)))
     # run_s, t_s, q, turned about x, y, z (rad)
     path: ThinnedRows = field(default_factory=lambda: ThinnedRows(9, SAMPLES // 8))
-    process: ThinnedRows = field(default_factory=lambda: ThinnedRows(3, SAMPLES // 16))  # host time in s, MB, CPU time in s
+    # host time in s, MB, CPU time in s
+    process: ThinnedRows = field(default_factory=lambda: ThinnedRows(3, SAMPLES // 16))
     keyframes: Keyframes = field(default_factory=Keyframes)
     packet_times: TimeBins = field(default_factory=lambda: TimeBins(2))
     answers: AnswerTally = field(default_factory=AnswerTally)
     faults: list[FaultRecord] = field(default_factory=list)
-    residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))  # host time in s, x, y, z in arcsec
+    # host time in s, x, y, z in arcsec
+    residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))
     first_events: list[EventRecord] = field(default_factory=list)
     last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     wrong_sky: WrongSky = field(default_factory=WrongSky)
@@ -307,7 +323,9 @@ class RunFigures:
             self._add_frames(frames)
 
     def _recount(self) -> None:
-        """Count frames as wrong that were added before it was found that they are: conditions say since when they hold."""
+        """Count frames as wrong that were added before it was found that they are: conditions
+        say since when they hold.
+        """
         if not self.wrong_sky.any:
             return
         newest = self._newest
@@ -387,7 +405,9 @@ class RunFigures:
 def _times_ms(
     frames: list[FrameRecord], swap_ns: npt.NDArray[np.int64], before: FrameRecord | None, after_missed: BoolArray
 ) -> FloatArray:
-    """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames does not count."""
+    """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames
+    does not count.
+    """
     intervals_ns = np.diff(swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns).astype(np.float64)
     intervals_ns[after_missed] = np.nan
     if before is None:
@@ -424,7 +444,9 @@ def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def figures_of(path: Path) -> RunFigures:
-    """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
+    """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is
+    damaged.
+    """
     figures = RunFigures(read_head(path))
     figures.answers = AnswerTally(_begun_ns(figures.head))
     for block in run_blocks(path, BLOCK):
@@ -440,7 +462,9 @@ def _begun_ns(head: dict[str, str]) -> int:
 
 
 class RunReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a run: the JSON object of `hilstar report`. Times in ms, but for `duration_s`."""
+    """The figures of a run: the JSON object of `hilstar report`. Times in ms, but for
+    `duration_s`.
+    """
 
     frames: int
     duration_s: float
@@ -463,7 +487,8 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     packets: dict[str, int]
     events: dict[str, int]
     pulses: dict[str, int]
-    right_frames: int = 0  # on the screen, with a fresh attitude, not changed by the operator, of a sky that is right
+    # on the screen, with a fresh attitude, not changed by the operator, of a sky that is right
+    right_frames: int = 0
     wrong_frames: int = 0
     wrong_sky: WrongSkyTotal = WrongSkyTotal()
     lost_packets: int = 0

@@ -1,1 +1,3 @@
-"""The monitor's window in a run: its timing, its photodiode square, and what its operator's keys change."""
+"""The monitor's window in a run: its timing, its photodiode square, and what its operator's keys
+change.
+"""

@@ -1,4 +1,6 @@
-"""A bench on its display, past the start-up gate: swaps are timed, and a display whose timing cannot be trusted is refused."""
+"""A bench on its display, past the start-up gate: swaps are timed, and a display whose timing
+cannot be trusted is refused.
+"""
 
 import datetime
 import logging
@@ -31,14 +33,16 @@ DROPPED = 1.5  # periods
 MAX_DROPPED = 2  # among GATE_FRAMES: a desktop that is still busy with the new window
 BURSTS, BURST = 3, 8  # bursts of swaps, to find how many are queued
 BURST_AT = 0.25  # share of a period after a swap: far from the next one
-OFF_GRID = (0.125, 0.75)  # in periods: where a burst ends on a variable refresh, off the grid of a fixed one
+# in periods: where a burst ends on a variable refresh, off the grid of a fixed one
+OFF_GRID = (0.125, 0.75)
 DRAINED = 6  # periods after which a driver's queue is empty
 # The first is today's and serves most drivers; a 4K display or a slow X server needs more.
 GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 GUARD_TRIALS = 4
 PLAIN_BITS = 8
 VRR_FRAMES = 5
-VRR_AT, VRR_UNDER = 1.5, 1.75  # periods after a swap: when the next frame is submitted, and the latest that it is shown with
+# periods after a swap: when the next frame is submitted, and the latest that it is shown with
+VRR_AT, VRR_UNDER = 1.5, 1.75
 UNPACED = 0.1  # share of the known period: swaps faster by more do not wait for it
 log = logging.getLogger(__name__)
 
@@ -47,10 +51,11 @@ log = logging.getLogger(__name__)
 class Timing:
     """What the gate measured: the median period, how many frames were dropped, and who keeps time.
 
-    `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
-    `modes_hz` are the refresh rates that the display has. The driver holds `queued` finished frames back, a refresh each, and
-    takes a frame for a swap up to `guard_ms` before it. With `variable` the display shows a frame when it comes.
-    `period_error_ms` is the standard error of the median.
+    `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could,
+    but swaps do not wait. `modes_hz` are the refresh rates that the display has. The driver holds
+    `queued` finished frames back, a refresh each, and takes a frame for a swap up to `guard_ms`
+    before it. With `variable` the display shows a frame when it comes. `period_error_ms` is the
+    standard error of the median.
     """
 
     period_ms: float
@@ -66,9 +71,11 @@ class Timing:
 
 @contextmanager
 def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force: bool, timed: bool) -> Iterator[Screen]:
-    """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises InputError or MachineError.
+    """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises
+    InputError or MachineError.
 
-    The monitor has to be the one that the bench's files were measured on, not too long before `today`.
+    The monitor has to be the one that the bench's files were measured on, not too long before
+    `today`.
     """
     monitor = file.config.monitor
     found = check_monitor(file, identity_here(monitor.display), today)
@@ -102,7 +109,9 @@ def _bench_on(window: Window, file: BenchFile, found: MonitorCheck, *, timed: bo
 
 
 def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Timing:
-    """Time GATE_FRAMES swaps, refuse (MachineError) a display that is not the bench file's unless `force`; its timing."""
+    """Time GATE_FRAMES swaps, refuse (MachineError) a display that is not the bench file's
+    unless `force`; its timing.
+    """
     window, monitor = screen.window, screen.bench.config.monitor
     screen.bench.draw(None)
     swaps_ns = []
@@ -129,7 +138,9 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
 
 
 def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
-    """Log what may be wrong with a display, and refuse (MachineError) one that is; with `force` that is logged and kept."""
+    """Log what may be wrong with a display, and refuse (MachineError) one that is; with `force`
+    that is logged and kept.
+    """
     window, monitor = screen.window, screen.bench.config.monitor
     changed = screen.bench.renderer.changed_codes()
     if changed:
@@ -150,11 +161,12 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
 
 
 def burst_periods(screen: Screen, clock: HostClock) -> float:
-    """How long BURST swaps in a row take, in periods, from a quarter of a period after a swap on with no frame queued.
+    """How long BURST swaps in a row take, in periods, from a quarter of a period after a swap on
+    with no frame queued.
 
-    The last swap returns once the frame that precedes it by the queue's length is shown. At a fixed refresh that is after
-    BURST - 0.25 periods, less a period for each queued frame. A variable refresh shows the first frame at once, and its last
-    swap returns off that grid.
+    The last swap returns once the frame that precedes it by the queue's length is shown. At a fixed
+    refresh that is after BURST - 0.25 periods, less a period for each queued frame. A variable
+    refresh shows the first frame at once, and its last swap returns off that grid.
     """
     took = []
     for _ in range(BURSTS):
@@ -178,7 +190,9 @@ def queue_of(screen: Screen, clock: HostClock) -> tuple[int, bool]:
 
 
 def follows_frames(screen: Screen, clock: HostClock) -> bool:
-    """Whether the refresh is variable: a frame submitted 1.5 periods after a swap is shown at once, and not after 2 periods."""
+    """Whether the refresh is variable: a frame submitted 1.5 periods after a swap is shown at
+    once, and not after 2 periods.
+    """
     early = 0
     for _ in range(VRR_FRAMES):
         screen.present(0)
@@ -207,10 +221,13 @@ def needed_guard_ms(screen: Screen, clock: HostClock) -> float:
 
 
 def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timing:
-    """What the intervals between swaps say of a display; `known_hz` is its refresh rate by the system, 0 if unknown."""
+    """What the intervals between swaps say of a display; `known_hz` is its refresh rate by the
+    system, 0 if unknown.
+    """
     wanted_ms = 1000.0 / monitor.refresh_hz
     period_ms = float(np.median(periods_ms))
-    # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time but this program.
+    # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time
+    # but this program.
     on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
     by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
     dropped = periods_ms > DROPPED * wanted_ms

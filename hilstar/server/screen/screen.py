@@ -1,4 +1,6 @@
-"""The monitor's window: frames on it, their pacing by its refresh, the square that a photodiode watches, and its keys."""
+"""The monitor's window: frames on it, their pacing by its refresh, the square that a photodiode
+watches, and its keys.
+"""
 
 import logging
 import math
@@ -22,12 +24,15 @@ from hilstar.server.pacer import Moment, Pacer, Presented
 
 HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
 KEYS = {"b": "blank", "c": "crosshair", "g": "grid", "t": "patch", "space": "pause"}
-CODE_BITS = 7  # bits of the photodiode square: its light in any 7 successive frames tells which frames they are
+# bits of the photodiode square: its light in any 7 successive frames tells which frames they are
+CODE_BITS = 7
 log = logging.getLogger(__name__)
 
 
 def maximal_sequence() -> tuple[int, ...]:
-    """The 127 bits of the shift register x^7 + x^6 + 1: any 7 in a row come once (Golomb, Shift Register Sequences, 1967)."""
+    """The 127 bits of the shift register x^7 + x^6 + 1: any 7 in a row come once (Golomb, Shift
+    Register Sequences, 1967).
+    """
     state, bits = 1, []
     for _ in range(2**CODE_BITS - 1):
         bits.append(state & 1)
@@ -39,7 +44,8 @@ CODE = maximal_sequence()
 
 
 def marker_light(number: int, kind: str) -> int:
-    """The square of a frame, 0 or 1: light in every other frame (`toggle`), or the bit of CODE at the frame's number.
+    """The square of a frame, 0 or 1: light in every other frame (`toggle`), or the bit of CODE at
+    the frame's number.
 
     `toggle` gives a latency modulo two frames, `code` modulo 127 frames.
     """
@@ -47,11 +53,13 @@ def marker_light(number: int, kind: str) -> int:
 
 
 class SwapClock:
-    """The grid of moments at which a screen swaps: a phase and a period, fitted to measured time stamps.
+    """The grid of moments at which a screen swaps: a phase and a period, fitted to measured time
+    stamps.
 
-    A second-order loop (Gardner, Phaselock Techniques, 2005): each swap pulls the phase by PHASE_SHARE of its error and the
-    period by PERIOD_SHARE of it, damping 0.79; a swap that came whole periods late advances the phase by that many. With
-    `paced_by_screen` false the grid is this program's own, and stamps do not move it.
+    A second-order loop (Gardner, Phaselock Techniques, 2005): each swap pulls the phase by
+    PHASE_SHARE of its error and the period by PERIOD_SHARE of it, damping 0.79; a swap that came
+    whole periods late advances the phase by that many. With `paced_by_screen` false the grid is
+    this program's own, and stamps do not move it.
     """
 
     PHASE_SHARE = 0.1
@@ -79,10 +87,13 @@ class SwapClock:
 
 
 class DrawBudget:
-    """How long before its swap a frame is begun: as late as recent frames allow, so that its attitude is fresh."""
+    """How long before its swap a frame is begun: as late as recent frames allow, so that its
+    attitude is fresh.
+    """
 
     FRAMES = 120
-    SLOW = 3  # the third slowest counts: two outliers in two seconds are late rather than all others early
+    # the third slowest counts: two outliers in two seconds are late rather than all others early
+    SLOW = 3
     GUARD_NS = 1.0 * NS_PER_MS
     MORE = 1.25  # factor on the time that a driver was seen to need
 
@@ -98,9 +109,11 @@ class DrawBudget:
         self._costs_ns.append(cost_ns)
 
     def add_flip(self, lead_ns: float, late_ns: float) -> bool:
-        """Add a flip that was `late_ns` after its moment, of a frame that was ready `lead_ns` before it.
+        """Add a flip that was `late_ns` after its moment, of a frame that was ready `lead_ns`
+        before it.
 
-        True where the guard is raised: the third in FRAMES frames that was ready in time and a refresh late.
+        True where the guard is raised: the third in FRAMES frames that was ready in time and a
+        refresh late.
         """
         self._frames += 1
         if self._frames >= self.FRAMES:
@@ -118,12 +131,16 @@ class DrawBudget:
 
     @property
     def min_ns(self) -> float:
-        """The shortest of the last frames: with less time left than that, a swap cannot be reached."""
+        """The shortest of the last frames: with less time left than that, a swap cannot be
+        reached.
+        """
         return min(self._costs_ns, default=0)
 
     @property
     def ns(self) -> float:
-        """The time that all but two of the last frames took, and a guard; at most a period, and a whole period at first."""
+        """The time that all but two of the last frames took, and a guard; at most a period, and
+        a whole period at first.
+        """
         if len(self._costs_ns) < self.FRAMES // 4:
             return self._period_ns
         return min(sorted(self._costs_ns)[-self.SLOW] + self.guard_ns, self._period_ns)
@@ -132,10 +149,11 @@ class DrawBudget:
 class Screen:
     """A window with a bench's frames on it.
 
-    `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is the time from a swap to
-    the middle row's first light: half of the scan-out, the panel's own delay, and the frames `queued` in the driver. `output`
-    is how the display's output was set when the gate was passed, None where that is not known; `forced` has what was wrong with
-    the display or its monitor, and was shown by --force.
+    `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns`
+    is the time from a swap to the middle row's first light: half of the scan-out, the panel's own
+    delay, and the frames `queued` in the driver. `output` is how the display's output was set when
+    the gate was passed, None where that is not known; `forced` has what was wrong with the display
+    or its monitor, and was shown by --force.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
@@ -160,14 +178,18 @@ class Screen:
         self._backend.show_on(view)
 
     def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
-        """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen keeps time."""
+        """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen
+        keeps time.
+        """
         period_ns = period_ms * NS_PER_MS if by_screen else NS_PER_S / self.bench.config.monitor.refresh_hz
         self.clock = SwapClock(swap_ns, period_ns, by_screen)
         self.budget = DrawBudget(period_ns)
         self.queued = 0
 
     def keep_ahead(self, guard_ms: float, queued: int) -> None:
-        """Have frames ready `guard_ms` before their swap; the driver holds `queued` of them back for a refresh each."""
+        """Have frames ready `guard_ms` before their swap; the driver holds `queued` of them back
+        for a refresh each.
+        """
         self.budget = DrawBudget(self.clock.period_ns, guard_ms * NS_PER_MS)
         self.swap_to_light_ns += round((queued - self.queued) * self.clock.period_ns)
         self.queued = queued
@@ -183,7 +205,9 @@ class Screen:
         return self.window.timestamp_source + ("" if self.clock.paced_by_screen else ", software pacing")
 
     def present(self, number: int) -> int | None:
-        """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""
+        """Draw the bench's last frame on the back buffer; the photodiode square's light in frame
+        `number`, None without one.
+        """
         monitor = self.bench.config.monitor
         white = 2**monitor.bits - 1
         side_px = monitor.photodiode_px
@@ -192,7 +216,9 @@ class Screen:
         return marker
 
     def swap(self, timed: bool = True) -> int:
-        """Swap what was presented, and take in keys; host time of the swap, ns, which moves the clock if `timed`."""
+        """Swap what was presented, and take in keys; host time of the swap, ns, which moves the
+        clock if `timed`.
+        """
         swap_ns = self.window.swap(self._backend.take_back_buffer)
         if timed:
             self.clock.update(swap_ns)
@@ -284,7 +310,9 @@ class DisplayPacer(Pacer):
         self._end_with_window()
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
-        """Where the times of swaps come from, scheduling, swaps, how long the sky was changed or hidden, and the output."""
+        """Where the times of swaps come from, scheduling, swaps, how long the sky was changed or
+        hidden, and the output.
+        """
         named: dict[str, Any] = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
         named |= {"guard_ms": self._screen.budget.guard_ns / NS_PER_MS, "queued_frames": self._screen.queued}
         named |= swaps | self.operator.summary()

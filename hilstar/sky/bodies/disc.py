@@ -1,19 +1,25 @@
-"""A body wide enough to have a face: where its disc is seen, how bright each place of it is, and what it hides.
+"""A body wide enough to have a face: where its disc is seen, how bright each place of it is, and
+what it hides.
 
-All is computed in the axes that make the body's spheroid a unit sphere, where limb and terminator are circles; a true distance
-counts, so that a near Earth is the cap that it is. Laws give radiance relative to `normal_e_per_s_sr`:
+All is computed in the axes that make the body's spheroid a unit sphere, where limb and terminator
+are circles; a true distance counts, so that a near Earth is the cap that it is. Laws give radiance
+relative to `normal_e_per_s_sr`:
 
 - `lambert`: mu0, the cosine of the Sun's angle from the place's normal;
-- `lunar-lambert`: 2 l mu0 / (mu0 + mu) + (1 - l) mu0, mu the observer's (McEwen 1991, Icarus 92, 298), l = `lunar_share`;
-- `limb-darkened`: 0.30 + 0.93 mu - 0.23 mu^2, sunlight at 550 nm (Cox 2000, Allen's Astrophysical Quantities, 14.7);
+- `lunar-lambert`: 2 l mu0 / (mu0 + mu) + (1 - l) mu0, mu the observer's (McEwen 1991, Icarus 92,
+  298), l = `lunar_share`;
+- `limb-darkened`: 0.30 + 0.93 mu - 0.23 mu^2, sunlight at 550 nm (Cox 2000, Allen's Astrophysical
+  Quantities, 14.7);
 - `uniform`: 1.
 
 The law gives a disc its shape, the body's magnitude its sum: `of_rate` scales the one to the other.
 
-The Earth from an orbit: where its disc is seen, and the radiance that its magnitude from afar gives its ground.
+The Earth from an orbit: where its disc is seen, and the radiance that its magnitude from afar gives
+its ground.
 
-Mallama and Hilton's magnitude is that of the whole globe from afar. It is taken as a Lambert sphere's whose ground is as bright
-as that needs at each phase; near, the same ground is seen, and what is in view adds up to another sum. There are no
+Mallama and Hilton's magnitude is that of the whole globe from afar. It is taken as a Lambert
+sphere's whose ground is as bright as that needs at each phase; near, the same ground is seen, and
+what is in view adds up to another sum. There are no
 clouds, seas, city lights, moonlight or airglow.
 
 Sizes, flattening, poles and laws of the light of Sun, Moon, Earth and planets.
@@ -33,10 +39,15 @@ from hilstar.sky.bodies.light import EARTH_CURVE_DEG, KM_PER_AU, body_v_mag, pha
 
 Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
 SOLAR_LIMB = (0.30, 0.93, -0.23)
-# The Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; clipped to 0 and 1 beyond the fitted range.
+# The Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; clipped to 0 and 1 beyond the
+# fitted range.
 LUNAR_SHARE = (1.0, -0.019, 2.42e-4, -1.46e-6)
-QUADRATURE = 40  # Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux, tests/unit/sky/bodies/test_disc.py
-AIR_TOP = 20.0  # scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code shows
+# Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux,
+# tests/unit/sky/bodies/test_disc.py
+QUADRATURE = 40
+# scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code
+# shows
+AIR_TOP = 20.0
 EARTH = "Earth"
 EQUATOR_KM, POLAR_KM = 6378.1366, 6356.7519  # IERS Conventions 2010, table 1.1
 MEAN_KM = math.sqrt(EQUATOR_KM * POLAR_KM)  # mean radius of the outline seen from the equator
@@ -53,7 +64,8 @@ RADII_KM = {
     "Neptune": 24_764.0,
     EARTH: EQUATOR_KM,
 }
-# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
+# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see:
+# the same source
 POLAR_RADII_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
 POLES_DEG = {"Jupiter": (268.057, 64.495), "Saturn": (40.589, 83.537), "Uranus": (257.311, -15.175), "Neptune": (299.36, 43.46)}
 LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
@@ -62,7 +74,9 @@ NORTH = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """An exponential atmosphere: its scale height, and its vertical optical depth from the limb's surface up."""
+    """An exponential atmosphere: its scale height, and its vertical optical depth from the
+    limb's surface up.
+    """
 
     scale_km: float
     depth: float
@@ -70,9 +84,11 @@ class Air:
 
 @dataclass(frozen=True, eq=False)
 class Disc:
-    """A body's disc as seen: `direction` (3,) to its centre and `pole`, unit vectors, ICRS axes; `sun`, from it to the Sun.
+    """A body's disc as seen: `direction` (3,) to its centre and `pole`, unit vectors, ICRS axes;
+    `sun`, from it to the Sun.
 
-    `equator_km` and `polar_km` are the spheroid's radii, `normal_e_per_s_sr` the radiance where the law's function is 1.
+    `equator_km` and `polar_km` are the spheroid's radii, `normal_e_per_s_sr` the radiance where the
+    law's function is 1.
     """
 
     name: str
@@ -89,7 +105,9 @@ class Disc:
 
     @cached_property
     def to_sphere(self) -> FloatArray:
-        """The map (3, 3) of ICRS vectors to axes in which the body is a unit sphere on +z, in equatorial radii."""
+        """The map (3, 3) of ICRS vectors to axes in which the body is a unit sphere on +z, in
+        equatorial radii.
+        """
         squash = np.eye(3) + (self.equator_km / self.polar_km - 1) * np.outer(self.pole, self.pole)
         towards = squash @ self.direction
         z = towards / np.linalg.norm(towards)
@@ -108,7 +126,9 @@ class Disc:
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
-        """A place's product with this vector (3,) is the cosine of the Sun's angle times the length of the normal."""
+        """A place's product with this vector (3,) is the cosine of the Sun's angle times the
+        length of the normal.
+        """
         return np.asarray(self.to_sphere @ self.sun)
 
     @property
@@ -123,11 +143,15 @@ class Disc:
 
     @property
     def slant_depth(self) -> float:
-        """The optical depth along a ray that touches the surface, 0 without air (Chapman's limit)."""
+        """The optical depth along a ray that touches the surface, 0 without air (Chapman's
+        limit).
+        """
         return 0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
 
     def limb(self, count: int, radii: float = 1.0) -> FloatArray:
-        """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all round."""
+        """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all
+        round.
+        """
         sine = min(1.0, radii / self.distance_radii)
         turn = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
         ring = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1)
@@ -140,22 +164,30 @@ class Disc:
         return replace(self, normal_e_per_s_sr=electrons_per_s / whole_sr if whole_sr > 0 else 0.0)
 
     def impact(self, directions: FloatArray) -> FloatArray:
-        """How close rays along ICRS directions (n, 3) pass the centre, radii (n,); infinite for those that lead away."""
+        """How close rays along ICRS directions (n, 3) pass the centre, radii (n,); infinite for
+        those that lead away.
+        """
         return self._impact(directions @ self.to_sphere.T)
 
     def transmission(self, directions: FloatArray) -> FloatArray:
-        """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less than 1 through its air."""
+        """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less
+        than 1 through its air.
+        """
         height = (self._impact(directions @ self.to_sphere.T) - 1) / (self.air_radii or 1.0)
         through = np.exp(-self.slant_depth * np.exp(-np.maximum(height, 0.0)))
         return np.where(height < 0, 0.0, through)
 
     def _impact(self, seen: FloatArray) -> FloatArray:
-        """How close rays (n, 3), `to_sphere` axes, pass the centre, radii; infinite for those that lead away."""
+        """How close rays (n, 3), `to_sphere` axes, pass the centre, radii; infinite for those
+        that lead away.
+        """
         across = np.hypot(seen[:, 0], seen[:, 1])
         return np.where(seen[:, 2] > 0, self.distance_radii * across / np.linalg.norm(seen, axis=1), np.inf)
 
     def radiance(self, directions: FloatArray) -> FloatArray:
-        """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0 beside it."""
+        """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0
+        beside it.
+        """
         rays = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         seen = rays @ self.to_sphere.T
         on = np.flatnonzero(self._impact(seen) < 1)
@@ -168,7 +200,9 @@ class Disc:
         return light
 
     def with_air(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The radiance (n,) of disc and air in ICRS directions (n, 3), and the share (n,) of what is behind that they hide."""
+        """The radiance (n,) of disc and air in ICRS directions (n, 3), and the share (n,) of
+        what is behind that they hide.
+        """
         covered = 1 - self.transmission(directions)
         light = self.radiance(directions)
         if self.air is None:
@@ -178,28 +212,34 @@ class Disc:
         return light, covered
 
     def air_light(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Electrons per second and steradian of the air beside the disc in ICRS directions (n, 3), and the share that it hides.
+        """Electrons per second and steradian of the air beside the disc in ICRS directions (n, 3),
+        and the share that it hides.
 
-        It is as bright as ground that a ray just touches on that side, by the share of light that it stops.
+        It is as bright as ground that a ray just touches on that side, by the share of light that
+        it stops.
         """
         height = np.maximum(self.impact(directions) - 1, 0.0) / (self.air_radii or 1.0)
         hidden = -np.expm1(-self.slant_depth * np.exp(-height))
         return self.touched_light(directions) * hidden, hidden
 
     def touched_light(self, directions: FloatArray) -> FloatArray:
-        """Electrons per second and steradian (n,) of ground that rays just touch, by the share of light that air stops there.
+        """Electrons per second and steradian (n,) of ground that rays just touch, by the share of
+        light that air stops there.
 
         The rays have the sides of ICRS directions (n, 3).
         """
         seen = directions @ self.to_sphere.T
-        side = seen[:, :2] / np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-30)[:, None]  # any at the middle
+        # any at the middle
+        side = seen[:, :2] / np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-30)[:, None]
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
         mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
         return np.asarray(self.normal_e_per_s_sr * mu0 / -np.expm1(-self.slant_depth))
 
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
-        """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the sphere's axes."""
+        """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the
+        sphere's axes.
+        """
         length = np.linalg.norm(place @ self.to_sphere, axis=1)
         mu0: FloatArray = np.maximum(0.0, place @ self.sun_sphere / length)
         mu: FloatArray = np.maximum(0.0, -np.einsum("ij,ij->i", place, seen) / length)
@@ -218,7 +258,8 @@ class Disc:
         return float(self.points(QUADRATURE)[1].sum())
 
     def points(self, nodes: int) -> tuple[FloatArray, FloatArray]:
-        """Directions (n, 3), ICRS axes, of places on the lit face, and the law's function times the steradian of each (n,).
+        """Directions (n, 3), ICRS axes, of places on the lit face, and the law's function times the
+        steradian of each (n,).
 
         `nodes` is their number along either axis of the face.
         """
@@ -233,9 +274,11 @@ class Disc:
         return true / distance[:, None], shaded * facing * area / distance**3
 
     def _lit_face(self, nodes: int) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 3) of the sphere that are seen and lit, and the area that each stands for (n,).
+        """Places (n, 3) of the sphere that are seen and lit, and the area that each stands for
+        (n,).
 
-        A place has a longitude from the observer's meridian towards the Sun, and a latitude from the plane of both.
+        A place has a longitude from the observer's meridian towards the Sun, and a latitude from
+        the plane of both.
         """
         node, weight = gauss_legendre(nodes)
         top = np.arccos(1 / self.distance_radii)
@@ -244,7 +287,8 @@ class Disc:
         reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
-            sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])  # Sun's longitude; +x is its side, -z the observer's
+            # Sun's longitude; +x is its side, -z the observer's
+            sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])
             first = np.clip(sun - np.pi / 2, -reach, reach)
         half = (reach - first) / 2
         longitude = first[:, None] + half[:, None] * (node + 1)
@@ -266,8 +310,9 @@ def lunar_share(phase_deg: float) -> float:
     return float(np.clip(np.polynomial.polynomial.polyval(phase_deg, LUNAR_SHARE), 0.0, 1.0))
 
 
-# Molecules alone: the scale height of the US Standard Atmosphere 1976 over its lowest 20 km (7.3 to 8.4 km), and the depth that
-# Bodhaine et al. 1999 (J. Atmos. Oceanic Technol. 16, 1854) have at 550 nm. Dust is lower than rays that get through.
+# Molecules alone: the scale height of the US Standard Atmosphere 1976 over its lowest 20 km (7.3 to
+# 8.4 km), and the depth that Bodhaine et al. 1999 (J. Atmos. Oceanic Technol. 16, 1854) have at 550
+# nm. Dust is lower than rays that get through.
 AIR = Air(scale_km=8.0, depth=0.097)
 LOWEST_KM = 1.0  # an orbit below the ground is seen from here
 AT_CENTRE_KM = 1000.0  # an observer so near the centre has no place of its own: no Earth is seen
@@ -280,10 +325,12 @@ def at_centre(place_km: FloatArray) -> bool:
 
 
 def apparent_cone(seen_km: FloatArray, velocity_km_s: FloatArray) -> tuple[FloatArray, float]:
-    """The unit vector (3,) to the middle of the Earth's disc as seen, and the distance, km, at which it is as wide.
+    """The unit vector (3,) to the middle of the Earth's disc as seen, and the distance, km, at
+    which it is as wide.
 
-    `seen_km` (3,) is the vector to its centre and the velocity (3,) that about it: the Earth's own drops out of light time and
-    aberration. Every direction of the limb is aberrated by itself, which keeps it a circle (Penrose 1959) about another middle.
+    `seen_km` (3,) is the vector to its centre and the velocity (3,) that about it: the Earth's own
+    drops out of light time and aberration. Every direction of the limb is aberrated by itself,
+    which keeps it a circle (Penrose 1959) about another middle.
     """
     distance_km = max(float(np.linalg.norm(seen_km)), EQUATOR_KM + LOWEST_KM)
     towards = seen_km / float(np.linalg.norm(seen_km))
@@ -295,7 +342,8 @@ def apparent_cone(seen_km: FloatArray, velocity_km_s: FloatArray) -> tuple[Float
 
 
 def earth_disc(seen_km: FloatArray, from_sun_km: FloatArray, velocity_km_s: FloatArray, v0_e_per_s: float) -> Disc:
-    """The Earth's disc: `seen_km` and `velocity_km_s` as of `apparent_cone`, and the vector (3,) from the Sun to the Earth.
+    """The Earth's disc: `seen_km` and `velocity_km_s` as of `apparent_cone`, and the vector (3,)
+    from the Sun to the Earth.
 
     A V of 0 gives `v0_e_per_s` electrons.
     """
@@ -333,7 +381,9 @@ def _normal(sun_km: float, phase_deg: float, v0_e_per_s: float) -> float:
 
 
 def pole(name: str) -> FloatArray:
-    """The unit vector (3,) of a body's north pole, ICRS axes; the ICRS's own of one that is round."""
+    """The unit vector (3,) of a body's north pole, ICRS axes; the ICRS's own of one that is
+    round.
+    """
     if name not in POLES_DEG:
         return NORTH
     return direction_of(*POLES_DEG[name])

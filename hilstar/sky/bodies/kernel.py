@@ -1,4 +1,5 @@
-"""Places of Sun, Moon and planets by JPL's ephemeris DE421 (Folkner et al. 2009), part of the extra `hilstar[bodies]`.
+"""Places of Sun, Moon and planets by JPL's ephemeris DE421 (Folkner et al. 2009), part of the extra
+`hilstar[bodies]`.
 
 Where the sky is seen from near the Earth: parallax, light bent by the Sun, aberration.
 """
@@ -24,8 +25,9 @@ TT_FROM_TAI_S = 32.184
 NS_PER_DAY = 86_400 * 10**9
 INSTALL = "pip install 'hilstar[bodies]'"
 
-# The kernel's chains of segments (centre, target). A planet is the centre of mass of its system, within 0.08 arcsec of the
-# planet's own: Jupiter's moons move Jupiter by 230 km, Saturn's Saturn by 300 km.
+# The kernel's chains of segments (centre, target). A planet is the centre of mass of its system,
+# within 0.08 arcsec of the planet's own: Jupiter's moons move Jupiter by 230 km, Saturn's Saturn by
+# 300 km.
 EARTH = ((0, 3), (3, 399))
 CHAINS: dict[str, tuple[tuple[int, int], ...]] = {
     "Earth": EARTH,  # from its own centre: no way at all
@@ -39,16 +41,20 @@ CHAINS: dict[str, tuple[tuple[int, int], ...]] = {
     "Uranus": ((0, 7),),
     "Neptune": ((0, 8),),
 }
-LIGHT_TIME_ROUNDS = 3  # each fixed-point round gains a factor of 1e4 (light's speed over the body's)
+# each fixed-point round gains a factor of 1e4 (light's speed over the body's)
+LIGHT_TIME_ROUNDS = 3
 SUN_MASSES = 1.0
 MAS_PER_DEG = 3_600_000.0
-# ERFA's own at 1 au (`ldsun`), 4 arcmin from the Sun's centre: within its disc the formula has no meaning.
+# ERFA's own at 1 au (`ldsun`), 4 arcmin from the Sun's centre: within its disc the formula has no
+# meaning.
 DEFLECTION_LIMIT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Tdb:
-    """A moment of barycentric dynamical time as a Julian date in two parts: the date is their sum."""
+    """A moment of barycentric dynamical time as a Julian date in two parts: the date is their
+    sum.
+    """
 
     whole: float
     part: float
@@ -59,18 +65,23 @@ class Tdb:
 
 
 def tdb_of_utc(utc_ns: int) -> Tdb:
-    """The moment of a UTC, ns since 1970 where every day has 86400 s, within 2 microseconds (ERFA's `dat` and `dtdb`)."""
+    """The moment of a UTC, ns since 1970 where every day has 86400 s, within 2 microseconds
+    (ERFA's `dat` and `dtdb`).
+    """
     days, rest_ns = divmod(utc_ns, NS_PER_DAY)
     whole, part = UNIX_JD + days, rest_ns / NS_PER_DAY
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # before 1960, and years after the last known leap second
+        # before 1960, and years after the last known leap second
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
         # Not `utctai`, whose day that ends with a leap second is stretched over 86401 s.
         tt_part = part + (float(erfa.dat(*erfa.jd2cal(whole, part))) + TT_FROM_TAI_S) / DAY_S
     return Tdb(whole, tt_part + float(erfa.dtdb(whole, tt_part, part, 0.0, 0.0, 0.0)) / DAY_S)
 
 
 class Kernel:
-    """The ephemeris on this machine. Raises MachineError where the extra is not installed; nothing is downloaded."""
+    """The ephemeris on this machine. Raises MachineError where the extra is not installed;
+    nothing is downloaded.
+    """
 
     def __init__(self) -> None:
         found = importlib.util.find_spec("skyfield_data")
@@ -81,7 +92,8 @@ class Kernel:
         spk = SPK.open(str(Path(found.origin).parent / "data" / "de421.bsp"))
         self._segments: dict[tuple[int, int], Any] = {link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain}
         for segment in self._segments.values():
-            segment.compute(segment.start_jd)  # maps its numbers into memory, where they stay when the file is closed
+            # maps its numbers into memory, where they stay when the file is closed
+            segment.compute(segment.start_jd)
         spk.daf.file.close()
         sun = self._segments[CHAINS["Sun"][0]]
         self.first_jd, self.last_jd = float(sun.start_jd), float(sun.end_jd)
@@ -96,7 +108,9 @@ class Kernel:
         return np.asarray(sum(p for p, _ in both).T), np.asarray(sum(v for _, v in both).T / DAY_S)
 
     def seen_km(self, name: str, whole: float, part: FloatArray, earth_km: FloatArray) -> FloatArray:
-        """Vectors (k, 3) from the Earth's centre to where a body was when the light that arrives now left it."""
+        """Vectors (k, 3) from the Earth's centre to where a body was when the light that arrives
+        now left it.
+        """
         light_days = np.zeros_like(part)
         for _ in range(LIGHT_TIME_ROUNDS):
             seen = self.places_km(CHAINS[name], whole, part - light_days) - earth_km
@@ -106,7 +120,9 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """An observer: place and velocity about the barycentre, km and km/s, and the vector from the Sun to it, km; ICRS axes."""
+    """An observer: place and velocity about the barycentre, km and km/s, and the vector from the
+    Sun to it, km; ICRS axes.
+    """
 
     place_km: FloatArray
     velocity_km_s: FloatArray
@@ -114,10 +130,11 @@ class Viewpoint:
 
 
 def apparent_bodies(seen_km: FloatArray, view: Viewpoint) -> FloatArray:
-    """Unit vectors (n, 3) of the Sun and other bodies at vectors `seen_km` (n, 3) from the observer, light time included.
+    """Unit vectors (n, 3) of the Sun and other bodies at vectors `seen_km` (n, 3) from the
+    observer, light time included.
 
-    The Sun bends the light of the others: Klioner 2003, AJ 125, 1580, by ERFA's `ld`. The bending by planets, 0.02 arcsec
-    beside Jupiter's limb, is left out.
+    The Sun bends the light of the others: Klioner 2003, AJ 125, 1580, by ERFA's `ld`. The bending
+    by planets, 0.02 arcsec beside Jupiter's limb, is left out.
     """
     directions = _unit(seen_km)
     distance_km = float(np.linalg.norm(view.from_sun_km))
@@ -128,7 +145,9 @@ def apparent_bodies(seen_km: FloatArray, view: Viewpoint) -> FloatArray:
 
 
 def apparent_stars(directions: FloatArray, parallax_mas: FloatArray, view: Viewpoint) -> FloatArray:
-    """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre; a parallax of NaN or below 0 counts as 0."""
+    """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre; a parallax of NaN
+    or below 0 counts as 0.
+    """
     shift_rad = np.radians(np.fmax(parallax_mas, 0.0) / MAS_PER_DEG)
     directions = _unit(directions - shift_rad[:, None] * (view.place_km / KM_PER_AU))
     distance_km = float(np.linalg.norm(view.from_sun_km))

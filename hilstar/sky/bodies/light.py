@@ -1,22 +1,30 @@
-"""V magnitudes of Sun, Moon, Earth and planets, by distances and phase, for an observer near the Earth.
+"""V magnitudes of Sun, Moon, Earth and planets, by distances and phase, for an observer near the
+Earth.
 
-Planets: Mallama and Hilton 2018 (Astron. Comput. 25, 10; arXiv:1808.01973), equations 2, 3, 4, 6, 8, 10, 14 and 16. Of Mars the
-terms of longitude and season are left out: 0.035 mag rms, 0.06 at most. Saturn is globe and rings.
+Planets: Mallama and Hilton 2018 (Astron. Comput. 25, 10; arXiv:1808.01973), equations 2, 3, 4, 6,
+8, 10, 14 and 16. Of Mars the terms of longitude and season are left out: 0.035 mag rms, 0.06 at
+most. Saturn is globe and rings.
 
-Moon: -12.73 + 0.026 phase + 4e-9 phase^4 at its mean distance (Allen 1973; Krisciunas and Schaefer 1991, PASP 103, 1033,
-eq. 9). The ROLO model (Kieffer and Stone 2005) is within 0.08 mag of it from 6 to 97 degrees and 0.16 mag brighter at 2: the
-opposition surge is left out. Beyond 150 degrees as the cube of the angle left to 180 (Russell 1916, ApJ 43, 103), without
-earthshine; Allen's table is within 0.1 mag of both up to 150 degrees, and 0.25 fainter at 160.
+Moon: -12.73 + 0.026 phase + 4e-9 phase^4 at its mean distance (Allen 1973; Krisciunas and Schaefer
+1991, PASP 103, 1033,
+eq. 9). The ROLO model (Kieffer and Stone 2005) is within 0.08 mag of it from 6 to 97 degrees and
+0.16 mag brighter at 2: the opposition surge is left out. Beyond 150 degrees as the cube of the
+angle left to 180 (Russell 1916, ApJ 43, 103), without earthshine; Allen's table is within 0.1 mag
+of both up to 150 degrees, and 0.25 fainter at 160.
 
-Earth: Mallama and Hilton's curve, which was made for the whole globe from afar and is held to 170 degrees.
+Earth: Mallama and Hilton's curve, which was made for the whole globe from afar and is held to 170
+degrees.
 
-Electron rates of bodies: sunlight times their albedo, through the tracker's curves as a star's spectrum is.
+Electron rates of bodies: sunlight times their albedo, through the tracker's curves as a star's
+spectrum is.
 
-Planets: geometric albedos of Mallama, Krobusek and Pavlov 2017 (Icarus 282, 19; table 7): Johnson-Cousins U, B, V, Rc, Ic and
-Sloan z'. The paper's Sloan albedos u' to z' alone, measured apart, give rates within 0.05 mag; a star of the same B-V would be
-0.2 mag off for Jupiter and 0.5 for Uranus, whose methane takes the red. The Moon: the ROLO model's reflectance at 45 degrees of
-phase (Kieffer and Stone 2005, AJ 129, 2887, table 4); at 10 and 90 degrees its rate at equal V is within 4 %. Straight lines
-between the bands, constant beyond them. Sunlight: G2V of the library.
+Planets: geometric albedos of Mallama, Krobusek and Pavlov 2017 (Icarus 282, 19; table 7):
+Johnson-Cousins U, B, V, Rc, Ic and Sloan z'. The paper's Sloan albedos u' to z' alone, measured
+apart, give rates within 0.05 mag; a star of the same B-V would be
+0.2 mag off for Jupiter and 0.5 for Uranus, whose methane takes the red. The Moon: the ROLO model's
+reflectance at 45 degrees of phase (Kieffer and Stone 2005, AJ 129, 2887, table 4); at 10 and 90
+degrees its rate at equal V is within 4 %. Straight lines between the bands, constant beyond them.
+Sunlight: G2V of the library.
 """
 
 import numpy as np
@@ -32,7 +40,8 @@ KM_PER_AU = 149_597_870.7
 SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47
 SUN_BV_MAG = 0.653  # the same source
 
-MERCURY = (-0.613, 6.3280e-02, -1.6336e-03, 3.3644e-05, -3.4265e-07, 1.6893e-09, -3.0334e-12)  # eq. 2
+# eq. 2
+MERCURY = (-0.613, 6.3280e-02, -1.6336e-03, 3.3644e-05, -3.4265e-07, 1.6893e-09, -3.0334e-12)
 VENUS = (-4.384, -1.044e-03, 3.687e-04, -2.814e-06, 8.938e-09)  # eq. 3
 VENUS_CRESCENT = (236.05828, -2.81914, 8.39034e-03)  # eq. 4
 VENUS_CRESCENT_DEG = 163.7
@@ -46,13 +55,16 @@ EARTH_TERMS = (-3.99, -1.060e-3, 2.054e-4)  # eq. 5
 EARTH_CURVE_DEG = 170.0
 FULL_MOON_V_MAG, MOON_PER_DEG, MOON_PER_DEG4 = -12.73, 0.026, 4e-9
 MOON_DISTANCE_KM = 384_400.0
-MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3  # nearer to new moon than 0.3 deg the magnitude is that at 0.3
+# nearer to new moon than 0.3 deg the magnitude is that at 0.3
+MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3
 SUNLIGHT = "G2V"
-BANDS_NM = (366.0, 438.0, 545.0, 641.0, 798.0, 913.0)  # U B V Rc Ic (Bessell 1998, table A2) and z' (Fukugita et al. 1996)
+# U B V Rc Ic (Bessell 1998, table A2) and z' (Fukugita et al. 1996)
+BANDS_NM = (366.0, 438.0, 545.0, 641.0, 798.0, 913.0)
 ALBEDOS: dict[str, tuple[float, ...]] = {
     "Mercury": (0.087, 0.105, 0.142, 0.158, 0.180, 0.237),
     "Venus": (0.348, 0.658, 0.689, 0.658, 0.640, 0.630),
-    "Earth": (0.60, 0.512, 0.434, 0.392, 0.396, 0.40),  # from memory, without a source at hand; U and z' are estimates
+    # from memory, without a source at hand; U and z' are estimates
+    "Earth": (0.60, 0.512, 0.434, 0.392, 0.396, 0.40),
     "Mars": (0.060, 0.088, 0.170, 0.250, 0.285, 0.325),
     "Jupiter": (0.358, 0.443, 0.538, 0.513, 0.389, 0.348),
     "Saturn": (0.203, 0.339, 0.499, 0.646, 0.543, 0.450),
@@ -65,7 +77,9 @@ B_NM, V_NM = 438.0, 545.0
 
 
 def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float) -> float:
-    """V of a body by the vectors (3,) to it from the Sun and from the observer, ICRS axes; the Sun's by the second alone."""
+    """V of a body by the vectors (3,) to it from the Sun and from the observer, ICRS axes; the
+    Sun's by the second alone.
+    """
     distance_au = float(np.linalg.norm(observer_to_body_km)) / KM_PER_AU
     if name == "Sun":
         return SUN_V_MAG + 5 * float(np.log10(distance_au))
@@ -75,7 +89,8 @@ def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: Float
         return moon_v_mag(sun_au, distance_au * KM_PER_AU, phase_deg)
     if name in _POLES:
         sun_deg, observer_deg = (latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km))
-    if name == "Saturn":  # globe and rings (eq. 10); rings that are lit from the other side do not count
+    # globe and rings (eq. 10); rings that are lit from the other side do not count
+    if name == "Saturn":
         sine = float(np.sin(np.radians(np.sqrt(max(0.0, sun_deg * observer_deg)))))
         mag = -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
     elif name == "Uranus":
@@ -117,7 +132,9 @@ _POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URAN
 def bodies_electrons_per_s(
     names: tuple[str, ...], model: electrons.BrightnessModel, optics: electrons.Optics, photometry: electrons.Photometry
 ) -> FloatArray:
-    """Electron rates of bodies of V = 0, shape (n,). Raises InputError as `tabulate_pickles` does."""
+    """Electron rates of bodies of V = 0, shape (n,). Raises InputError as `tabulate_pickles`
+    does.
+    """
     if model == "ags":
         return np.full(len(names), electrons.ags_electrons_per_s(optics, photometry))
     return electrons.library_electrons_per_s(reflected(names), optics, photometry)

@@ -1,8 +1,10 @@
-"""The part of a bench's sky that moves: bodies, and with the observer's velocity the aberration of all stars.
+"""The part of a bench's sky that moves: bodies, and with the observer's velocity the aberration of
+all stars.
 
-What is costly is computed seldom: places by the ephemeris once in three hours, with cubics between them; apparent places and
-magnitudes at steps of the observer's orbit, the places with straight lines between them. All of it depends on the time alone,
-so a replay draws the same light. For an observer whose place comes with each frame it is all computed with each frame.
+What is costly is computed seldom: places by the ephemeris once in three hours, with cubics between
+them; apparent places and magnitudes at steps of the observer's orbit, the places with straight
+lines between them. All of it depends on the time alone, so a replay draws the same light. For an
+observer whose place comes with each frame it is all computed with each frame.
 """
 
 import logging
@@ -40,13 +42,14 @@ from hilstar.sky.stars import Stars, aberrate, with_bodies
 log = logging.getLogger(__name__)
 
 PLANETS = ("Mercury", "Venus", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
-# The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
+# The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through
+# them are within 0.1 mas.
 SPAN_S = 3 * 3600
 SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
 YEAR_NS = 31_557_600 * NS_PER_S
 EDGE_DAYS = 1.0  # light time, and the cubics
-# A change of velocity that is left out, as aberrating all stars in view anew takes as long as their projection: 0.02 arcsec,
-# which the Earth takes an hour and a half to reach.
+# A change of velocity that is left out, as aberrating all stars in view anew takes as long as their
+# projection: 0.02 arcsec, which the Earth takes an hour and a half to reach.
 UNSEEN_KM_S = 0.03
 EXPONENTS = np.arange(4)
 CUBIC_AT = np.linspace(0.0, 1.0, 4)
@@ -56,7 +59,9 @@ J2000_JD, YEAR_DAYS = 2_451_545.0, 365.25
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Cubics over SPAN_S, coefficients first: vectors (4, n, 3) to bodies as seen from the Earth, its place and velocity."""
+    """Cubics over SPAN_S, coefficients first: vectors (4, n, 3) to bodies as seen from the
+    Earth, its place and velocity.
+    """
 
     seen_km: FloatArray
     earth_km: FloatArray
@@ -65,7 +70,9 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class SkyMoment:
-    """A time since the start, and the observer's state about the Earth, km and km/s, where it comes with the frame."""
+    """A time since the start, and the observer's state about the Earth, km and km/s, where it
+    comes with the frame.
+    """
 
     since_ns: int
     state: tuple[float, float, float, float, float, float] | None = None
@@ -76,9 +83,11 @@ START = SkyMoment(0)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The bodies as an observer sees them at a moment: vectors (n, 3), km, its viewpoint, and unit vectors.
+    """The bodies as an observer sees them at a moment: vectors (n, 3), km, its viewpoint, and unit
+    vectors.
 
-    An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the observer's about its centre.
+    An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the
+    observer's about its centre.
     """
 
     seen_km: FloatArray
@@ -92,7 +101,8 @@ class Sight:
 class BodyLight:
     """Bodies by name, their B-V (n,) and their electron rates at V = 0 (n,).
 
-    `colours` (n, channels) and those of `sunlight` (channels,) are shares of electrons, as in `Stars`.
+    `colours` (n, channels) and those of `sunlight` (channels,) are shares of electrons, as in
+    `Stars`.
     """
 
     names: tuple[str, ...]
@@ -106,10 +116,11 @@ NOTHING = BodyLight((), np.empty(0), np.empty(0))
 
 
 class MovingSky:
-    """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`, and stars are placed for t_ns = `start_ns`.
+    """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`, and stars are placed for t_ns =
+    `start_ns`.
 
-    Times that its methods call `since_ns` count from `start_ns`. Where t_ns is `unix` time, every UTC day has 86400 s of it,
-    leap seconds or not, and `start_ns` is the beginning of one.
+    Times that its methods call `since_ns` count from `start_ns`. Where t_ns is `unix` time, every
+    UTC day has 86400 s of it, leap seconds or not, and `start_ns` is the beginning of one.
 
     Raises InputError where the ephemeris ends before that date, or the orbit does.
     """
@@ -138,11 +149,14 @@ class MovingSky:
         self._fixed_km_s = self._seen_from(START).view.velocity_km_s
 
     def stars_seen(self, directions: FloatArray, parallax_mas: FloatArray) -> FloatArray:
-        """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are seen at the start."""
+        """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are
+        seen at the start.
+        """
         return apparent_stars(directions, parallax_mas, self._seen_from(START).view)
 
     def among(self, stars: Stars) -> Stars:
-        """The stars with the bodies among them at the start, in arrays of their own, which `seen` changes.
+        """The stars with the bodies among them at the start, in arrays of their own, which `seen`
+        changes.
 
         Satellites have places in the arrays, which whoever draws them fills (see `passing`).
         """
@@ -156,9 +170,11 @@ class MovingSky:
     def seen(
         self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None, place_km: FloatArray | None = None
     ) -> Stars:
-        """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved there, in the arrays.
+        """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved
+        there, in the arrays.
 
-        A velocity (3,), ICRS, adds to that of this sky's observer, and a place (3,), from the Earth's centre, to its place.
+        A velocity (3,), ICRS, adds to that of this sky's observer, and a place (3,), from the
+        Earth's centre, to its place.
         """
         moment = self._moment(t_ns, velocity_km_s, place_km)
         now = self._at(moment)
@@ -167,7 +183,8 @@ class MovingSky:
         if count:
             vectors = now[:count, :3].copy()
             if self._earth is not None and velocity is not None:
-                vectors[[self._earth]] = aberrate(vectors[[self._earth]], -velocity)  # its aberration is its own
+                # its aberration is its own
+                vectors[[self._earth]] = aberrate(vectors[[self._earth]], -velocity)
             stars.vectors[-count:] = vectors
             stars.grid.centre[-count:] = vectors
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
@@ -183,7 +200,9 @@ class MovingSky:
         return self._utc_ns + self._within(t_ns)
 
     def passing(self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None) -> Pass | None:
-        """The satellites that can be in a cone at a moment; None for none; the observer's velocity and place as in `seen`."""
+        """The satellites that can be in a cone at a moment; None for none; the observer's
+        velocity and place as in `seen`.
+        """
         if self.satellites is None:
             return None
         since_ns = self._within(t_ns)
@@ -211,9 +230,11 @@ class MovingSky:
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
     ) -> list[Disc]:
-        """The bodies wider than that, any part of which is within `reach_rad` of `axis` (3,), nearest first; else as `seen`.
+        """The bodies wider than that, any part of which is within `reach_rad` of `axis` (3,),
+        nearest first; else as `seen`.
 
-        Places and sizes are the moment's, light and the Sun's direction those of the last step of the orbit.
+        Places and sizes are the moment's, light and the Sun's direction those of the last step of
+        the orbit.
         """
         if not self.names:
             return []
@@ -242,7 +263,9 @@ class MovingSky:
         return self._at(self._moment(t_ns, velocity_km_s, place_km))[:-1, 3]
 
     def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> SkyMoment:
-        """A time since the start, held within the ephemeris, with the observer's state about the Earth where it is given."""
+        """A time since the start, held within the ephemeris, with the observer's state about the
+        Earth where it is given.
+        """
         since_ns = self._within(t_ns)
         if place_km is None:
             return SkyMoment(since_ns)
@@ -251,7 +274,9 @@ class MovingSky:
         return SkyMoment(since_ns, (x, y, z, u, v, w))
 
     def _step(self, moment: SkyMoment) -> SkyMoment:
-        """The last step of the orbit; where the observer's state comes with the frame, the moment itself."""
+        """The last step of the orbit; where the observer's state comes with the frame, the
+        moment itself.
+        """
         return SkyMoment(moment.since_ns // self._step_ns * self._step_ns) if moment.state is None else moment
 
     def _at(self, moment: SkyMoment) -> FloatArray:
@@ -264,7 +289,9 @@ class MovingSky:
         return node + (self._node(SkyMoment(first.since_ns + self._step_ns)) - node) * share
 
     def sight(self, since_ns: int) -> Sight:
-        """The bodies at a moment, aberrated by the observer's velocity at the start; the Sun first."""
+        """The bodies at a moment, aberrated by the observer's velocity at the start; the Sun
+        first.
+        """
         return self._sight(SkyMoment(since_ns))
 
     def _sight(self, moment: SkyMoment) -> Sight:
@@ -283,7 +310,8 @@ class MovingSky:
         if moment.state is not None:
             place_km, about_km_s = np.array(moment.state[:3]), np.array(moment.state[3:])
         seen_km = from_earth_km - place_km
-        # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a low orbit, 700 m of the Moon
+        # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a
+        # low orbit, 700 m of the Moon
         later_s = (np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)) / LIGHT_KM_S
         seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
         if EARTH in self._tracked and at_centre(place_km):
@@ -309,7 +337,8 @@ class MovingSky:
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
     def _compute_node(self, moment: SkyMoment) -> FloatArray:
-        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the observer's velocity.
+        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the
+        observer's velocity.
 
         The Earth's is its disc's middle as it is seen, all aberration included.
         """
@@ -371,7 +400,9 @@ class MovingSky:
         return 2000.0 + (date.whole - J2000_JD + date.part) / YEAR_DAYS
 
     def _limits(self) -> tuple[int, int]:
-        """The first and the last time since the start in the ephemeris. Raises InputError where the start is beyond it."""
+        """The first and the last time since the start in the ephemeris. Raises InputError where
+        the start is beyond it.
+        """
         first, last = self._kernel.first_jd + EDGE_DAYS, self._kernel.last_jd - EDGE_DAYS
         limits = tuple(round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S) for jd in (first, last))
         if not limits[0] <= 0 <= limits[1]:
@@ -380,7 +411,9 @@ class MovingSky:
         return limits[0], limits[1]
 
     def _within(self, t_ns: int | None) -> int:
-        """A time since the start, held within the ephemeris; a far one is told once, as it is most likely meant otherwise."""
+        """A time since the start, held within the ephemeris; a far one is told once, as it is
+        most likely meant otherwise.
+        """
         since_ns = 0 if t_ns is None else t_ns - self._start_ns
         if abs(since_ns) > YEAR_NS and not self._told:
             self._told = True
@@ -394,7 +427,9 @@ class MovingSky:
 
 
 def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:
-    """The observer's velocity (3,) by which directions of the start are aberrated; None where that is not seen."""
+    """The observer's velocity (3,) by which directions of the start are aberrated; None where
+    that is not seen.
+    """
     change = now[-1, :3]
     if velocity_km_s is not None:
         return np.asarray(change + velocity_km_s)
@@ -402,7 +437,9 @@ def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatAr
 
 
 def _through(air: SiteAir, discs: list[Disc], utc_ns: int) -> list[Disc]:
-    """Discs as the air shows them, those below the horizon left out; how it flattens them is left out too."""
+    """Discs as the air shows them, those below the horizon left out; how it flattens them is
+    left out too.
+    """
     above, seen = air.above(utc_ns), []
     for disc in discs:
         altitude_rad = above.altitude_rad(disc.direction[None])

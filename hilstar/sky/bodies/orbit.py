@@ -4,8 +4,9 @@ SGP4 is that of Vallado et al. 2006, AIAA 2006-6753.
 
 A spacecraft's orbit by a CCSDS Orbit Ephemeris Message, 1.0 to 3.0 (CCSDS 502.0-B), in KVN.
 
-Its frame is ICRF, GCRF or EME2000 about the Earth; lines of a segment are joined by the Hermite polynomial through the four
-epochs about a time, places and velocities, whatever the message recommends. Accelerations and covariances are not used.
+Its frame is ICRF, GCRF or EME2000 about the Earth; lines of a segment are joined by the Hermite
+polynomial through the four epochs about a time, places and velocities, whatever the message
+recommends. Accelerations and covariances are not used.
 """
 
 import importlib.util
@@ -35,15 +36,18 @@ log = logging.getLogger(__name__)
 VERSION_KEY = "CCSDS_OEM_VERS"
 OEM_ADVICE = "write an OEM in KVN about the Earth in ICRF, GCRF or EME2000"
 FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
-TAI_TO_SCALE_S = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184, "TDB": 32.184}  # TDB is within 2 ms, or 15 m, of TT
+# TDB is within 2 ms, or 15 m, of TT
+TAI_TO_SCALE_S = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184, "TDB": 32.184}
 EPOCH = re.compile(r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))T(\d\d):(\d\d):(\d\d(?:\.\d+)?)Z?", re.ASCII)
 YEARS, DAYS_OF_YEAR = range(1900, 2200), range(1, 367)
 NODES = 4  # 1e-6 km of a low orbit at four minutes
-MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3  # to beyond the Lagrange points; a state in metres is outside one of them
+# to beyond the Lagrange points; a state in metres is outside one of them
+MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3
 FAR_KM = 1.0  # half an arcsecond of the Moon
 TRIED = 50
 DAY_NS = 86_400 * NS_PER_S
-UNSEEN_NS = 120 * NS_PER_S  # magnitudes are those of a minute's beginning, places those of two steps
+# magnitudes are those of a minute's beginning, places those of two steps
+UNSEEN_NS = 120 * NS_PER_S
 COUNTS = {7, 10}  # an epoch, place and velocity, perhaps an acceleration
 
 
@@ -55,7 +59,9 @@ class Orbit(Protocol):
         """Straight lines over this time keep the apparent places of bodies within 5 mas."""
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place (3,), km, and velocity (3,), km/s, ICRS axes, at a UTC, ns since 1970. Raises InputError where it ends."""
+        """Place (3,), km, and velocity (3,), km/s, ICRS axes, at a UTC, ns since 1970. Raises
+        InputError where it ends.
+        """
 
 
 class Geocentre:
@@ -70,7 +76,9 @@ class Geocentre:
 
 
 class TleOrbit:
-    """A satellite on the elements in the text of a file `name`. Raises InputError for wrong ones, MachineError without SGP4."""
+    """A satellite on the elements in the text of a file `name`. Raises InputError for wrong
+    ones, MachineError without SGP4.
+    """
 
     # From 400 km the Moon's parallax bends its path by 5e-3 arcsec/s^2: 2.5 mas off in the middle.
     step_s = 2.0
@@ -118,7 +126,9 @@ def _checked(name: str, text: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=8)
 def icrs_from_teme(hour: int) -> FloatArray:
-    """The rotation (3, 3) at an hour since 1970 (UTC): equation of the equinoxes, then nutation and precession (IAU 2006)."""
+    """The rotation (3, 3) at an hour since 1970 (UTC): equation of the equinoxes, then nutation
+    and precession (IAU 2006).
+    """
     date: Tdb = tdb_of_utc(hour * TURN_NS)
     cosine, sine = (f(erfa.ee06a(date.whole, date.part)) for f in (np.cos, np.sin))
     teme_to_true = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -127,7 +137,9 @@ def icrs_from_teme(hour: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """One segment: its time scale, epochs (n,), ns since 1970 of that scale, and states (n, 6), km and km/s, ICRS axes."""
+    """One segment: its time scale, epochs (n,), ns since 1970 of that scale, and states (n, 6),
+    km and km/s, ICRS axes.
+    """
 
     scale: str
     t_ns: npt.NDArray[np.int64]
@@ -137,8 +149,9 @@ class Segment:
 class OemOrbit:
     """The orbit in the text of a file `name`.
 
-    Raises InputError for a text that is none, or that has no epoch within a day of a UTC, ns since 1970, at which stars are
-    placed. Where that is only the beginning of the `day` of what is shown, the file need not cover it.
+    Raises InputError for a text that is none, or that has no epoch within a day of a UTC, ns since
+    1970, at which stars are placed. Where that is only the beginning of the `day` of what is shown,
+    the file need not cover it.
     """
 
     step_s = 2.0  # as for a `TleOrbit`
@@ -157,7 +170,9 @@ class OemOrbit:
             log.warning("%s: between its epochs the orbit is off by some %.2g km; %s", name, off_km, advice)
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest epoch, which is told once."""
+        """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest
+        epoch, which is told once.
+        """
         found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
         if not self._told and _away_ns(found, utc_ns) > 0 and abs(utc_ns - self._stars_ns) > self._unseen_ns:
             log.warning("%s: has no orbit at %s UTC; that of its nearest epoch is held", self._name, _date(utc_ns))
@@ -186,7 +201,9 @@ def _at(times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int) -> tuple
 
 
 def _off_km(segment: Segment) -> float:
-    """How far the polynomial is off between epochs, km, by what it is at epochs that are held out, where steps are longer."""
+    """How far the polynomial is off between epochs, km, by what it is at epochs that are held
+    out, where steps are longer.
+    """
     inner = np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int)) if len(segment.t_ns) > 2 else ()
     worst_km, order = 0.0, 2 * min(NODES, len(segment.t_ns) - 1)
     for k in inner:
@@ -274,7 +291,8 @@ def _time(scale: str, utc_ns: int) -> int:
         return utc_ns
     year, month, day = (int(part) for part in _date(utc_ns)[:10].split("-"))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # before 1960, and years after the last known leap second
+        # before 1960, and years after the last known leap second
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
         leap_s = float(erfa.dat(year, month, day, 0.0))
     return utc_ns + round((leap_s + TAI_TO_SCALE_S[scale]) * NS_PER_S)
 

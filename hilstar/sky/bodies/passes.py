@@ -1,4 +1,6 @@
-"""Satellites that can be in view at a moment: their directions and their light at any time about it."""
+"""Satellites that can be in view at a moment: their directions and their light at any time about
+it.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -31,7 +33,8 @@ EARTH_GM_KM3_S2 = 398_600.4418  # IERS Conventions 2010
 FASTEST_KM_S = 11.2  # escape speed: whatever stays about the Earth is slower
 OWN_KM = 5.0  # what is nearer is taken for the observer itself; elements are off by 1 to 3 km a day
 OLD_DAYS = 14.0
-# Those that can come near the axis within this time, or before it turns by this angle, are looked for at once: 1 ms for 20 000.
+# Those that can come near the axis within this time, or before it turns by this angle, are looked
+# for at once: 1 ms for 20 000.
 WATCH_S, WATCH_RAD = 3.0, np.radians(3.0)
 COS_WATCH = np.cos(WATCH_RAD)
 HIDDEN_KM = 1.0  # in 3 s an arc is 40 m off a straight line
@@ -43,7 +46,9 @@ SHIFT_RAD = 4e-4  # aberration of what the Earth's motion shifts, and light time
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """Vectors (3,), ICRS axes: from the Earth to the Sun, km, and the Earth's velocity about the barycentre, km/s."""
+    """Vectors (3,), ICRS axes: from the Earth to the Sun, km, and the Earth's velocity about the
+    barycentre, km/s.
+    """
 
     sun_km: FloatArray
     earth_km_s: FloatArray
@@ -51,9 +56,11 @@ class Circumstances:
 
 @dataclass(frozen=True, slots=True)
 class SkyAt:
-    """A moment of the sky: its UTC, the circumstances (computed on demand), and the velocity that aberrates its bodies.
+    """A moment of the sky: its UTC, the circumstances (computed on demand), and the velocity that
+    aberrates its bodies.
 
-    `place_km` and `velocity_km_s` (3,) are the observer's about the Earth where the orbit does not say it, else None.
+    `place_km` and `velocity_km_s` (3,) are the observer's about the Earth where the orbit does not
+    say it, else None.
     """
 
     utc_ns: int
@@ -65,7 +72,9 @@ class SkyAt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cone:
-    """A search for satellites of at least `faintest_e_per_s` within `radius_rad` of `axis` (3,), within `half_s` of a time."""
+    """A search for satellites of at least `faintest_e_per_s` within `radius_rad` of `axis` (3,),
+    within `half_s` of a time.
+    """
 
     axis: FloatArray
     radius_rad: float
@@ -75,11 +84,12 @@ class Cone:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """Satellites that can be in view: `index` (n,), their places in the list; seconds of its methods count from its moment.
+    """Satellites that can be in view: `index` (n,), their places in the list; seconds of its
+    methods count from its moment.
 
-    Cubics in time, coefficients first (4, n, 3): `seen_km` from the observer to where each sent what arrives, `place_km` that
-    about the Earth, and `observer_km` (4, 3). `since_s` is the moment after `epoch_utc`, `fixed_km_s` (3,) the observer's
-    velocity at the start of the sky.
+    Cubics in time, coefficients first (4, n, 3): `seen_km` from the observer to where each sent
+    what arrives, `place_km` that about the Earth, and `observer_km` (4, 3). `since_s` is the moment
+    after `epoch_utc`, `fixed_km_s` (3,) the observer's velocity at the start of the sky.
     """
 
     index: IntArray
@@ -99,7 +109,9 @@ class Pass:
         return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
 
     def through(self, air: SiteAir, utc_ns: int) -> Self:
-        """The same through the air at a UTC: bent, and with the light that comes through, none below the horizon."""
+        """The same through the air at a UTC: bent, and with the light that comes through, none
+        below the horizon.
+        """
         range_km = np.linalg.norm(self.seen_km[0], axis=1)[:, None]
         towards, above, seen_km = self.seen_km[0] / range_km, air.above(utc_ns), self.seen_km.copy()
         seen_km[0] = above.bent(towards) * range_km
@@ -108,7 +120,8 @@ class Pass:
         return replace(self, seen_km=seen_km, brightness=replace(self.brightness, standard_e_per_s=standard))
 
     def directions(self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None) -> FloatArray:
-        """Unit vectors (k, 3), ICRS, of satellites at places `which` (k,), aberrated as bodies are by `fixed_km_s`.
+        """Unit vectors (k, 3), ICRS, of satellites at places `which` (k,), aberrated as bodies are
+        by `fixed_km_s`.
 
         A velocity (3,) adds to that, within 1 mas.
         """
@@ -117,7 +130,9 @@ class Pass:
         return aberrate(seen / np.sqrt(np.einsum("ij,ij->i", seen, seen))[:, None], velocity)
 
     def vectors_km(self, seconds: FloatArray) -> FloatArray:
-        """From the observer to where each (n, 3) sent what arrives then, each at its own of `seconds` (n,)."""
+        """From the observer to where each (n, 3) sent what arrives then, each at its own of
+        `seconds` (n,).
+        """
         return _at(self.seen_km, seconds[:, None])
 
     def speeds_rad_s(self) -> FloatArray:
@@ -127,7 +142,9 @@ class Pass:
         return np.asarray(speed / distance)
 
     def rates_e_per_s(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """Mean electron rates (k,) between two times: by their middle's place, and in closed form what varies by itself."""
+        """Mean electron rates (k,) between two times: by their middle's place, and in closed
+        form what varies by itself.
+        """
         middle_s, listed = ((begin_s + end_s) / 2)[:, None], self.index[which]
         place = _at(self.place_km[:, which], middle_s)
         share = reflected_share(_at(self.seen_km[:, which], middle_s), place, self.now.sun_km)
@@ -141,9 +158,11 @@ def _at(cubic: FloatArray, s: FloatArray | np.float64) -> FloatArray:
 
 
 class Satellites:
-    """A list of satellites seen from an orbit; t_ns = 0 is the UTC `zero_ns`, sunlight of V = 0 gives `v0_e_per_s`.
+    """A list of satellites seen from an orbit; t_ns = 0 is the UTC `zero_ns`, sunlight of V = 0
+    gives `v0_e_per_s`.
 
-    The observer's own, by catalogue number where the orbit has one, is left out, and what is within OWN_KM of it at a moment.
+    The observer's own, by catalogue number where the orbit has one, is left out, and what is within
+    OWN_KM of it at a moment.
     """
 
     def __init__(
@@ -215,7 +234,8 @@ class Satellites:
         found = np.flatnonzero(near)
         brightest = self._brightest(found, seen[found], range_km[found], reach_km, sky.now())
         found = found[brightest >= cone.faintest_e_per_s]
-        # What is in the shadow, or well behind the Earth, at both ends of an arc that is nearly straight is so between them.
+        # What is in the shadow, or well behind the Earth, at both ends of an arc that is nearly
+        # straight is so between them.
         lit, sun_km = np.zeros(len(found)), sky.now().sun_km
         for seconds in np.array([-half_s, half_s]):
             place = self._swarm.places_km(found, sky.utc_ns, seconds)
@@ -225,7 +245,9 @@ class Satellites:
     def _brightest(
         self, which: IntArray, seen_km: FloatArray, range_km: FloatArray, reach_km: float, now: Circumstances
     ) -> FloatArray:
-        """The most that each of these (n,) can send while it moves by `reach_km`: outside the shadow, and in a flash."""
+        """The most that each of these (n,) can send while it moves by `reach_km`: outside the
+        shadow, and in a flash.
+        """
         range_km = np.maximum(range_km, OWN_KM)
         closest_km = np.maximum(range_km - reach_km, OWN_KM)
         to_sun = now.sun_km / np.linalg.norm(now.sun_km)
@@ -234,13 +256,17 @@ class Satellites:
         return np.asarray(self.brightness.standard_e_per_s[which] * self.brightness.most(which) * share)
 
     def write(self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray) -> None:
-        """Put satellites (k,) into the arrays of stars that were made with this list: unit vectors (k, 3) and rates (k,)."""
+        """Put satellites (k,) into the arrays of stars that were made with this list: unit
+        vectors (k, 3) and rates (k,).
+        """
         place = len(stars) - len(stars.bodies) + index
         stars.vectors[place], stars.electrons_per_s[place] = vectors, electrons_per_s
         stars.v_mag[place] = magnitude(electrons_per_s / self._v0_e_per_s)
 
     def place(self, utc_ns: int) -> int:
-        """Prepare the places for a UTC and return how many satellites have one; log the others once, in one line."""
+        """Prepare the places for a UTC and return how many satellites have one; log the others
+        once, in one line.
+        """
         if self._swarm.move_to(utc_ns):
             self.warn_of_age(utc_ns)
             self._lost = int(np.count_nonzero(self._swarm.error))
@@ -293,7 +319,9 @@ class Satellites:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Watch:
-    """The satellites that can be in a cone, or in one near it, within WATCH_S of a moment; of the observer's path then."""
+    """The satellites that can be in a cone, or in one near it, within WATCH_S of a moment; of
+    the observer's path then.
+    """
 
     cone: Cone
     utc_ns: int
@@ -318,14 +346,18 @@ def _reach_km(observer: FloatArray, half_s: float) -> float:
 
 
 def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float) -> BoolArray:
-    """Whether vectors (n,), by their parts along an axis and their lengths, can come within an angle of it by moving so far."""
+    """Whether vectors (n,), by their parts along an axis and their lengths, can come within an
+    angle of it by moving so far.
+    """
     moved = np.arcsin(np.minimum(1.0, reach_km / np.maximum(range_km, reach_km + OWN_KM)))
     limit = np.cos(np.minimum(np.pi, radius_rad + moved))
     return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
 
 
 def _light_cubics(place_km: FloatArray, observer_km: FloatArray, earth_km_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cubics (4, n, 3) of where satellites sent what arrives, about the Earth and from the observer, by their places."""
+    """Cubics (4, n, 3) of where satellites sent what arrives, about the Earth and from the
+    observer, by their places.
+    """
     seen = place_km - observer_km[:, None]
     distance = np.sqrt(np.einsum("ij,ij->i", seen[0], seen[0]))
     late_s = (distance / LIGHT_KM_S)[:, None]
@@ -334,7 +366,8 @@ def _light_cubics(place_km: FloatArray, observer_km: FloatArray, earth_km_s: Flo
     sent[0] -= late_s * (place_km[1] - late_s * place_km[2])
     sent[1] -= receding * place_km[1] + 2 * late_s * place_km[2]
     seen = sent - observer_km[:, None]
-    # Meanwhile the Earth, and what is about it, has moved on: that undoes the aberration by its velocity.
+    # Meanwhile the Earth, and what is about it, has moved on: that undoes the aberration by its
+    # velocity.
     seen[0] -= late_s * earth_km_s
     seen[1] -= receding * earth_km_s
     return sent, seen

@@ -1,19 +1,25 @@
-"""Lists of element sets, as CelesTrak and Space-Track give them: two lines each, with or without names, or OMM (`omm`).
+"""Lists of element sets, as CelesTrak and Space-Track give them: two lines each, with or without
+names, or OMM (`omm`).
 
-How bright a satellite is: a diffuse sphere in sunlight, in and out of the Earth's shadow, and its flashes.
+How bright a satellite is: a diffuse sphere in sunlight, in and out of the Earth's shadow, and its
+flashes.
 
-A standard magnitude is V at 1000 km and 90 degrees of phase, in full sunlight at 1 au (McCants, Heavens-Above). A diffuse
-sphere's light goes with sin p + (pi - p) cos p of the phase angle p (Lambert; Hejduk 2011, AMOS Conference, eq. 2), which is 1
-there, and with the square of the distance.
+A standard magnitude is V at 1000 km and 90 degrees of phase, in full sunlight at 1 au (McCants,
+Heavens-Above). A diffuse sphere's light goes with sin p + (pi - p) cos p of the phase angle p
+(Lambert; Hejduk 2011, AMOS Conference, eq. 2), which is 1 there, and with the square of the
+distance.
 
 A table of what users know of satellites: their brightness, flashes and sizes, by catalogue number.
 
-Places of many satellites at any time: SGP4 (Vallado et al. 2006, AIAA 2006-6753) seldom, cubics between.
+Places of many satellites at any time: SGP4 (Vallado et al. 2006, AIAA 2006-6753) seldom, cubics
+between.
 
-SGP4 takes 0.5 us a satellite, 11 ms for 20 000: most of a frame. It is therefore asked at the ends of STEP_S only, for a share
-of the list at a time, and between them places follow the cubic through both places and velocities. Low orbits are then within
-0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, nowhere more than 0.07 arcsec from the Earth's centre: measured
-over three days. A cubic of exact velocities would be within 5 mm; SGP4's own are not quite the slopes of its places.
+SGP4 takes 0.5 us a satellite, 11 ms for 20 000: most of a frame. It is therefore asked at the ends
+of STEP_S only, for a share of the list at a time, and between them places follow the cubic through
+both places and velocities. Low orbits are then within
+0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, nowhere more than 0.07 arcsec from the
+Earth's centre: measured over three days. A cubic of exact velocities would be within 5 mm; SGP4's
+own are not quite the slopes of its places.
 """
 
 import importlib.util
@@ -74,15 +80,19 @@ TABLE_FORM = f"write a CSV with the columns {KEY},{','.join(COLUMNS)}, of which 
 Row = dict[str, float]
 STEP_S = 20
 STEP_NS = STEP_S * NS_PER_S
-# So many at a time take 0.3 ms; the moments of a step at which a share's turn comes are spread over it.
+# So many at a time take 0.3 ms; the moments of a step at which a share's turn comes are spread over
+# it.
 SHARE = 512
-# Coefficients of 1, s, s^2, s^3 of the cubic through place and velocity (times the step) at both ends
+# Coefficients of 1, s, s^2, s^3 of the cubic through place and velocity (times the step) at both
+# ends
 HERMITE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-3.0, -2.0, 3.0, -1.0], [2.0, 1.0, -2.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Satellite:
-    """One satellite: its name (that of no other in its list), its catalogue number, and its elements."""
+    """One satellite: its name (that of no other in its list), its catalogue number, and its
+    elements.
+    """
 
     name: str
     number: int
@@ -94,9 +104,11 @@ class Satellite:
 
 
 def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
-    """The satellites in the text of a list, in its order; of several sets of one, that of the date nearest to a UTC.
+    """The satellites in the text of a list, in its order; of several sets of one, that of the date
+    nearest to a UTC.
 
-    A name that several have is followed by the catalogue number; one without a name is called by that.
+    A name that several have is followed by the catalogue number; one without a name is called by
+    that.
 
     Raises InputError with the line that is wrong, and MachineError without SGP4.
     """
@@ -119,7 +131,9 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
 
 
 def _satellites(text: str, file: str) -> "Iterator[Satellite]":
-    """Each element set of a list, as a satellite with the name that it has there. Raises InputError."""
+    """Each element set of a list, as a satellite with the name that it has there. Raises
+    InputError.
+    """
     from sgp4.api import Satrec
 
     if is_omm(text):
@@ -168,7 +182,9 @@ def _name(line: str) -> str:
 
 
 def _check(line: str, where: str) -> None:
-    """Refuse (InputError) a line of the wrong length, with a wrong checksum, or without its numbers."""
+    """Refuse (InputError) a line of the wrong length, with a wrong checksum, or without its
+    numbers.
+    """
     if len(line) != LINE_LENGTH or not line.isascii():
         raise InputError(f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}")
     total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
@@ -182,9 +198,11 @@ def _check(line: str, where: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Brightness:
-    """The brightness of n satellites, (n,) each (see `read_table`). `standard_e_per_s` are rates at the standard magnitude.
+    """The brightness of n satellites, (n,) each (see `read_table`). `standard_e_per_s` are rates at
+    the standard magnitude.
 
-    Without `period_s` (NaN) a satellite's light is steady; with `flash_s` (else NaN) it flashes, otherwise it goes up and down.
+    Without `period_s` (NaN) a satellite's light is steady; with `flash_s` (else NaN) it flashes,
+    otherwise it goes up and down.
     """
 
     standard_e_per_s: FloatArray
@@ -195,16 +213,20 @@ class Brightness:
     size_m: FloatArray
 
     def most(self, which: IntArray) -> FloatArray:
-        """The largest factor by which each of these is ever brighter than its mean (in a flash: than without)."""
+        """The largest factor by which each of these is ever brighter than its mean (in a flash:
+        than without).
+        """
         ratio = flux_ratio(-self.amplitude_mag[which])
         varied = np.where(np.isnan(self.flash_s[which]), 2 * ratio / (ratio + 1), ratio)
         return np.where(np.isnan(self.period_s[which]), 1.0, varied)
 
     def variation(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in closed form.
+        """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in
+        closed form.
 
-        Up and down: a cosine of the flux whose extremes are `amplitude_mag` apart, with a mean of 1. Flashes: Gaussian ones of
-        `flash_s` at half height, `amplitude_mag` brighter at their top. A maximum is at `flash_at_s`.
+        Up and down: a cosine of the flux whose extremes are `amplitude_mag` apart, with a mean
+        of 1. Flashes: Gaussian ones of `flash_s` at half height, `amplitude_mag` brighter at their
+        top. A maximum is at `flash_at_s`.
         """
         factor = np.ones(len(which))
         steady = np.isnan(self.period_s[which])
@@ -226,7 +248,8 @@ class Brightness:
         from scipy.special import ndtr  # 0.1 s, which only flashes need
 
         period_s, sigma_s = self.period_s[which], self.flash_s[which] / FWHM_SIGMAS
-        # The light of all flashes up to each end, in flashes: whole periods, and those near that have not ended
+        # The light of all flashes up to each end, in flashes: whole periods, and those near that
+        # have not ended
         until = []
         for seconds in (begin_s, end_s):
             turn = np.floor((seconds - self.flash_at_s[which]) / period_s)
@@ -240,7 +263,8 @@ class Brightness:
 
 
 def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
-    """Flux over that of the standard magnitude (n,), of satellites at vectors from the observer and from the Earth (n, 3).
+    """Flux over that of the standard magnitude (n,), of satellites at vectors from the observer and
+    from the Earth (n, 3).
 
     The Sun stands at a vector (3,) from the Earth; the Earth's shadow is in it.
     """
@@ -252,14 +276,18 @@ def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: 
 
 
 def phase_factor(cos_phase: FloatArray) -> FloatArray:
-    """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its phase angles."""
+    """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its
+    phase angles.
+    """
     return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - np.arccos(cos_phase)) * cos_phase)
 
 
 def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
-    """The share (n,) of the Sun's disc that the Earth leaves free, seen from places (n, 3) about the Earth; without its air.
+    """The share (n,) of the Sun's disc that the Earth leaves free, seen from places (n, 3) about
+    the Earth; without its air.
 
-    The area of two overlapping circles, in space stretched along the Earth's axis so that it is a sphere.
+    The area of two overlapping circles, in space stretched along the Earth's axis so that it is a
+    sphere.
     """
     place, sun = _stretched(place_km), _stretched(sun_km)
     distance = np.linalg.norm(place, axis=1)
@@ -284,7 +312,8 @@ def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
 
 
 def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
-    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer inside it sees all.
+    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer
+    inside it sees all.
 
     What is seen through less than `depth_km` of it counts as seen.
     """
@@ -297,12 +326,16 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
 
 
 def _stretched(vectors_km: FloatArray) -> FloatArray:
-    """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS z within 0.2 degrees."""
+    """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS
+    z within 0.2 degrees.
+    """
     return np.asarray(vectors_km * np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]))
 
 
 def read_table(text: str, file: str) -> dict[int, Row]:
-    """The rows of a table by catalogue number, each with the columns that are filled. Raises InputError with the line."""
+    """The rows of a table by catalogue number, each with the columns that are filled. Raises
+    InputError with the line.
+    """
     rows: dict[int, Row] = {}
     table = table_of(Path(file), TABLE_FORM, iter(text.splitlines(keepends=True)))
     (_, key), *columns = _columns(table)
@@ -361,7 +394,8 @@ def _values(row: dict[str, str], where: str) -> Row:
 
 
 def brightness_of(satellites: Sequence[Satellite], rows: dict[int, Row], default_mag: float, v0_e_per_s: float) -> Brightness:
-    """The brightness of satellites by a table's rows and a standard magnitude for those that have none.
+    """The brightness of satellites by a table's rows and a standard magnitude for those that have
+    none.
 
     `v0_e_per_s` is the electron rate of sunlight of V = 0.
     """
@@ -399,7 +433,9 @@ class Swarm:
         return len(self.error)
 
     def move_to(self, utc_ns: int) -> bool:
-        """Prepare the places about a UTC, ns since 1970; returns whether any satellite entered another step."""
+        """Prepare the places about a UTC, ns since 1970; returns whether any satellite entered
+        another step.
+        """
         step = (utc_ns - self._late_ns) // STEP_NS
         due = np.flatnonzero(step != self._step)
         if not len(due):
@@ -424,7 +460,9 @@ class Swarm:
         self._ends[k] = end
 
     def _states(self, k: int, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place, km, and velocity times the step, (n, 2, 3), ICRS axes, and errors (n,); NaN where there is one."""
+        """Place, km, and velocity times the step, (n, 2, 3), ICRS axes, and errors (n,); NaN
+        where there is one.
+        """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
         error, place_km, velocity_km_s = self._shares[k].sgp4(np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY]))
         states = np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1) @ icrs_from_teme(utc_ns // TURN_NS).T
@@ -433,13 +471,17 @@ class Swarm:
         return states, error
 
     def places_km(self, which: IntArray | slice, utc_ns: int, seconds: FloatArray | float = 0.0) -> FloatArray:
-        """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it was moved to; NaN for none."""
+        """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it
+        was moved to; NaN for none.
+        """
         s = ((utc_ns - self._begin_ns[which]) / NS_PER_S + seconds)[:, None] / STEP_S
         terms = self._terms[which]
         return np.asarray(terms[:, 0] + s * (terms[:, 1] + s * (terms[:, 2] + s * terms[:, 3])))
 
     def motion_km(self, which: IntArray, utc_ns: int) -> FloatArray:
-        """Coefficients (4, n, 3) of 1, s, s^2 and s^3 of the same places, s in seconds after that UTC."""
+        """Coefficients (4, n, 3) of 1, s, s^2 and s^3 of the same places, s in seconds after
+        that UTC.
+        """
         s = ((utc_ns - self._begin_ns[which]) / NS_PER_S)[:, None] / STEP_S
         a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
         cubic = a + s * (b + s * (c + s * d)), b + s * (2 * c + s * 3 * d), c + s * 3 * d, d

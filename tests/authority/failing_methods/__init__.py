@@ -1,7 +1,7 @@
 """Cases in which a method fails whatever machine runs it: mathematics, and the detector's noise.
 
-`test_failing_methods.py` holds them. `hilstar study stability` shows their figures as tools/make_stability.py recorded them,
-beside the cases that it draws and measures.
+`test_failing_methods.py` holds them. `hilstar study stability` shows their figures as
+tools/make_stability.py recorded them, beside the cases that it draws and measures.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Where methods fail with directions and attitudes: poles, the wrap of right ascension, field edges, quaternions.
+"""Where methods fail with directions and attitudes: poles, the wrap of right ascension, field
+edges, quaternions.
 
 Attitudes: two signs of one quaternion, half turns, fast turns, NaN and infinity.
 """
@@ -36,12 +37,13 @@ from hilstar.sky.stars import RAD_PER_MAS, cell_grid, unit_vectors_icrs
 
 # float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
 DIRECTION_MAS = 1e-5
-# Turning by 2e-16 rad moves a place by that times f / cos^2: 1.7 px * 3.3e5 * 2e-16 = 1e-10 px at 89.9 degrees. Times 100.
+# Turning by 2e-16 rad moves a place by that times f / cos^2: 1.7 px * 3.3e5 * 2e-16 = 1e-10 px at
+# 89.9 degrees. Times 100.
 EDGE_PX = 1e-8
 NONE_LOST = 0.0
 ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
-# The demo's lens and pitch (configs/demo.toml), and about the field angle of its monitor's corner, which weak perspective is
-# judged at; README.md promises centroids to 1.1e-5 px.
+# The demo's lens and pitch (configs/demo.toml), and about the field angle of its monitor's corner,
+# which weak perspective is judged at; README.md promises centroids to 1.1e-5 px.
 FOCAL_LENGTH_MM, PITCH_UM = 350.0, 57.65
 CORNER_DEG = 10.0
 CENTROID_PX = 1.1e-5
@@ -49,7 +51,8 @@ START = from_radec_roll_deg(84.057, -1.2, 30.0)
 AXIS = np.array([0.36, -0.48, 0.8])
 PERIOD_S = 0.1
 FRACTIONS = np.linspace(0.05, 0.95, 19)
-# float64 knows an angle to 2e-16 rad, 5e-11 arcsec; times 200 for the some twenty operations from rate to attitude.
+# float64 knows an angle to 2e-16 rad, 5e-11 arcsec; times 200 for the some twenty operations from
+# rate to attitude.
 ANGLE_ARCSEC = 1e-8
 NONE_TAKEN = 0.0
 POLICY = Policy(max_extrapolation_ns=NS_PER_S, stale_after_ns=NS_PER_S)
@@ -87,7 +90,9 @@ def motion_at_pole() -> FailureCase:
 
 
 def _great_circle(ra_deg: float, dec_deg: float, path_rad: FloatArray) -> FloatArray:
-    """Where a straight path in space ends, seen at `path_rad` (east, north), by angles along a great circle."""
+    """Where a straight path in space ends, seen at `path_rad` (east, north), by angles along a
+    great circle.
+    """
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
@@ -189,12 +194,16 @@ def boresight_at_pole() -> FailureCase:
 
 
 def weak_perspective_px(angle_rad: FloatArray, focal_length_px: float) -> FloatArray:
-    """Distances from the axis, px, with one depth Z0 = 1 for every star: x = f X / Z0 (what eq. 4.3 and 4.4 mean)."""
+    """Distances from the axis, px, with one depth Z0 = 1 for every star: x = f X / Z0 (what eq.
+    4.3 and 4.4 mean).
+    """
     return np.asarray(focal_length_px * np.sin(angle_rad))
 
 
 def weak_perspective_error(angle_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The error of weak perspective at field angles (n,), with the demo's lens and monitor: px and arcsec."""
+    """The error of weak perspective at field angles (n,), with the demo's lens and monitor: px
+    and arcsec.
+    """
     angle = np.radians(angle_deg)
     focal_length_px = FOCAL_LENGTH_MM * 1e3 / PITCH_UM
     off_px = weak_perspective_px(angle, focal_length_px) - focal_length_px * np.tan(angle)
@@ -239,7 +248,9 @@ def turned(turn_deg: float, fraction: float = 1.0) -> FloatArray:
 
 
 def way_error_arcsec(between: Between, sign: float, turn_deg: float) -> float:
-    """The largest error of `between` (`slerp`, or one that fails) on a turn whose end has this sign, arcsec; NaN if any is."""
+    """The largest error of `between` (`slerp`, or one that fails) on a turn whose end has this
+    sign, arcsec; NaN if any is.
+    """
     with np.errstate(invalid="ignore"):
         ways = [between(START, sign * turned(turn_deg), float(f)) for f in FRACTIONS]
     errors = [angle_between_rad(q, turned(turn_deg, f)) for q, f in zip(ways, FRACTIONS, strict=True)]
@@ -288,7 +299,9 @@ def half_turn() -> FailureCase:
 
 
 def sampled_error_arcsec(turn_deg: float, with_rates: bool) -> float:
-    """The largest error of a timeline between samples that are `turn_deg` of a steady turn apart, arcsec."""
+    """The largest error of a timeline between samples that are `turn_deg` of a steady turn
+    apart, arcsec.
+    """
     rate = np.radians(turn_deg) / PERIOD_S * AXIS if with_rates else None
     timeline = Timeline(POLICY)
     for k in range(3):
@@ -318,7 +331,9 @@ def fast_turns() -> FailureCase:
 
 
 def norm_alone(q: tuple[float, ...]) -> bool:
-    """Whether a quaternion passes that is refused where abs(norm - 1) is too large: NaN is never larger."""
+    """Whether a quaternion passes that is refused where abs(norm - 1) is too large: NaN is never
+    larger.
+    """
     return not abs(math.sqrt(sum(c * c for c in q)) - 1.0) > NORM_TOLERANCE
 
 

@@ -1,4 +1,6 @@
-"""Where methods fail between a catalogue and DN: colours, spectra, and a virtual tracker with much light, none, or NaN."""
+"""Where methods fail between a catalogue and DN: colours, spectra, and a virtual tracker with
+much light, none, or NaN.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,15 @@ from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 
-# Each star of the library held out in turn (README.md): 95 % of the stars with V-I < 2.5 are within 2.4 %, of the redder 25 %.
+# Each star of the library held out in turn (README.md): 95 % of the stars with V-I < 2.5 are within
+# 2.4 %, of the redder 25 %.
 BLUE_ERROR, RED_ERROR = 0.024, 0.25
 COOL_K = 5000.0
-# The median of both (README.md): 0.8 % for V-I < 2.5, 5 % beyond, where a fifth of the library's stars under 5000 K are.
+# The median of both (README.md): 0.8 % for V-I < 2.5, 5 % beyond, where a fifth of the library's
+# stars under 5000 K are.
 COOL_MEDIAN = 0.8 * 0.008 + 0.2 * 0.05
-TABLE_ERROR = 1e-6  # a millionth of a magnitude; the table itself is within 1e-11 (hilstar/sky/electrons.py)
+# a millionth of a magnitude; the table itself is within 1e-11 (hilstar/sky/electrons.py)
+TABLE_ERROR = 1e-6
 STEP_MAG = 1e-8  # 2e-9 mag of B-V are crossed, at a slope of order 1
 STEP_BV_MAG = 1e-9
 NOTHING = 0.0
@@ -106,7 +111,8 @@ def planck_overflow() -> FailureCase:
     x, wavelength_m = np.array([1e5, 1e3, 1.0, 1e-12]), 500e-9
     kelvin = PLANCK_J_S * LIGHT_M_S / (wavelength_m * BOLTZMANN_J_K * x)
     scale = 2 * np.pi * PLANCK_J_S * LIGHT_M_S**2 / wavelength_m**5
-    # 1 / (exp(x) - 1) another way: nothing at Wien's end, a hyperbolic cotangent at 1, 1/x - 1/2 at Rayleigh's and Jeans's.
+    # 1 / (exp(x) - 1) another way: nothing at Wien's end, a hyperbolic cotangent at 1, 1/x - 1/2 at
+    # Rayleigh's and Jeans's.
     exact = scale * np.array([0.0, 0.0, (1 / np.tanh(0.5) - 1) / 2, 1e12 - 0.5])
     with np.errstate(over="ignore"):
         naive = scale / (np.exp(x) - 1)
@@ -188,7 +194,9 @@ def blind_tracker() -> FailureCase:
 
 
 def standard_errors(sample: FloatArray, mean: float, sigma: float) -> float:
-    """The error of a sample's mean or sigma against a normal law's, whichever is larger, in standard errors."""
+    """The error of a sample's mean or sigma against a normal law's, whichever is larger, in
+    standard errors.
+    """
     n = sample.size
     return float(max(abs(sample.mean() - mean) / (sigma / n**0.5), abs(sample.std() - sigma) / (sigma / (2 * n) ** 0.5)))
 
@@ -259,7 +267,8 @@ def empty_field() -> FailureCase:
     nothing = np.zeros_like(dn)
     with np.errstate(invalid="ignore"):
         scaled = nothing / nothing.max()
-    # 2400 electrons and an offset of 100: 200 DN; their shot noise, 48 e- read noise and the rounding.
+    # 2400 electrons and an offset of 100: 200 DN; their shot noise, 48 e- read noise and the
+    # rounding.
     sigma_dn = float(np.sqrt((2400 + 48**2) / 24**2 + 1 / 12))
     error = standard_errors(dn, 200.0, sigma_dn)
     return FailureCase(

@@ -18,7 +18,9 @@ def chromium() -> Iterator[Browser]:
 
 @pytest.fixture
 def page(chromium) -> Iterator[Browser]:
-    """The browser, on a laptop in the dark, whose console must have said nothing when the test ends."""
+    """The browser, on a laptop in the dark, whose console must have said nothing when the test
+    ends.
+    """
     chromium.get("about:blank")
     chromium.complaints()
     chromium.size(1366, 768)

@@ -1,4 +1,6 @@
-"""The operator's page in a browser, before a real run: what it shows moves, turns red in time, and acts only where it may."""
+"""The operator's page in a browser, before a real run: what it shows moves, turns red in time,
+and acts only where it may.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,9 @@ from tests.support.waiting import CHANCES, CoreWaits, repeating, wait_for
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 ADDRESS = re.compile(r"page is at (http://\S+)")
-# "Red within 0.5 s of anything wrong": 50 to 210 ms on two cores with ten processes that want them. A run that dies is missed
-# 0.4 s after its last word; a browser's timers may be late by BUSY_MS on such a machine.
+# "Red within 0.5 s of anything wrong": 50 to 210 ms on two cores with ten processes that want them.
+# A run that dies is missed 0.4 s after its last word; a browser's timers may be late by BUSY_MS on
+# such a machine.
 RED_MS, BUSY_MS = 500, 300
 MIN_PICTURES_HZ = 4  # of 8 that are asked for, on such a machine
 PACKET_S, TURN_RAD = 0.01, 1e-3  # between two packets
@@ -184,7 +187,9 @@ def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
 
 
 def test_labels_are_few_and_none_stands_over_the_codes(live):
-    """A label for each 24 000 px of the picture at most, and the field's besides; codes lie over everything."""
+    """A label for each 24 000 px of the picture at most, and the field's besides; codes lie over
+    everything.
+    """
     area_px = live.run("const c = document.getElementById('overlay'); return c.clientWidth * c.clientHeight")
     live.until("Number(document.getElementById('overlay').dataset.labels) > 3")
     assert float(live.run("return document.getElementById('overlay').dataset.labels")) <= area_px / 24_000 + 2

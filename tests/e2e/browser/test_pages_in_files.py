@@ -1,4 +1,6 @@
-"""Pages that are one file, in chromium: the page of a first-light session on a phone, at a desk and on paper."""
+"""Pages that are one file, in chromium: the page of a first-light session on a phone, at a desk
+and on paper.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ WARM_UP = "\n[certify.virtual]\ncold_percent = 3.0\nwarm_up_min = 2.0\n"
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """A session with a monitor that warms up; without a photodiode and the response, so that three steps measure nothing."""
+    """A session with a monitor that warms up; without a photodiode and the response, so that
+    three steps measure nothing.
+    """
     folder = tmp_path_factory.mktemp("pages")
     (folder / "bench.toml").write_text(bench_text(TWIN))
     (folder / "truth.toml").write_text(bench_text(TWIN, {"monitor": {"flip_x": True}}) + WARM_UP)

@@ -1,4 +1,6 @@
-"""A run's report in a browser, from a file: its pictures, its zoom, its moments, at every size, by mouse and by keys alone."""
+"""A run's report in a browser, from a file: its pictures, its zoom, its moments, at every size,
+by mouse and by keys alone.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ def answer(k: int) -> AnswerRecord:
 
 @pytest.fixture(scope="module")
 def report_file(tmp_path_factory) -> Path:
-    """The report of 10 s with a stale half second, two missed periods, refused packets and a mark."""
+    """The report of 10 s with a stale half second, two missed periods, refused packets and a
+    mark.
+    """
     folder = tmp_path_factory.mktemp("run")
     (folder / "bench.toml").write_text(SMALL_BENCH)
     with hilstar.load(folder / "bench.toml") as bench, Ledger(folder / "run.mcap", bench) as ledger:

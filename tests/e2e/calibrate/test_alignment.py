@@ -1,4 +1,6 @@
-"""calibrate alignment: a misaligned bench, what its tracker reports, and the same tracker after the correction."""
+"""calibrate alignment: a misaligned bench, what its tracker reports, and the same tracker after
+the correction.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ from tests.support.alignment import HEADER, reported, write_pairs
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 
-TRUE_Q = normalise(np.array([1.0, 0.0021, -0.0013, 0.0044]))  # 1020 arcsec across the boresight, 1815 about it
+# 1020 arcsec across the boresight, 1815 about it
+TRUE_Q = normalise(np.array([1.0, 0.0021, -0.0013, 0.0044]))
 ATTITUDES = [
     from_radec_roll_deg(*angles) for angles in [(84, -1, 0), (83, 2, 70), (187, -60, 140), (56, 24, 250), (280, 38, 300)]
 ]
@@ -137,7 +140,9 @@ def test_one_percent_of_wild_ones_is_named_by_row(measured, tmp_path):
 
 @pytest.fixture(scope="module")
 def run_of_a_slew(tmp_path_factory):
-    """A ledger of a slew at 0.5 deg/s at 50 Hz, with a blank second, and telemetry at 4 Hz whose clock is 0.04 s late."""
+    """A ledger of a slew at 0.5 deg/s at 50 Hz, with a blank second, and telemetry at 4 Hz whose
+    clock is 0.04 s late.
+    """
     folder = tmp_path_factory.mktemp("slew")
     bench = bench_file(folder, "bench.toml", None)
     rate = np.radians([0.3, -0.4, 0.1])
@@ -167,7 +172,8 @@ def test_a_ledger_says_what_was_commanded_at_the_moment_of_light(run_of_a_slew, 
     assert right["rotation_arcsec"] == pytest.approx(np.array([1e-3, 2e-3, -3e-3]) * ARCSEC_PER_RAD, abs=0.01)
     assert right["residual_arcsec"]["cross"] < 0.01
     assert right["pairs"] + right["skipped"] == 90
-    assert 12 <= right["skipped"] <= 16  # before and after the run, the blank second, and the one that is not valid
+    # before and after the run, the blank second, and the one that is not valid
+    assert 12 <= right["skipped"] <= 16
     assert late["rotation_arcsec"] != pytest.approx(right["rotation_arcsec"], abs=10)
 
 

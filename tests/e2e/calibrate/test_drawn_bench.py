@@ -1,4 +1,6 @@
-"""Benches by chance through first light and verify, as tools/any_bench.py takes them: one as drawn, and some of few pixels."""
+"""Benches by chance through first light and verify, as tools/any_bench.py takes them: one as
+drawn, and some of few pixels.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from tests.support.commands import run_hilstar_here
 SEED, SMALL_SEED = 1, 48
 # A microdisplay of which the tracker sees 2 %, before 256 x 256 pixels with a PSF of 2.1 px.
 NUMBERS = (16,)
-# Turned by 29 degrees and mirrored; a PSF of 2.0 px; even light, on its side, seen whole; an S-curve and a wide field.
+# Turned by 29 degrees and mirrored; a PSF of 2.0 px; even light, on its side, seen whole; an
+# S-curve and a wide field.
 SMALL_NUMBERS = (3, 17, 18, 22)
 PLACES = {"focus", "warm-up", "geometry", "scale", "latency"}
 

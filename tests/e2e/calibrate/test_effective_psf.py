@@ -1,4 +1,6 @@
-"""`hilstar calibrate psf` on images of another renderer: squares of light behind a lens in closed form, with photon noise."""
+"""`hilstar calibrate psf` on images of another renderer: squares of light behind a lens in
+closed form, with photon noise.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ POINTS = (np.arange(6) - 2.5) / 2  # of a dot's square along a side, monitor px
 
 
 def round_lens(x, y):
-    """Weight, place and sigma along x and y of each Gaussian: round ones that grow to the edges, and no coma."""
+    """Weight, place and sigma along x and y of each Gaussian: round ones that grow to the edges,
+    and no coma.
+    """
     return [(1.0, 0.0, 0.0, 0.5 + 0.3 * ((x - 256) / 256) ** 2, 0.5 + 0.1 * (y - 144) / 144)]
 
 
@@ -100,7 +104,8 @@ def test_the_psf_over_the_field_is_found_without_the_dot(tmp_path, lens, more):
     at = (np.arange(side) - side // 2) / glass.per_px
     for (x, y), found in zip(glass.places_px, glass.images[:, 0, 0], strict=True):
         wanted = light(lens(x, y), np.zeros(1), np.zeros(1), at, at) / glass.per_px**2
-        off = [float(axis @ at / axis.sum()) for axis in (wanted.sum(axis=0), wanted.sum(axis=1))]  # centroids in the middle
+        # centroids in the middle
+        off = [float(axis @ at / axis.sum()) for axis in (wanted.sum(axis=0), wanted.sum(axis=1))]
         wanted = light(lens(x, y), -np.array(off[:1]), -np.array(off[1:]), at, at) / glass.per_px**2
         assert 0.5 * np.abs(found - wanted).sum() < ELSEWHERE
         for axis in (0, 1):

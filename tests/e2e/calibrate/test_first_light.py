@@ -1,4 +1,6 @@
-"""hilstar first-light: whole sessions on a planted bench, killed and resumed, and by a command that takes the images."""
+"""hilstar first-light: whole sessions on a planted bench, killed and resumed, and by a command
+that takes the images.
+"""
 
 from __future__ import annotations
 
@@ -49,19 +51,22 @@ STEPS = [
 FEW = ["--patches", 30]  # 12 levels
 NONE = ["--patches", 0]
 GAMMA, BLACK, WHITE_E_PER_S = 2.35, 1 / 800, 2.5e6
-# `calibrate photometric` states the error of 12 levels at 3 decades below white as 0.4 %; the tracker's whole DN add as much.
+# `calibrate photometric` states the error of 12 levels at 3 decades below white as 0.4 %; the
+# tracker's whole DN add as much.
 RESPONSE_MAG = 0.01
 DELAY_MS, EDGE_MS = 12.5, 0.05  # an edge's jitter of 0.1 ms leaves 0.01 in the median of 150
 SCALE_MAG = 0.005  # 20 stars or more, each within 0.01 mag
-# The tracker's pixel is 107 arcsec. Held-out dots of this bench are 0.2 arcsec rms off; outside the tracker's field, which is
-# a third of the screen, nothing is measured and the lens is extrapolated.
+# The tracker's pixel is 107 arcsec. Held-out dots of this bench are 0.2 arcsec rms off; outside the
+# tracker's field, which is a third of the screen, nothing is measured and the lens is extrapolated.
 PLACES_ARCSEC = 3.0
 SAME = 1e-6  # figures are written with six digits
 SEEN_SHARE = 0.6  # of the screen's width and height, about its middle: what the tracker surely sees
 
 
 def plant(folder, **monitor):
-    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length, light, and delay."""
+    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal
+    length, light, and delay.
+    """
     (folder / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
     head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
     light = {"w": BLACK + gamma_response(10, GAMMA).light}
@@ -84,7 +89,9 @@ def plant(folder, **monitor):
 
 
 def places_off_arcsec(folder):
-    """How far the places that the tracker sees are from where the truth has them, rms over the directions of its field."""
+    """How far the places that the tracker sees are from where the truth has them, rms over the
+    directions of its field.
+    """
     cameras = [
         bench_camera(file.config, folder) for file in map(read_bench_file, (folder / "bench.toml", folder / "truth.toml"))
     ]
@@ -180,7 +187,9 @@ def again_by_hand(folder, *words):
 
 
 def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path):
-    """One code, two entrances: the step's own files through `calibrate geometric`, `photometric` and `scale`."""
+    """One code, two entrances: the step's own files through `calibrate geometric`, `photometric`
+    and `scale`.
+    """
     folder, found, _ = whole
     steps = {step["name"]: step["figures"] for step in found["steps"]}
     images = folder / "s" / "images" / "geometry-1"
@@ -233,7 +242,9 @@ def started(folder, *more):
 
 
 def ended_at(process, folder, image, ending):
-    """Let a session run until an image is there, end it so, and give back the images of that step and when they were taken."""
+    """Let a session run until an image is there, end it so, and give back the images of that
+    step and when they were taken.
+    """
     end_s = time.monotonic() + PATIENCE_S
     while not list((folder / "s").glob(f"images/{image}*")):
         assert time.monotonic() < end_s
@@ -245,7 +256,9 @@ def ended_at(process, folder, image, ending):
 
 
 def untouched(taken):
-    """How many of the images are as they were; the last one may have been cut short, and is taken again."""
+    """How many of the images are as they were; the last one may have been cut short, and is
+    taken again.
+    """
     return sum(path.exists() and path.stat().st_mtime_ns == when for path, when in taken.items())
 
 
@@ -280,7 +293,9 @@ def test_a_session_that_is_stopped_or_killed_half_way_says_so_and_goes_on_where_
 
 @pytest.mark.usefixtures("without_charts")
 def test_the_truth_that_comes_with_hilstar_is_found(tmp_path):
-    """By its name alone, in a folder that has no such file: mirror, focal length, light, its fall to the edges, full scale."""
+    """By its name alone, in a folder that has no such file: mirror, focal length, light, its
+    fall to the edges, full scale.
+    """
     shutil.copy(resource_path("configs", "demo.toml"), tmp_path / "bench.toml")
     result = run_hilstar_here(
         "first-light", "bench.toml", "-o", "s", "--virtual", "truth-example.toml", "--patches", 60, "--json", cwd=tmp_path
@@ -305,7 +320,8 @@ def test_images_come_from_a_command(tmp_path):
     assert result.returncode == 0, result.stderr
     steps = steps_of(result)
     assert steps["orientation"]["figures"]["seen"] == "mirrored top to bottom"
-    # The camera's pixels are points; a screen's are squares of 0.924 px, which the figure takes out of the dots' width.
+    # The camera's pixels are points; a screen's are squares of 0.924 px, which the figure takes out
+    # of the dots' width.
     assert steps["focus"]["figures"]["psf_sigma_px"] == pytest.approx(
         math.sqrt(plain_camera.SIGMA_PX**2 - 0.924**2 / 12), abs=0.02
     )

@@ -1,4 +1,6 @@
-"""calibrate dots and geometric, from the plan to a frame that is drawn through the lens that was found."""
+"""calibrate dots and geometric, from the plan to a frame that is drawn through the lens that was
+found.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +97,8 @@ def test_stars_are_drawn_through_the_lens_that_was_found(fitted, session):
         on_screen = (np.abs(front_x - 959.5) < 960) & (np.abs(front_y - 539.5) < 540)
     assert np.sqrt((off**2).mean()) < STARS_ARCSEC[0]
     assert off.max() < STARS_ARCSEC[1]
-    assert ((np.abs(x - 959.5) < 960) & (np.abs(y - 539.5) < 540)).sum() == on_screen.sum() > 100  # no corner loses a star
+    # no corner loses a star
+    assert ((np.abs(x - 959.5) < 960) & (np.abs(y - 539.5) < 540)).sum() == on_screen.sum() > 100
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""calibrate geometric from the tracker's images: dots as blurred squares of light, with noise, hot pixels and a dark frame."""
+"""calibrate geometric from the tracker's images: dots as blurred squares of light, with noise,
+hot pixels and a dark frame.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from tests.support.commands import assert_refused, run_hilstar_here
 
 SIGMA_PX, PEAK_DN, FLOOR_DN, NOISE_DN = 1.1, 9000.0, 400.0, 12.0
 HOT = 150  # pixels
-# An image's centroids are better than 0.02 px here, but for the S-curve of the centroider: twice the aim for a table.
+# An image's centroids are better than 0.02 px here, but for the S-curve of the centroider: twice
+# the aim for a table.
 IMAGES_ARCSEC = tuple(2 * aim for aim in STARS_ARCSEC)
 
 

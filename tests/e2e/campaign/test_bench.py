@@ -1,4 +1,6 @@
-"""A campaign before a real tracker: a stub of it in a process of its own, over UDP, with planted errors."""
+"""A campaign before a real tracker: a stub of it in a process of its own, over UDP, with planted
+errors.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,8 @@ def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(tmp
         wild, _ = tracker.communicate()
     found, rows = json.loads(result.stdout), read_columns(tmp_path / "out" / "cases.parquet")
     assert sorted(rows["order"]) == rows["case"] == list(range(500)) and rows["order"] != rows["case"]
-    # A machine that stands still tells the stub late what is lit: its answer is then of the case before.
+    # A machine that stands still tells the stub late what is lit: its answer is then of the case
+    # before.
     before = dict(zip(rows["order"], rows["case"], strict=True))
     for each in found["wrong_cases"]:
         assert {each["case"], before.get(each["order"] - 1), 500 + each["order"] // 100} & set(json.loads(wild))
@@ -79,7 +82,8 @@ def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(tmp
     assert found["pixel_arcsec"]["cross"] == pytest.approx(planted.pixel_arcsec, rel=0.1)
     assert found["noise_arcsec"]["cross"] == pytest.approx(planted.noise_arcsec[0], rel=0.1)
     assert found["noise_arcsec"]["roll"] == pytest.approx(planted.noise_arcsec[2], rel=0.1)
-    # The drift over the campaign's seconds is a part of the bias: half an arcsec, and four errors of a mean of 500.
+    # The drift over the campaign's seconds is a part of the bias: half an arcsec, and four errors
+    # of a mean of 500.
     error = np.array(found["bias_arcsec"]) - planted.bias_arcsec - [*fov.mean(axis=0), 0.0]
     assert np.all(np.abs(error) < 0.5 + 4 * np.array([7.5, 7.5, 12.0]) / np.sqrt(500))
     drift = found["drift"]
@@ -101,7 +105,9 @@ def reached(folder: Path, goal: int, hilstar: subprocess.Popen[str]) -> bool:
 
 
 def killed_once(folder: Path, planted: Planted, kills: int, cases: int) -> dict[str, Any]:
-    """The table of a campaign in which hilstar and the tracker are killed in turn, `kills` times together."""
+    """The table of a campaign in which hilstar and the tracker are killed in turn, `kills` times
+    together.
+    """
     rng = np.random.default_rng(5)
     with contextlib.ExitStack() as trackers:
         tracker, hilstar = trackers.enter_context(answering(planted)), started(folder)
@@ -180,7 +186,8 @@ def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_th
     by_order = [value for _, value in sorted(zip(rows["order"], rows["vary.render.quantisation"], strict=True))]
     assert sum(a != b for a, b in pairwise(by_order)) == 1
     error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xyz"], axis=1) - planted.bias_arcsec
-    # A frame that is late by its 10 ms is off by 7 arcsec, and after half a second a case has gone on by 180 and more.
+    # A frame that is late by its 10 ms is off by 7 arcsec, and after half a second a case has gone
+    # on by 180 and more.
     assert np.median(np.abs(error[:, :2])) < 10 and np.abs(error[:, :2]).max() < 90
 
 
@@ -199,7 +206,8 @@ def test_late_answers_of_the_case_before_are_neither_s_on_a_clock_of_its_own(tmp
 
 
 def test_a_case_goes_along_a_log(tmp_path: Path) -> None:
-    turning = [from_radec_roll_deg(80 + 0.01 * k, 20.0, 0.0).tolist() for k in range(300)]  # 0.1 deg/s, 340 arcsec/s across
+    # 0.1 deg/s, 340 arcsec/s across
+    turning = [from_radec_roll_deg(80 + 0.01 * k, 20.0, 0.0).tolist() for k in range(300)]
     lines = ["t_s,qw,qx,qy,qz", *(",".join(map(repr, [k / 10, *q])) for k, q in enumerate(turning))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     attitudes = {"kind": "log", "log": "log.csv"}
@@ -209,7 +217,8 @@ def test_a_case_goes_along_a_log(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     rows = read_columns(tmp_path / "out" / "cases.parquet")
     error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xy"], axis=1) - planted.bias_arcsec[:2]
-    assert np.median(np.abs(error)) < 15  # 0.2 s after its begin a case that stood still would be off by 70
+    # 0.2 s after its begin a case that stood still would be off by 70
+    assert np.median(np.abs(error)) < 15
 
 
 def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""A cluster: a scheduler and workers started from outside, one of another version, one killed, and the driver killed."""
+"""A cluster: a scheduler and workers started from outside, one of another version, one killed,
+and the driver killed.
+"""
 
 from __future__ import annotations
 

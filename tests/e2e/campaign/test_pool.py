@@ -16,7 +16,8 @@ from tests.support.forks import Started
 from tests.support.servers import workers_of
 from tests.support.waiting import PATIENCE_S, wait_for
 
-# Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
+# Slow enough to be killed in its middle; its answer, and the images that it fails over, are those
+# of the pixels alone.
 SOLVER = """
 import time
 from pathlib import Path

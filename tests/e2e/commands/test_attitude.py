@@ -17,7 +17,8 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
 from tests.support.sources.aem_messages import kvn, rows_of
 
-# A catalogue place is of 1991.25 and this of the bench's epoch: Hipparcos' fastest star moves by 10 arcsec a year.
+# A catalogue place is of 1991.25 and this of the bench's epoch: Hipparcos' fastest star moves by 10
+# arcsec a year.
 MOTION_DEG = 0.2
 ROUNDING_DEG = 1e-9
 
@@ -55,7 +56,8 @@ def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(tmp_pa
         assert seen.separation(looked).deg == pytest.approx(star["from_boresight_deg"], abs=ROUNDING_DEG)
         cam = turn.apply(seen.cartesian.xyz.to_value(units.one))
         side = np.array([star["x_px"], star["y_px"]]) - (np.array(found["tracker"]["resolution_px"]) - 1) / 2
-        assert side @ cam[:2] == pytest.approx(np.hypot(*side) * np.hypot(*cam[:2]), rel=1e-6)  # on the same side
+        # on the same side
+        assert side @ cam[:2] == pytest.approx(np.hypot(*side) * np.hypot(*cam[:2]), rel=1e-6)
 
 
 def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
@@ -87,7 +89,9 @@ def test_a_live_stream_is_awaited(tmp_path):
 
 
 def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
-    """As the notice of a body's attitude says: here the body's z is the pole and the camera looks along its x."""
+    """As the notice of a body's attitude says: here the body's z is the pole and the camera
+    looks along its x.
+    """
     (tmp_path / "log.aem").write_text(kvn(rows_of([0, 0, 0, 1])))
     assert told(tmp_path / "log.aem")["dec_deg"] == pytest.approx(90, abs=ROUNDING_DEG)
     found = told(tmp_path / "log.aem", "--mounting", "0.5,-0.5,-0.5,-0.5")

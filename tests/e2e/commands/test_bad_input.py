@@ -1,4 +1,6 @@
-"""Whatever is named as a file, a number or an output: one line, soon, and nothing of the input repeated at length."""
+"""Whatever is named as a file, a number or an output: one line, soon, and nothing of the input
+repeated at length.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ MONITOR = '[calibration]\nkind="photometric"\nwho=""\nwhen=""\ninstrument=""\nun
 
 @pytest.fixture(autouse=True)
 def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """In a directory of its own, with an alarm: whatever waits for ever fails, and does not stop the suite."""
+    """In a directory of its own, with an alarm: whatever waits for ever fails, and does not stop
+    the suite.
+    """
     monkeypatch.chdir(tmp_path)
     with bounded_by(PATIENCE_S):
         yield
@@ -50,7 +54,9 @@ def refusal(*words: str) -> str:
 
 
 def place(kind: str, name: str) -> tuple[str, ...]:
-    """The command that reads a file of one kind by its name, and everything else that it reads made well."""
+    """The command that reads a file of one kind by its name, and everything else that it reads
+    made well.
+    """
     benches = {
         "curve": BENCH.replace('"ccd47-20"', f'"{name}"'),
         "transmission": BENCH.replace('"n-bk7-10mm"', f'"{name}"'),

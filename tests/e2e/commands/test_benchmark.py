@@ -27,10 +27,11 @@ benchmark.QUICK = replace(benchmark.QUICK, starts=1, rounds=12, budget_s=0.7)
 main()
 """
 GRID = ("--stars", "100,1000", "--sizes", "640x480")
-# The stages are timed with a wait after each and without the frame's bookkeeping; a wrong unit or a stage left out or counted
-# twice is off by more.
+# The stages are timed with a wait after each and without the frame's bookkeeping; a wrong unit or a
+# stage left out or counted twice is off by more.
 SUM_FACTOR = 3.0
-# Ten stars on one pixel, each float32 sum and each share (erf of the GPU, 1.2e-6) at its worst, of the brightest pixel.
+# Ten stars on one pixel, each float32 sum and each share (erf of the GPU, 1.2e-6) at its worst, of
+# the brightest pixel.
 FLOAT32_OF_PEAK = 1e-5
 
 
@@ -178,6 +179,7 @@ def test_slow_works_take_fewer_turns_evenly(monkeypatch):
     monkeypatch.setattr(benchmark, "_seconds", seconds)
     works = {name: lambda name=name: name for name in ("fast", "slow", "slowest")}
     times = benchmark.interleaved(works, rounds=8, budget_s=5.0)
-    # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one counts.
+    # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one
+    # counts.
     assert {name: len(values) for name, values in times.items()} == {"fast": 8, "slow": 4, "slowest": 1}
     assert taken[3:] == ["fast", "fast", "slow"] * 4

@@ -73,7 +73,8 @@ def test_the_frame_s_files_agree_with_each_other(orion):
         assert len(header["BENCHSHA"]) == 64
     inside = [r for r in rows if 6 < float(r["x_px"]) < 1017 and 6 < float(r["y_px"]) < 1017]
     assert len(inside) > 500
-    # Every star's light is in the image: 1e-6 is cut, and the sum of half a million float32 pixels is exact in float64.
+    # Every star's light is in the image: 1e-6 is cut, and the sum of half a million float32 pixels
+    # is exact in float64.
     edge = sum(float(r["electrons_per_s"]) for r in rows if r not in inside)
     total = sum(float(r["electrons_per_s"]) for r in inside)
     assert total * (1 - 1e-5) < linear.sum(dtype=np.float64) < (total + edge) * (1 + 1e-5)
@@ -202,7 +203,9 @@ def test_a_stream_without_opengl_gets_one_line_and_exit_code_3(small_bench_file,
         assert_refused(run_hilstar(*words, env=no_opengl), 3, "apt-get install libegl1 libgl1-mesa-dri")
 
 
-NUMPY_DN = 2  # by which two DN without noise may differ: float32 adds up light in another order, and the ADC rounds
+# by which two DN without noise may differ: float32 adds up light in another order, and the ADC
+# rounds
+NUMPY_DN = 2
 NUMPY_OTHER = 1e-3  # of lit pixels, whose light is within rounding of a threshold
 
 
@@ -335,7 +338,8 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
         for delay_s in (0.0, 0.1, 0.4, 1.0):
             process = subprocess.Popen([*HILSTAR, *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
             try:
-                wait_for(lambda process=process: has_handlers(process), poll_s=0.005)  # Python's own start is not ours to guard
+                # Python's own start is not ours to guard
+                wait_for(lambda process=process: has_handlers(process), poll_s=0.005)
                 time.sleep(delay_s)
                 process.send_signal(signal.SIGINT)
                 _, err = process.communicate(timeout=PATIENCE_S)
@@ -345,7 +349,9 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
 
 
 def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path):
-    """`demo` starts a sender: killed with it by `run_hilstar`, and what is orphaned all the same is found and ended."""
+    """`demo` starts a sender: killed with it by `run_hilstar`, and what is orphaned all the same
+    is found and ended.
+    """
     with pytest.raises(subprocess.TimeoutExpired):
         run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=4)
     assert [command for command in leftovers.living_children().values() if str(tmp_path) in command] == []

@@ -55,7 +55,9 @@ def test_a_frame_drawn_again_is_the_same_sky(golden, small_bench_file, tmp_path)
 
 
 def test_a_golden_frame_holds_on_another_driver(golden, small_bench_file, tmp_path):
-    """Mesa's softpipe has its own shader machine and rasteriser; its pixels are others, its sky is the same."""
+    """Mesa's softpipe has its own shader machine and rasteriser; its pixels are others, its sky
+    is the same.
+    """
     other = tmp_path / "softpipe.fits"
     env = os.environ | {"LIBGL_ALWAYS_SOFTWARE": "1", "GALLIUM_DRIVER": "softpipe"}
     drawn = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "-o", other, "--json", env=env)
@@ -64,7 +66,8 @@ def test_a_golden_frame_holds_on_another_driver(golden, small_bench_file, tmp_pa
     assert not np.array_equal(fits.getdata(other), fits.getdata(golden[0]))
     result = run_hilstar_here("compare", other, golden[0], "--json")
     assert result.returncode == 0, result.stdout
-    # Measured: up to 3e-7 mag and 4e-7 px at 95 %, in six fields of two benches; a hundredth of the limits is 25 times that.
+    # Measured: up to 3e-7 mag and 4e-7 px at 95 %, in six fields of two benches; a hundredth of the
+    # limits is 25 times that.
     summary = json.loads(result.stdout)
     assert summary["flux_error_mag"]["p95"] < 0.01 * summary["limits"]["flux_mag"]
     assert summary["centroid_error_px"]["p95"] < 0.01 * summary["limits"]["centroid_px"]

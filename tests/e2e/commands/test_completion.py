@@ -1,4 +1,6 @@
-"""Tab completes commands, options and choices, in a real bash that was set up by `hilstar --install-completion`."""
+"""Tab completes commands, options and choices, in a real bash that was set up by `hilstar
+--install-completion`.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +112,8 @@ def test_zsh_gets_its_script(env):
 
 
 def test_completing_needs_no_numpy_and_a_command_no_pydantic():
-    # Half of the time that Tab would take; 0.17 s of processor time without, 0.30 s with it. A command: 0.33 and 0.44 s.
+    # Half of the time that Tab would take; 0.17 s of processor time without, 0.30 s with it. A
+    # command: 0.33 and 0.44 s.
     code = "import hilstar.cli, sys; print('numpy' in sys.modules); hilstar.cli.run_command(['frame', 'none.toml'])"
     found = subprocess.run(
         [sys.executable, "-c", f"{code}; print('pydantic' in sys.modules)"], capture_output=True, text=True, check=True

@@ -1,4 +1,6 @@
-"""The demo: its sender begins when the loop draws, a sky that stood still is no success, and it has the operator's page too."""
+"""The demo: its sender begins when the loop draws, a sky that stood still is no success, and it
+has the operator's page too.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ from tests.support.servers import Served
 pytestmark = pytest.mark.e2e
 
 SECONDS = 1.5
-# The planted field-of-view error has amplitudes of 2.8 arcsec. A display that misses a frame at 0.3 deg/s is 18 arcsec
-# behind, and on a busy machine that is most of the bias's error.
+# The planted field-of-view error has amplitudes of 2.8 arcsec. A display that misses a frame at 0.3
+# deg/s is 18 arcsec behind, and on a busy machine that is most of the bias's error.
 LOOP_BIAS_ARCSEC = 60.0
 SLOW_START_S = 0.5  # a sender that began before would have sent 50 attitudes
 
@@ -114,11 +116,14 @@ def test_the_demo_can_be_watched_and_acted_on(tmp_path):
 
 
 def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was_planted(tmp_path):
-    """Six seconds: the bias, with what the field-of-view error adds to it over so short a scan, and the live figures."""
+    """Six seconds: the bias, with what the field-of-view error adds to it over so short a scan,
+    and the live figures.
+    """
     result = run_hilstar_here("demo", "--loop", "-o", tmp_path / "demo", "--duration", "6", "--json")
     if "and 30 are needed" in result.stderr or "and 30 others are needed" in result.stderr:
         pytest.skip("the machine is too busy for three answers a second, or for most of the frames")
-    assert result.returncode in {0, 1}, result.stderr  # 1: a busy machine's sky stood still for a moment
+    # 1: a busy machine's sky stood still for a moment
+    assert result.returncode in {0, 1}, result.stderr
     summary = json.loads(result.stdout)
     assert summary["answers"]["right"] > 10
     (line,) = (line for line in result.stderr.splitlines() if line.startswith('{"loop"'))

@@ -1,4 +1,6 @@
-"""README's first command, as it stands, in a folder that has only what git has; and what it installed, without that folder."""
+"""README's first command, as it stands, in a folder that has only what git has; and what it
+installed, without that folder.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from tests.support.readme import blocks
 from tests.support.waiting import INSTALLED_WITHIN_S, PATIENCE_S
 
 FILES = ("pyproject.toml", "README.md", "LICENSE", "hilstar", "shaders", "configs")
-# For pip: packages are not compiled ahead, which takes longer than all that the demo then imports ("no" turns it off).
+# For pip: packages are not compiled ahead, which takes longer than all that the demo then imports
+# ("no" turns it off).
 ENVIRONMENT = {"PIP_NO_COMPILE": "no"}
 
 
@@ -35,7 +38,9 @@ def shape(text: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The folder after the command (apt, a new environment, a wheel with all it depends on, the demo), and what was printed."""
+    """The folder after the command (apt, a new environment, a wheel with all it depends on, the
+    demo), and what was printed.
+    """
     folder = tmp_path_factory.mktemp("checkout")
     for name in FILES:
         source = ROOT / name

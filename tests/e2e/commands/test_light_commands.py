@@ -1,4 +1,6 @@
-"""The monitor's light from the command line: what it can show, what was measured of it, what white is worth."""
+"""The monitor's light from the command line: what it can show, what was measured of it, what
+white is worth.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 
 EXACT = '[render]\nquantisation = "exact"\n'
-# 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code, 3 % at any.
+# 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code,
+# 3 % at any.
 RESPONSE_ERROR = 0.03
 
 
@@ -33,7 +36,9 @@ def of_json(*arguments: object) -> dict:
 
 
 def test_where_a_star_clips_and_where_it_shows_nothing_is_where_frames_say_so(bench_with):
-    """A bench whose stars are all of the Sun's colour: at the magnitude where a star clips its peak is white."""
+    """A bench whose stars are all of the Sun's colour: at the magnitude where a star clips its
+    peak is white.
+    """
     bench = bench_with('[render]\nquantisation = "round"\nflux_at_white_e_per_s = 1e8\n')
     found = budget(bench)
     zero_mag = zero_point_mag(bench)
@@ -131,7 +136,9 @@ def test_white_is_the_brightest_star_wanted(bench_with):
 
 
 def test_the_white_of_a_file_that_gives_none_leaves_codes_for_most_fields(tmp_path):
-    """The shortest bench file: with Sirius for white the brightest of 255 codes is 38 in the median field."""
+    """The shortest bench file: with Sirius for white the brightest of 255 codes is 38 in the
+    median field.
+    """
     bench_file = tmp_path / "wide.toml"
     bench_file.write_text(SMALL_BENCH.replace("[320, 240]", "[1920, 1080]").replace("= 60", "= 350"))
     fields = Rotation.random(30, random_state=1).as_quat(scalar_first=True)
@@ -171,7 +178,9 @@ def test_two_whites_or_none_get_one_line(small_bench_file):
 
 
 def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(tmp_path, small_bench_file):
-    """Readings of three stars as a tracker would give them, and a copy of the bench file, comments kept."""
+    """Readings of three stars as a tracker would give them, and a copy of the bench file,
+    comments kept.
+    """
     small_bench_file.write_text(SMALL_BENCH + "[render]  # how light becomes codes\nsprite_sigma_px = [0.9, 0.9]  # wide\n")
     with hilstar.load(small_bench_file) as bench:
         white = bench.flux_at_white_e_per_s
@@ -217,7 +226,9 @@ def test_a_star_that_clips_is_no_scale(small_bench_file):
 
 
 def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
-    """The example monitor, measured by its own plan with 1 % of noise, comes back; frames record its file's hash."""
+    """The example monitor, measured by its own plan with 1 % of noise, comes back; frames record
+    its file's hash.
+    """
     plan = tmp_path / "plan.csv"
     planned = of_json("calibrate", "plan", "-o", plan, "--headless", tmp_path / "patches", "--resolution", "64,48")
     true = load_calibration("lcd-example", 8).response

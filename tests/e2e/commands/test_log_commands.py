@@ -100,7 +100,8 @@ def test_fault_options_stand_alone_or_take_a_share(tmp_path):
     told = json.loads(result.stdout)
     assert told["packets"] == 4000
     for name, share in (("lost", 0.1), ("corrupted", 0.05), ("reordered", 0.05)):
-        # Four sigma of a binomial count; a packet that is to be held back while another is held back goes on.
+        # Four sigma of a binomial count; a packet that is to be held back while another is held
+        # back goes on.
         assert told[name] == pytest.approx(4000 * share, abs=4 * np.sqrt(4000 * share) + 12)
 
 

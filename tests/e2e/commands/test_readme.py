@@ -23,8 +23,9 @@ def test_the_picture_is_what_the_program_makes(tmp_path):
     assert made.returncode == 0, made.stderr
     ours, theirs = (np.array(Image.open(path).convert("L")).astype(int) for path in (tmp_path / "p.png", ROOT / "readme.png"))
     assert ours.shape == theirs.shape
-    # Another driver may round a code the other way: the preview's power of 0.35 makes at most 40 grey levels of one, and a code
-    # that is written out differs in a hundred pixels of a million. Another field differs in 5000.
+    # Another driver may round a code the other way: the preview's power of 0.35 makes at most 40
+    # grey levels of one, and a code that is written out differs in a hundred pixels of a million.
+    # Another field differs in 5000.
     assert (np.abs(ours - theirs) > 40).mean() < 1e-3
 
 

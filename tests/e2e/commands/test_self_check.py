@@ -1,4 +1,6 @@
-"""The attitude that a source's self-check names, written in the source's own form, looks at the star that it names."""
+"""The attitude that a source's self-check names, written in the source's own form, looks at the
+star that it names.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ MOUNTING = [0.6, 0.48, -0.64, 0.0]
 ALNILAM = 26311
 # The line has seven digits, of MRPs as of quaternions (4e-7 rad at most).
 DIGITS_DEG = np.degrees(5e-7)
-# Alnilam stands 15 arcsec from the place that the line names, and a pixel of the small bench's tracker has 38.
+# Alnilam stands 15 arcsec from the place that the line names, and a pixel of the small bench's
+# tracker has 38.
 MIDDLE_PX = 0.5
 STATED = ("--epoch-utc", "2026-11-22T10:00:00", "--place=48.1,11.6,500")
 Numbers = list[float]
@@ -120,7 +123,9 @@ def bench(tmp_path: Path) -> Path:
 
 
 def looked_at(*arguments: object) -> tuple[dict, str, Numbers]:
-    """What `hilstar attitude` says, and of its self-check the words before the numbers, and the numbers."""
+    """What `hilstar attitude` says, and of its self-check the words before the numbers, and the
+    numbers.
+    """
     result = run_hilstar_here("attitude", *arguments, "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)

@@ -1,4 +1,6 @@
-"""[sky.bodies] and [spacecraft] through the commands: who is in the truth table, where, and what is refused."""
+"""[sky.bodies] and [spacecraft] through the commands: who is in the truth table, where, and what
+is refused.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +85,9 @@ def test_the_virtual_tracker_sees_the_same_bodies(bodies_file):
 
 
 def test_the_sun_in_view_overflows_nothing(bodies_file):
-    """1.6e18 electrons/s in one point: a detector's wells are full, the screen is white, and both say so."""
+    """1.6e18 electrons/s in one point: a detector's wells are full, the screen is white, and
+    both say so.
+    """
     for path, command in (("s.fits", ("simulate", "-o")), ("c.png", ("frame", "--codes"))):
         done = run_hilstar_here(
             command[0], bodies_file, "--radec", "236.056,-19.779,0", command[1], bodies_file.parent / path, "--json"
@@ -111,7 +115,9 @@ def test_a_frame_s_time_moves_bodies_and_comes_back_bit_for_bit(bodies_file):
 
 
 def test_shares_of_light_are_the_stars_own(bodies_file):
-    """The Sun's light is that of all stars many times over, and faint Neptune lights no pixel beside so bright a white."""
+    """The Sun's light is that of all stars many times over, and faint Neptune lights no pixel
+    beside so bright a white.
+    """
     text = bodies_file.read_text() + COARSE
     bodies_file.write_text(text)
     with load(bodies_file) as bench:
@@ -124,7 +130,9 @@ def test_shares_of_light_are_the_stars_own(bodies_file):
 
 
 def test_a_run_s_ledger_replays_bodies_bit_for_bit_and_summaries_name_what_clips(bodies_file):
-    """From a log of ten minutes that looks at the Moon: it crosses 300 arcsec, one and a half pixels."""
+    """From a log of ten minutes that looks at the Moon: it crosses 300 arcsec, one and a half
+    pixels.
+    """
     folder = bodies_file.parent
     q = from_radec_roll_deg(7.557, 7.141, 0.0)
     rows = [f"{t},{','.join(map(repr, q.tolist()))}" for t in range(0, 601, 60)]
@@ -181,7 +189,8 @@ def test_an_oem_of_the_same_orbit_shows_the_same_moon(bodies_file):
         bodies_file.write_text(text + f'[spacecraft]\norbit = "{orbit}"\n')
         with load(bodies_file) as bench:
             places.append(bench.stars.vectors[bench.stars.bodies.index("Moon") - len(bench.stars.bodies)].copy())
-    assert places[0] == pytest.approx(places[1], abs=5e-12)  # a microarcsecond; metres in their distance
+    # a microarcsecond; metres in their distance
+    assert places[0] == pytest.approx(places[1], abs=5e-12)
 
 
 def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodies_file):
@@ -191,7 +200,8 @@ def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodi
     text = bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source")
     bodies_file.write_text(text + '[spacecraft]\norbit = "station.oem"\n')
     done = run_hilstar_here("attitude", folder / "station.aem", "--bench", bodies_file, "--at", "30")
-    assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr  # how the tracker is mounted
+    # how the tracker is mounted
+    assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr
 
 
 @pytest.mark.parametrize(

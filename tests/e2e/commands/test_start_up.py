@@ -1,4 +1,6 @@
-"""What a command imports before it does anything: half a second of a start is imports, and each has to be wanted."""
+"""What a command imports before it does anything: half a second of a start is imports, and each
+has to be wanted.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ def test_the_first_frame_of_stars_alone_imports_nothing_that_only_others_need():
 
 
 def test_a_run_begins_no_other_process_by_what_it_imports():
-    """As the own search of glfw would, whose process says a traceback where a signal ends the start-up meanwhile."""
+    """As the own search of glfw would, whose process says a traceback where a signal ends the
+    start-up meanwhile.
+    """
     program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
     program += "import hilstar.cli.serve, hilstar.server.screen.gate; print('glfw' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}

@@ -1,4 +1,6 @@
-"""The operator's page of a run: what it is told, what it may do, and that it comes back and goes with the run."""
+"""The operator's page of a run: what it is told, what it may do, and that it comes back and goes
+with the run.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from tests.support.waiting import CHANCES, wait_for
 
 pytestmark = pytest.mark.e2e
 PAGE = "hilstar.server.console.server"
-# `stale_after_ms` is 250; then the next frame, a tick of the run's and one of the page's. What is left is for a busy machine.
+# `stale_after_ms` is 250; then the next frame, a tick of the run's and one of the page's. What is
+# left is for a busy machine.
 STALE_S, SEEN_S = 0.25, 0.5
 
 
@@ -158,7 +161,8 @@ def test_a_ledger_may_be_called_anything(tmp_path):
             status, said = page.control("ledger", on=True)
             assert (status, "/r\\xffun/hilstar-" in said["line"]) == (200, True)
             assert page.control("mark", text="still here")[0] == 200
-            wait_for(lambda: page.health_is(True))  # a busy machine may miss most frames of one second
+            # a busy machine may miss most frames of one second
+            wait_for(lambda: page.health_is(True))
         told = served.summary()["ledger"]
     assert told["failure"] is None
     found = run_hilstar_here("report", ledger, "-o", tmp_path / "report")
@@ -174,7 +178,8 @@ def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):
     frames = page.json("/state")["state"]["counts"]["frames"]
     os.kill(first, signal.SIGKILL)
     wait_for(lambda: [pid for pid in children(served.process.pid, PAGE) if pid != first])
-    assert page.json("/state")["state"]["counts"]["frames"] > frames  # the request waits at the door until there is a page
+    # the request waits at the door until there is a page
+    assert page.json("/state")["state"]["counts"]["frames"] > frames
     assert page.json("/health")["since"] == wrong_since
     said = "the operator's page ended (signal 9); it is started again"
     served.await_line(said)

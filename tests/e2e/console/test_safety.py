@@ -1,4 +1,6 @@
-"""The page against who should not get in: other names, other sites, wrong tokens, huge and slow requests, crowds."""
+"""The page against who should not get in: other names, other sites, wrong tokens, huge and slow
+requests, crowds.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +113,8 @@ def test_a_control_is_a_post_of_a_little_json(open_run):
     ):
         assert ask("/control/blank", "POST", body, JSON)[0] == 400, body
     assert ask("/control/mark", "POST", '{"text": "  "}', JSON)[0] == 400
-    assert ask("/control/patch", "POST", '{"level": 0.33}', JSON)[0] == 400  # never the nearest in silence
+    # never the nearest in silence
+    assert ask("/control/patch", "POST", '{"level": 0.33}', JSON)[0] == 400
     assert ask("/control/fault", "POST", '{"name": "x"}', JSON)[0] == 409
     assert not any(page.json("/state")["state"]["operator"].values())
 
@@ -164,7 +167,8 @@ def test_a_request_that_comes_slowly_is_dropped(local):
 def test_beyond_loopback_a_token_is_made_and_needed(open_run):
     served, page = open_run
     assert len(page.token) >= 40
-    assert sum(page.token in line for line in served.lines) == 1  # the address to open, and nowhere else
+    # the address to open, and nowhere else
+    assert sum(page.token in line for line in served.lines) == 1
     for given in ("", "Bearer", "Bearer wrong", f"Bearer {page.token}x", f"Basic {page.token}", f"Bearer {page.token[:-1]}"):
         for path in ("/state", "/health", "/metrics", "/sky"):
             assert page.ask(path, headers={"Authorization": given})[0] == 401
@@ -285,7 +289,9 @@ def test_a_wish_beyond_bounds_is_one_within_them(local, text):
 
 
 def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local):
-    """More of them than there are places, as browsers' pages with wishes: each that comes later has a place all the same."""
+    """More of them than there are places, as browsers' pages with wishes: each that comes later
+    has a place all the same.
+    """
     served, page = local
     own = {"Origin": f"http://127.0.0.1:{page.port}"}
     before = children(served.process.pid, "hilstar.server.console.server")

@@ -1,4 +1,6 @@
-"""SCPI of a run over real sockets, by PyVISA-py as a test stand has it; and by whoever sends it anything else."""
+"""SCPI of a run over real sockets, by PyVISA-py as a test stand has it; and by whoever sends it
+anything else.
+"""
 
 from __future__ import annotations
 
@@ -185,7 +187,8 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
         for _ in range(200):
             unread.sendall(b"*IDN?;" * 600 + b"\n")
     assert used_mb() < before_mb + RSS_MB
-    idle = [socket.create_connection(("127.0.0.1", port), PATIENCE_S) for _ in range(20)]  # more than are let in
+    # more than are let in
+    idle = [socket.create_connection(("127.0.0.1", port), PATIENCE_S) for _ in range(20)]
     with instrument(port) as opened:
         assert opened.ask("*IDN?").startswith("hilstar")
     for each in (unread, *idle):
@@ -213,7 +216,9 @@ def test_a_browser_is_not_listened_to(run, stand, request_line):
 
 
 def flooding(port: int, line: bytes, stop: threading.Event) -> None:
-    """Pipeline a line from PEERS connections, made anew where they are closed; their answers are read and dropped."""
+    """Pipeline a line from PEERS connections, made anew where they are closed; their answers are
+    read and dropped.
+    """
     peers: list[socket.socket] = []
     while not stop.is_set():
         while len(peers) < PEERS:
@@ -254,7 +259,8 @@ def test_peers_without_the_token_neither_stop_the_sky_nor_displace_its_controlle
                 waits_s.append(time.monotonic() - begun_s)
                 time.sleep(0.05)
             after = page.json("/state")["state"]["counts"]
-            assert stand.ask("*IDN?").startswith("hilstar") and stand.errors() == []  # the same connection, still let in
+            # the same connection, still let in
+            assert stand.ask("*IDN?").startswith("hilstar") and stand.errors() == []
         finally:
             stop.set()
             flood.join()

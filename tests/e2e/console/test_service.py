@@ -1,4 +1,6 @@
-"""A run as a service: what systemd is told, by a socket in its place; and that a run killed is soon back."""
+"""A run as a service: what systemd is told, by a socket in its place; and that a run killed is
+soon back.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +102,9 @@ def test_a_run_is_ready_with_its_first_frame_and_alive_while_frames_go_on(system
 
 
 def test_killed_and_started_again_it_shows_frames_within_three_seconds(systemd):
-    """In time of a free core: on a busy machine everything takes longer. docs/console-server.md has what the clock says."""
+    """In time of a free core: on a busy machine everything takes longer. docs/console-server.md
+    has what the clock says.
+    """
     with systemd.started() as process:
         systemd.told("READY=1")
         process.send_signal(signal.SIGKILL)

@@ -1,4 +1,6 @@
-"""The page of a session of first light: the patterns that the tracker looks at, and each step as it ends."""
+"""The page of a session of first light: the patterns that the tracker looks at, and each step as
+it ends.
+"""
 
 from __future__ import annotations
 

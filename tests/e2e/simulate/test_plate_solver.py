@@ -1,7 +1,8 @@
 """A plate solver that knows nothing of us finds the attitude that was commanded.
 
-cedar-solve (a fork of ESA's tetra3) brings its own star data, epoch 2024.0. It wants an old NumPy, so it gets an environment
-of its own. Near the poles its own proper motions are off by arcseconds, so the fields stay within 60 degrees of the equator.
+cedar-solve (a fork of ESA's tetra3) brings its own star data, epoch 2024.0. It wants an old NumPy,
+so it gets an environment of its own. Near the poles its own proper motions are off by arcseconds,
+so the fields stay within 60 degrees of the equator.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from tests.support.waiting import INSTALLED_WITHIN_S, PATIENCE_S
 # The issue's limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1
 CODES_LIMIT_ARCSEC = 2.0
-PICTURE_LIMIT_ARCSEC = 1.0  # for the virtual tracker's pictures, with its noise; measured 0.2 and 0.4
+# for the virtual tracker's pictures, with its noise; measured 0.2 and 0.4
+PICTURE_LIMIT_ARCSEC = 1.0
 STARS = {"linear": 30, "codes": 20}
 # Blobs whose second moments differ by more than this from the typical star's are two stars in one.
 WIDTH_TOLERANCE = {"linear": 0.01, "codes": 0.10}
@@ -66,7 +68,9 @@ def solver_python(tmp_path_factory) -> Path:
 
 
 def centroids(image: np.ndarray, width_tolerance: float) -> np.ndarray:
-    """Centres of gravity (y, x) of lone stars away from the edge, brightest first; NumPy and SciPy alone."""
+    """Centres of gravity (y, x) of lone stars away from the edge, brightest first; NumPy and
+    SciPy alone.
+    """
     labels, _ = ndimage.label(image > 0, np.ones((3, 3)))
     found = []
     for number, window in enumerate(ndimage.find_objects(labels), start=1):
@@ -127,13 +131,16 @@ def test_the_solved_attitude_is_the_commanded_one(solver_python, fields, kind, l
         assert solution["FOV"] == pytest.approx(20.0, abs=0.01)
 
 
-# How the tracker sits in Basilisk's body, and the field of 20 degrees that its camera is told to have.
+# How the tracker sits in Basilisk's body, and the field of 20 degrees that its camera is told to
+# have.
 MOUNTING = [0.6, 0.48, 0.64, 0.0]
 STAR_SIGMA = 8.0  # a pixel this far above the background is a star's
 
 
 def test_pictures_for_basilisk_s_camera_solve_to_basilisk_s_attitude(solver_python, tmp_path):
-    """The bytes that Basilisk's own image message points to, against the attitude that Basilisk recorded."""
+    """The bytes that Basilisk's own image message points to, against the attitude that Basilisk
+    recorded.
+    """
     port, pose = free_port(), rotation(MOUNTING)
     attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
     (tmp_path / "bench.toml").write_text(bench_text(FIELD, {"tracker": {"q_body_to_cam": MOUNTING}, "attitude": attitude}))
@@ -147,13 +154,15 @@ def test_pictures_for_basilisk_s_camera_solve_to_basilisk_s_attitude(solver_pyth
     assert "other-camera" not in summary["events"]
     times_ns = [500_000_000, 1_000_000_000]
     pictures = [np.array(Image.open(tmp_path / f"picture-{t_ns}.png")) for t_ns in times_ns]
-    assert all(picture.dtype == np.uint16 and not (picture & 15).any() for picture in pictures)  # 12 bits, the leading ones
+    # 12 bits, the leading ones
+    assert all(picture.dtype == np.uint16 and not (picture & 15).any() for picture in pictures)
     truth = Truth(tmp_path)
     found = [centroids(lit_pixels(picture >> 4), 0.3)[:40] for picture in pictures]
     for t_ns, solution in zip(times_ns, solved_fields(solver_python, found), strict=True):
         row = truth.row(t_ns)
         boresight = (pose * truth.body_from_n[row]).inv().apply([0, 0, 1])
-        # Stars stand nearer to where Basilisk's spacecraft flies, which the solver knows nothing of: v / c, to first order.
+        # Stars stand nearer to where Basilisk's spacecraft flies, which the solver knows nothing
+        # of: v / c, to first order.
         beta = truth.v_bn_n[row] / 299_792_458.0
         aberration = beta - beta @ boresight * boresight
         assert np.degrees(np.linalg.norm(aberration)) * 3600 > 2 * PICTURE_LIMIT_ARCSEC

@@ -44,7 +44,9 @@ def write_bench(folder: Path, *changes: dict, more: str = LIMIT) -> Path:
 
 
 def measured_monitor(folder: Path) -> dict:
-    """Changes to a monitor that was measured, as sRGB and without weights, and to a scale that was measured too."""
+    """Changes to a monitor that was measured, as sRGB and without weights, and to a scale that
+    was measured too.
+    """
     rows = "\n".join(f"{code},{light!r}" for code, light in enumerate(srgb_response(8).light.tolist()))
     (folder / "monitor.csv").write_text(f"code,w\n{rows}\n")
     (folder / "monitor.toml").write_text(NO_WEIGHTS)
@@ -85,7 +87,9 @@ def test_a_person_is_shown_the_difference(tmp_path):
 
 
 def test_what_the_calibration_refuses_is_not_proposed(tmp_path):
-    """A measured monitor without weights steals no bits, and a measured scale leaves no choice of full scale."""
+    """A measured monitor without weights steals no bits, and a measured scale leaves no choice
+    of full scale.
+    """
     path = write_bench(tmp_path, measured_monitor(tmp_path), more="[verify]\nflux_mag = 1e-5\ncentroid_px = 1e-5\n")
     _, summary = verified(path, "--propose")
     proposal = summary["proposal"]
@@ -97,7 +101,8 @@ def test_what_the_calibration_refuses_is_not_proposed(tmp_path):
 
 
 def test_the_smallest_change_of_a_magnitude_is_proposed(tmp_path):
-    """`exact` is there already, and full scale is measured: fainter stars go, by no more than the limits ask for.
+    """`exact` is there already, and full scale is measured: fainter stars go, by no more than the
+    limits ask for.
 
     Measured: 0.88 px off at 95 % to V = 6.5, 0.25 to V = 6.
     """
@@ -124,7 +129,9 @@ def test_a_bench_that_fails_for_its_geometry_gets_no_change_of_its_light(tmp_pat
 
 
 def write_true_lens(folder: Path, assumed: dict | None) -> Path:
-    """A bench that rounds, with a true lens, and with the lens that it assumes, by keys that differ from the true one."""
+    """A bench that rounds, with a true lens, and with the lens that it assumes, by keys that
+    differ from the true one.
+    """
     (folder / "truth.toml").write_text(TRUE_LENS)
     changes = {}
     if assumed is not None:
@@ -150,7 +157,9 @@ def test_behind_a_true_lens_that_the_bench_has_the_codes_are_mended(tmp_path):
     ],
 )
 def test_behind_another_true_lens_no_key_of_the_light_is_proposed(tmp_path, assumed, words):
-    """0.12 px off at 95 % by 0.3 px of the screen, the codes 0.01; all stars lost; 1.5 px off by tilt and lens."""
+    """0.12 px off at 95 % by 0.3 px of the screen, the codes 0.01; all stars lost; 1.5 px off by
+    tilt and lens.
+    """
     path = write_true_lens(tmp_path, assumed)
     before = path.read_text()
     code, summary = verified(path, "--write", "--strict")

@@ -83,7 +83,8 @@ def test_seeds_make_the_image_and_nothing_else_does(tmp_path):
     # Without noise the sky is one level; with it, the mean of many pixels is that level.
     quiet = clean == np.median(clean)
     assert quiet.mean() > 0.95
-    assert first[quiet].mean() == pytest.approx(np.median(clean), abs=0.6)  # half a DN of rounding, and 1e-3 of noise
+    # half a DN of rounding, and 1e-3 of noise
+    assert first[quiet].mean() == pytest.approx(np.median(clean), abs=0.6)
 
 
 def test_a_turn_smears_stars_and_keeps_their_flux(tmp_path):
@@ -102,7 +103,8 @@ def test_a_turn_smears_stars_and_keeps_their_flux(tmp_path):
         boxes = [image[y - 8 : y + 9, x - 12 : x + 13].astype(float).sum() for image in (still, turned)]
         same = moved[moved["hip"] == row["hip"]][0]
         assert np.hypot(same["x_px"] - row["x_px"], same["y_px"] - row["y_px"]) < 1e-6
-        # 16 bits clip nothing here but what rounding takes from faint wings: half a DN in 425 pixels.
+        # 16 bits clip nothing here but what rounding takes from faint wings: half a DN in 425
+        # pixels.
         assert boxes[1] == pytest.approx(boxes[0], rel=0.01)
 
 
@@ -161,7 +163,9 @@ def test_a_wrong_detector_gets_one_line(tmp_path, keys, words):
 
 
 def test_the_tracker_s_psf_may_be_an_image(tmp_path):
-    """A coma, whose light lies right of and below the stars' places: as bright, and the bench has another hash."""
+    """A coma, whose light lies right of and below the stars' places: as bright, and the bench
+    has another hash.
+    """
     fits.writeto(tmp_path / "coma.fits", sampled(coma(), 5, 7), fits.Header({"OVERSAMP": 5}))
     detector = {"gain_e_per_dn": 0.5, "bits": 16}
     images, hashes = [], []
@@ -181,7 +185,8 @@ def test_the_tracker_s_psf_may_be_an_image(tmp_path):
         light.append(stamp.sum())
         moved.append([(stamp.sum(axis=0) * at).sum(), (stamp.sum(axis=1) * at).sum()] / stamp.sum())
     assert light[1] == pytest.approx(light[0], rel=0.01)
-    # The profile's own first moment; the stamp's neighbours and the DN's rounding are in both images.
+    # The profile's own first moment; the stamp's neighbours and the DN's rounding are in both
+    # images.
     assert moved[1] - moved[0] == pytest.approx(0.45 * (0.28 * np.array([1.2, 0.5]) + 0.12 * np.array([3.0, 1.3])), abs=0.02)
     assert hashes[0] != hashes[1]
 

@@ -9,7 +9,8 @@ import pytest
 from tests.support.benches import ROOT
 from tests.support.commands import run_hilstar_here
 
-# Their comments say 0.005 mag or better; half of the limit is asked for, so that another seed passes too.
+# Their comments say 0.005 mag or better; half of the limit is asked for, so that another seed
+# passes too.
 SHARE_OF_LIMIT = 0.5
 
 

@@ -1,4 +1,6 @@
-"""From a traced bench through its dots and its geometry file to the twin's verdict; and a tracker with a flight model."""
+"""From a traced bench through its dots and its geometry file to the twin's verdict; and a
+tracker with a flight model.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ BENCH = bench_text(
         "render": {"quantisation": "exact"},
     }
 )
-TRUTH, MEASURED = (24, 60, 1e-3), (10, 25, 0.05)  # frames, dots, noise in px: as good as the truth, and of an afternoon
+# frames, dots, noise in px: as good as the truth, and of an afternoon
+TRUTH, MEASURED = (24, 60, 1e-3), (10, 25, 0.05)
 
 
 def calibrated(path, case, rng):

@@ -1,4 +1,6 @@
-"""The digital twin: a right bench passes, and each wrong one is caught for what is wrong with it."""
+"""The digital twin: a right bench passes, and each wrong one is caught for what is wrong with
+it.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,12 @@ from tests.support.commands import assert_refused, run_hilstar_here
 
 BENCH = bench_text(TWIN)
 FIELDS = "6"
-# Of a perfect monitor: a square pixel as nine points, the window's cut, and float32 sums. Measured 0.0013 px, 2e-5 mag.
+# Of a perfect monitor: a square pixel as nine points, the window's cut, and float32 sums. Measured
+# 0.0013 px, 2e-5 mag.
 FLOOR_PX = 0.004
 FLOOR_MAG = 1e-4
-# Each of a pixel's nine sprites is cut at 1e-6 of its light, as far as 4 px out and more on one side.
+# Each of a pixel's nine sprites is cut at 1e-6 of its light, as far as 4 px out and more on one
+# side.
 CUT_PX = 1e-4
 
 
@@ -64,7 +68,8 @@ def write_geometry_file(path: Path, lines: str) -> None:
     path.write_text(f'kind = "hilstar geometry 1"\nresolution_px = [640, 480]\n{table}{lines}\n')
 
 
-# What is planted, and the reasons that name it with its size: these and no others, but the centroids' own.
+# What is planted, and the reasons that name it with its size: these and no others, but the
+# centroids' own.
 PLANTED = {
     "distortion": ("k1 = 0.6", [r"the lens distorts by 2\.\d+ px \(k1 \+0\.6\)"]),
     "strong distortion": ("k1 = -2.5\nk2 = 20", [r"the lens distorts by 1\d\.\d+ px \(k1 -2\.5\)"]),
@@ -225,7 +230,9 @@ def twin(tmp_path_factory):
 
 
 def test_a_monitor_pixel_s_light_arrives_whole_and_where_it_belongs(twin):
-    """Against the tangent-plane scale: 57.65 um / 120 mm over 13 um / 25 mm is 0.9239 tracker pixels a monitor pixel."""
+    """Against the tangent-plane scale: 57.65 um / 120 mm over 13 um / 25 mm is 0.9239 tracker
+    pixels a monitor pixel.
+    """
     light = np.zeros((480, 640))
     light[300, 200] = 1e6
     image = twin.sky_optics.image_e_per_s(light)
@@ -234,7 +241,8 @@ def test_a_monitor_pixel_s_light_arrives_whole_and_where_it_belongs(twin):
     scale = (57.65e-3 / 120) / (13e-3 / 25)
     assert (image * x).sum() / image.sum() == pytest.approx(199.5 + (200 - 319.5) * scale, abs=CUT_PX)
     assert (image * y).sum() / image.sum() == pytest.approx(199.5 + (300 - 239.5) * scale, abs=CUT_PX)
-    # Its variance is the PSF's, a detector pixel's 1/12, and that of the square that a monitor pixel is.
+    # Its variance is the PSF's, a detector pixel's 1/12, and that of the square that a monitor
+    # pixel is.
     wanted = 0.55**2 + 1 / 12 + scale**2 / 12
     assert (image * (x - (image * x).sum() / image.sum()) ** 2).sum() / image.sum() == pytest.approx(wanted, rel=2e-3)
 

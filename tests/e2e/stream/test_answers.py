@@ -1,4 +1,6 @@
-"""Answers over real roads: a pty, UDP, TCP both ways, ZeroMQ and a growing file, read by a process of its own."""
+"""Answers over real roads: a pty, UDP, TCP both ways, ZeroMQ and a growing file, read by a
+process of its own.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def reading(folder: Path, keys: str, notices: Notices | None = None) -> Iterator
 
 
 def gathered(source: AnswersApart, count: int, again: Callable[[], object] = lambda: None) -> list[Answer]:
-    """So many answers; `again` sends where what was sent may have been lost before the road stood."""
+    """So many answers; `again` sends where what was sent may have been lost before the road
+    stood.
+    """
     found: list[Answer] = []
 
     def enough() -> bool:
@@ -159,7 +163,9 @@ def test_a_growing_file_counts_from_the_start_on_and_again_when_it_is_made_anew(
 
 @pytest.mark.parametrize("kind", ["device", "endless file"])
 def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
-    """A link to /dev/zero is let go; a file of zeros to 64 GB is read and dropped, no faster than a chunk each 10 ms."""
+    """A link to /dev/zero is let go; a file of zeros to 64 GB is read and dropped, no faster
+    than a chunk each 10 ms.
+    """
     path, notices = tmp_path / "tracker.bin", Notices()
     path.touch()
     with reading(tmp_path, 'source = "file"\npath = "tracker.bin"', notices) as source:
@@ -205,7 +211,9 @@ def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path,
 
 
 def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(tmp_path, rng):
-    """Half a second's worth of the bound, which would take a core for seconds: most of it is dropped, and answers go on."""
+    """Half a second's worth of the bound, which would take a core for seconds: most of it is
+    dropped, and answers go on.
+    """
     path, notices = tmp_path / "tracker.bin", Notices()
     fields = ", ".join(f'{{ name = "{name}", at = {4 * k}, type = "f32" }}' for k, name in enumerate(("qw", "qx", "qy", "qz")))
     keys = 'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength = 20\nchecksum = "crc32"\n'

@@ -1,4 +1,6 @@
-"""Links that the kernel stamps, or a process of their own: no stamp waits for Python's lock, and nothing ends the link."""
+"""Links that the kernel stamps, or a process of their own: no stamp waits for Python's lock, and
+nothing ends the link.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +42,14 @@ from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 from tests.support.wire.ptys import Cable
 
 HOLD_S = 0.5
-# A stamp that waits for the lock is late by the rest of the hold; a process that is merely woken late, on a machine whose cores
-# are all busy at normal priority, has been seen late by 0.05 s.
+# A stamp that waits for the lock is late by the rest of the hold; a process that is merely woken
+# late, on a machine whose cores are all busy at normal priority, has been seen late by 0.05 s.
 LATE_NS = 250_000_000
 
 
 HELD_S = 0.05
-# A datagram stamped when it is read is off by HELD_S or more; stamped on arrival it is off by microseconds.
+# A datagram stamped when it is read is off by HELD_S or more; stamped on arrival it is off by
+# microseconds.
 STAMP_NS = round(HELD_S / 2 * NS_PER_S)
 
 
@@ -109,7 +112,9 @@ def await_packet(link, put, number: int) -> None:
 
 
 def seen_late_ns(link, put) -> int:
-    """How late a message is stamped that leaves just before the lock is held; one that was read has come before it."""
+    """How late a message is stamped that leaves just before the lock is held; one that was read
+    has come before it.
+    """
     await_packet(link, put, 0)
     while link.receive(100):
         pass
@@ -149,7 +154,9 @@ def child_of(link) -> int:
 
 
 def test_a_reader_that_hangs_is_begun_again_at_once(caplog):
-    """Without waiting for the seconds that one gets which would run, on a machine whose cores are busy."""
+    """Without waiting for the seconds that one gets which would run, on a machine whose cores
+    are busy.
+    """
     with serial_road() as (link, put):
         await_packet(link, put, 0)
         before = link._reader.generation  # a busy machine may have begun it again already
@@ -239,7 +246,8 @@ def test_a_serial_line_that_was_unplugged_is_read_again_and_answers_go_out(tmp_p
 
 def test_basilisks_topic_and_long_messages_pass_through():
     notices = Notices()
-    long = bytes(1 << 20)  # over what a socket takes at once, and over what a link of packets takes at all
+    # over what a socket takes at once, and over what a link of packets takes at all
+    long = bytes(1 << 20)
     with publisher() as (sender, port):
         follower = Follower(None, Mounting(), DifferenceRates(10**9, 1.0), "attitude")
         with ZmqApart(vizard_broadcast(f"tcp://127.0.0.1:{port}", follower, notices=notices), notices) as link:
@@ -256,7 +264,9 @@ def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
         sender.connect(("127.0.0.1", datagrams.port))
 
         def held(count: int) -> list[tuple[int, int]]:
-            """How long after each began to be sent, and after it was sent, so many datagrams that were read late arrived."""
+            """How long after each began to be sent, and after it was sent, so many datagrams
+            that were read late arrived.
+            """
             sent_ns = []
             for _ in range(count):
                 before_ns = time.monotonic_ns()
@@ -266,7 +276,8 @@ def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
             taken = datagrams.take(2 * count)
             return [(each.host_ns - began, each.host_ns - ended) for each, (began, ended) in zip(taken, sent_ns, strict=True)]
 
-        # The kernel switches its stamps on from a work queue, some time after the socket asks for them.
+        # The kernel switches its stamps on from a work queue, some time after the socket asks for
+        # them.
         wait_for(lambda: held(1)[0][1] < STAMP_NS, "stamps")
         late_ns = held(5)
         datagrams.close()

@@ -1,4 +1,6 @@
-"""Basilisk itself drives `hilstar serve`: its own record of the attitude against every frame of the ledger."""
+"""Basilisk itself drives `hilstar serve`: its own record of the attitude against every frame of
+the ledger.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ from tests.support.sources.basilisk import Truth, basilisk, rotation
 from tests.support.sources.viz_message import craft, viz_message
 from tests.support.waiting import PATIENCE_S, is_connected_to, wait_for
 
-# Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half a second. The other
-# spacecraft is elsewhere, so that a choice of the wrong one is seen.
+# Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half
+# a second. The other spacecraft is elsewhere, so that a choice of the wrong one is seen.
 CHASER = [[0.512, 0.613, 0.596], [0.02, 0.027, 0.012]]
 TARGET = [[-0.3, 0.1, 0.2], [0.0, 0.01, 0.0]]
 MOUNTING = [0.6, 0.48, 0.64, 0.0]
@@ -30,11 +32,12 @@ FOCAL_PX = 60e3 / 57.65  # of the small bench's collimator and monitor
 CORNERS = np.array([[x, y, FOCAL_PX] for x in (-160, 0, 160) for y in (-120, 0, 120)])
 STAR_LIMIT_PX = 1e-3
 SUBSCRIBED_S = 0.3  # Basilisk does not tell whether a subscription has come over the connection
-SOME = 5  # of 60 messages and 72 frames: a machine with three times as many processes as cores keeps some 8
+# of 60 messages and 72 frames: a machine with three times as many processes as cores keeps some 8
+SOME = 5
 # sigma_BN is a double, as are all that is made of it; measured 4e-16.
 SAMPLE_LIMIT_RAD = 1e-14
-# Differences of three attitudes h apart: the rate's second derivative (1e-5 rad/s^3 here) times h^2 / 3 is 1.3e-9 at 20 ms,
-# and 3e-9 where a second message between them was lost.
+# Differences of three attitudes h apart: the rate's second derivative (1e-5 rad/s^3 here) times h^2
+# / 3 is 1.3e-9 at 20 ms, and 3e-9 where a second message between them was lost.
 RATE_LIMIT_RAD_S = 1e-8
 
 
@@ -48,7 +51,9 @@ def ledger_topics(path: Path) -> dict[str, list[dict]]:
 
 
 def star_errors_px(mine: Rotation, true: Rotation) -> np.ndarray:
-    """How far stars in the corners and the middle of the monitor are from where the true attitude has them."""
+    """How far stars in the corners and the middle of the monitor are from where the true
+    attitude has them.
+    """
     seen = (mine * true.inv()).apply(CORNERS)
     return np.linalg.norm(FOCAL_PX * seen[:, :2] / seen[:, 2:] - CORNERS[:, :2], axis=1)
 
@@ -107,7 +112,9 @@ def test_stars_of_every_frame_are_where_basilisk_s_truth_has_them(broadcast):
 
 
 def test_in_lockstep_every_step_is_one_frame(tmp_path):
-    """As fast as both go: two seconds of simulation in forty steps, each with the place from which the Earth is seen."""
+    """As fast as both go: two seconds of simulation in forty steps, each with the place from
+    which the Earth is seen.
+    """
     port = free_port()
     attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
     seen = {
@@ -155,7 +162,9 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
 
 
 def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_count(tmp_path):
-    """A hundred good ones, each followed by one that is cut short and by settings; and at the end a part too many."""
+    """A hundred good ones, each followed by one that is cut short and by settings; and at the
+    end a part too many.
+    """
     attitude = 'source = "vizard"\nspacecraft = "sat"'
     sigma = Rotation.from_rotvec([0.3, 0.4, 0.5]).as_mrp()
     with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:

@@ -1,4 +1,6 @@
-"""A run with a scenario and a stream of faults, over real sockets; and from its ledger the same pictures twice."""
+"""A run with a scenario and a stream of faults, over real sockets; and from its ledger the same
+pictures twice.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ STEP_S = 0.01
 
 
 def told(ledger: Path) -> list[str]:
-    """What the ledger of a run says so far of faults: those that began and ended, and the messages that were refused."""
+    """What the ledger of a run says so far of faults: those that began and ended, and the
+    messages that were refused.
+    """
     records = [json.loads(data) for data in read_messages(ledger, "/fault")]
     events = [json.loads(data)["kind"] for data in read_messages(ledger, "/event")]
     return [f"{each['event']} {each['name']}" for each in records] + ["refused"] * events.count("fault-refused")

@@ -1,4 +1,6 @@
-"""Floods of every kind at the socket of a real process: frames go on, memory and files are bounded, nothing is silent."""
+"""Floods of every kind at the socket of a real process: frames go on, memory and files are
+bounded, nothing is silent.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +110,8 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
         summary = served.summary()
     link = summary["link"]
     assert link["refused"] > 300
-    # How many of the 64 that were let in had their handshakes timed out by the end depends on how fast the cores are.
+    # How many of the 64 that were let in had their handshakes timed out by the end depends on how
+    # fast the cores are.
     assert link["rejected"] == summary["events"]["client-rejected"] > 0
     assert summary["ledger"]["failure"] is None
     assert summary["stale_frames"] - missed_in(waited.s) < summary["frames"] / 4, (summary, waited.s)
@@ -142,7 +145,9 @@ while time.monotonic() < end:
 
 
 def test_a_sender_of_long_messages_costs_another_s_packets_nothing(tmp_path):
-    """20 MB in 100 parts, again and again: dropping every connection for each lost many of the packets beside it."""
+    """20 MB in 100 parts, again and again: dropping every connection for each lost many of the
+    packets beside it.
+    """
     sequence = itertools.count()
     with bound(tmp_path) as served, connected(served.port) as good, connected(served.port) as long:
 
@@ -207,7 +212,9 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
     keys = 'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients = "mine/allowed_clients"'
 
     def heard(served: Served, own: Path, first: int, patience_s: float = PATIENCE_S) -> bool:
-        """Whether the ledger's count of frames shows an attitude of this client: a fresh one is told on stderr."""
+        """Whether the ledger's count of frames shows an attitude of this client: a fresh one is
+        told on stderr.
+        """
         with client(served.port, mine, own) as sender:
             told = len(served.lines)
             deadline_s = time.monotonic() + patience_s

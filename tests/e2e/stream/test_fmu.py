@@ -1,4 +1,6 @@
-"""A bench as an FMU, checked and driven by FMPy, which is another author's; with a tracker that answers."""
+"""A bench as an FMU, checked and driven by FMPy, which is another author's; with a tracker that
+answers.
+"""
 
 from __future__ import annotations
 

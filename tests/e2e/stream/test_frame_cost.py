@@ -1,4 +1,6 @@
-"""What one packet can ask of a frame: turns of 1 to 900 rad/s and retargets in a live stream, and in a replayed log."""
+"""What one packet can ask of a frame: turns of 1 to 900 rad/s and retargets in a live stream,
+and in a replayed log.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from tests.support.servers import serving, summary_of
 from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in
 
 RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
-# A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.
+# A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for
+# busy machines.
 MAX_FRAME_MS = 400.0
 MOVING = '[render]\nmotion = "on"\nquantisation = "round"\n'  # of exact codes a turn costs more
 
@@ -71,7 +74,9 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
 
 @pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])
 def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees):
-    """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame shows one place or the other."""
+    """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame
+    shows one place or the other.
+    """
     with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process, CoreWaits(process.pid) as waited:
         stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
         process.send_signal(signal.SIGTERM)

@@ -15,7 +15,8 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.rts_server import RtsServer
 from tests.support.waiting import CoreWaits
 
-# pyserial's client asks every 50 ms whether the server has set its line: a pulse is two of those, and 0.4 s apart.
+# pyserial's client asks every 50 ms whether the server has set its line: a pulse is two of those,
+# and 0.4 s apart.
 EVERY, REFRESH_HZ, SECONDS = 24, 60, 1.7
 APART_MS = 400.0
 
@@ -50,7 +51,8 @@ def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_pa
     assert told["lost"] == 0
     assert told["pulses"] >= 2, told
     assert min(down - up for up, down in pulses) >= 20e6
-    # Seen from the far port, against the grid of frames: what the summary calls jitter, and the socket's own.
+    # Seen from the far port, against the grid of frames: what the summary calls jitter, and the
+    # socket's own.
     rises_ms = np.array([up for up, _ in pulses]) / 1e6
     off_ms = rises_ms - rises_ms[0] - np.round((rises_ms - rises_ms[0]) / APART_MS) * APART_MS
     assert np.abs(off_ms).max() < APART_MS / 4 + 1000 * waited.s, (off_ms, waited.s)
@@ -60,7 +62,8 @@ def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_pa
 
 def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
     def cut():
-        while len(server.pulses()) < 2:  # the first is over for the run too, which waits for the server's word
+        # the first is over for the run too, which waits for the server's word
+        while len(server.pulses()) < 2:
             time.sleep(0.01)
         server.cut()
 

@@ -1,4 +1,6 @@
-"""A GPU that is lost, or has lost its memory in sleep, ends a run with exit code 3 and a ledger that can be read."""
+"""A GPU that is lost, or has lost its memory in sleep, ends a run with exit code 3 and a ledger
+that can be read.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from tests.support.commands import run_hilstar_here, run_started
 from tests.support.ledgers import read_run
 from tests.support.x11.screens import xvfb
 
-# hilstar's command line in which harm is done, once and for real, when the run first looks how long the machine has slept.
+# hilstar's command line in which harm is done, once and for real, when the run first looks how long
+# the machine has slept.
 PLANTED = """
 import sys
 from hilstar.server.bench import build
@@ -60,7 +63,9 @@ LOG_S = 4
 
 
 def planted(folder: Path, harm: str, slept_s: float, table: int = 0, quantisation: str = "round", **more):
-    """`replay --headless` (or with a window) of a log of LOG_S, with harm done in it; its ledger."""
+    """`replay --headless` (or with a window) of a log of LOG_S, with harm done in it; its
+    ledger.
+    """
     bench, ledger = folder / "bench.toml", folder / "run.mcap"
     bench.write_text(SMALL_BENCH + f'\n[render]\nquantisation = "{quantisation}"\n')
     log = still_log(folder / "still.csv", seconds=LOG_S)
@@ -75,7 +80,9 @@ def events_of(ledger: Path) -> list[str]:
 
 
 def assert_ended_early(ran, ledger: Path, folder: Path, *words: str) -> None:
-    """Exit code 3, a line that says why, a summary, and a ledger that says it too and that `report` reads."""
+    """Exit code 3, a line that says why, a summary, and a ledger that says it too and that
+    `report` reads.
+    """
     assert ran.returncode == 3, ran.stderr
     last = ran.stderr.splitlines()[-1]
     for word in words:
@@ -122,4 +129,5 @@ def test_a_window_s_own_table_that_changed_in_sleep_ends_the_run(tmp_path):
     with xvfb(tmp_path) as screen:
         ran, ledger = planted(tmp_path, "table", 60.0, table=-1, how="--windowed", env=screen.env)
     assert_ended_early(ran, ledger, tmp_path, "memory was lost in sleep, 1 of the tables")
-    assert "before the first frame" not in ran.stderr  # the window's own check of its codes leaves no error
+    # the window's own check of its codes leaves no error
+    assert "before the first frame" not in ran.stderr

@@ -22,7 +22,9 @@ from tests.support.x11.screens import recorded
 
 BODY = (0.7139, 0.1, -0.3, 0.6245)  # as a packet holds it; its norm is 1 within 1e-4
 SAME_RAD = 1e-9
-BEGUN_FRAMES = 60  # by then a head has told that it draws, in its own time; one that has not may take a minute to begin
+# by then a head has told that it draws, in its own time; one that has not may take a minute to
+# begin
+BEGUN_FRAMES = 60
 
 
 def children(parent: int) -> dict[str, int]:

@@ -1,4 +1,6 @@
-"""The ledger: everything of a run, through a kill and a full disk, and the same light when it is replayed."""
+"""The ledger: everything of a run, through a kill and a full disk, and the same light when it is
+replayed.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ LIMIT_BYTES = 20_000
 
 
 def stream(sender, count: int) -> None:
-    """A turn at 100 Hz, on a bench clock that stood at 50 s when it began; a wrong packet after each tenth."""
+    """A turn at 100 Hz, on a bench clock that stood at 50 s when it began; a wrong packet after
+    each tenth.
+    """
     start_ns = time.monotonic_ns()
     for k in range(count):
         run_ns = time.monotonic_ns() - start_ns
@@ -93,7 +97,9 @@ def test_every_packet_and_every_frame_is_there(tmp_path):
 
 
 def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
-    """A run that is recorded as pictures, and again from its ledger: with temporal dither each frame's codes are its own."""
+    """A run that is recorded as pictures, and again from its ledger: with temporal dither each
+    frame's codes are its own.
+    """
     log = tmp_path / "log.csv"
     rows = [propagate(START, np.array(RATE), k * 0.05) for k in range(9)]
     lines = [f"{k * 0.05},{','.join(repr(float(v)) for v in q)}" for k, q in enumerate(rows)]
@@ -136,7 +142,8 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
             process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
     assert found and frames
-    # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets reach to half a second of it.
+    # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets
+    # reach to half a second of it.
     within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000 - waited.s * NS_PER_S
     assert found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (found[-1].t_ns, frames[-1].t_ns, waited.s)
 

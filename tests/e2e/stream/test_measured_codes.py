@@ -1,4 +1,6 @@
-"""What codes cost is measured where a clock paces a run, stands in its ledger, and decides nowhere else."""
+"""What codes cost is measured where a clock paces a run, stands in its ledger, and decides
+nowhere else.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ def test_a_served_run_says_what_codes_cost_and_its_ledger_keeps_it(tmp_path):
     assert f"{MEASURED}{cheap_ms:g}, {best_ms:g}]" in codes_line(said)
     assert min(cheap_ms, best_ms) > 0
     assert head["quantisation"] in {"round", "exact"}
-    # A replay chooses as the run did, whatever it would measure itself; another command by the table.
+    # A replay chooses as the run did, whatever it would measure itself; another command by the
+    # table.
     for text in explained:
         assert "by [render] codes_ms" in codes_line(text)
         assert chosen_codes(text) == head["quantisation"]

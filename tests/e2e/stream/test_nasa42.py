@@ -1,4 +1,6 @@
-"""42 on a real TCP connection: what the real program sent, sent again at its own pace, and what else may come."""
+"""42 on a real TCP connection: what the real program sent, sent again at its own pace, and what
+else may come.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ from tests.support.waiting import PATIENCE_S, wait_for
 MOUNTING = (0.5, 0.5, -0.5, 0.5)
 STEP_S = 0.02
 RATE_RAD_S = np.radians([3.0, -8.0, 15.0])
-# Between 42's thirteen digits and hilstar's float64 lie some rotations; rates are exact to 1e-13, and predict 20 ms.
+# Between 42's thirteen digits and hilstar's float64 lie some rotations; rates are exact to 1e-13,
+# and predict 20 ms.
 FOLLOWED_RAD = 1e-9
 # Predicted for 0.25 s at most, by a rate that changes by 2.5e-3 rad/s in that time.
 NUTATED_RAD = 0.25 * 2.5e-3
@@ -49,7 +52,9 @@ def bench_of(folder: Path, *lines: str, mounting: tuple[float, ...] = MOUNTING) 
 
 
 def as_42(connection: socket.socket, messages: Iterable[bytes], step_s: float = STEP_S) -> int:
-    """Send each message at its time, as 42 does: only once the one before was acknowledged. How many were."""
+    """Send each message at its time, as 42 does: only once the one before was acknowledged. How
+    many were.
+    """
     connection.settimeout(PATIENCE_S)
     begin_s = time.monotonic()
     count = 0
@@ -89,7 +94,8 @@ def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
     samples = [reader.decode(each) for each in MESSAGES[:12]]
     frames = [frame for frame in frame_records(ledger) if frame.attitude_t_ns is not None]
     assert {frame.attitude_t_ns for frame in frames} <= {sample.t_ns for sample in samples}
-    for frame in frames:  # until the next message, an attitude is predicted by its rate, which nutates
+    # until the next message, an attitude is predicted by its rate, which nutates
+    for frame in frames:
         sample = samples[(frame.attitude_t_ns - samples[0].t_ns) // 100_000_000]
         predicted_ns = min(frame.light_ns - sample.t_ns, MAX_EXTRAPOLATION_NS)
         expected = propagate(sample.q_icrs_to_cam, sample.rate_cam_rad_s, predicted_ns / 1e9)
@@ -129,7 +135,9 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
 
 
 def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(tmp_path):
-    """Two hours of simulation, a message every 36 s: none is shown late, left out, or shown twice."""
+    """Two hours of simulation, a message every 36 s: none is shown late, left out, or shown
+    twice.
+    """
     drawn = []
     steps = [message(36.0 * k, turning(float(k)), RATE_RAD_S).encode() for k in range(200)]
     with (
@@ -179,7 +187,8 @@ def test_what_is_wrong_is_refused_by_reason_and_the_display_goes_on(tmp_path):
             connection, _ = listener.accept()
             with connection:
                 assert as_42(connection, [MESSAGES[0], *wrong, MESSAGES[1]]) == 6
-                connection.sendall(MESSAGES[2][:50])  # cut short: belongs to nothing after the connection is made anew
+                # cut short: belongs to nothing after the connection is made anew
+                connection.sendall(MESSAGES[2][:50])
             connection, _ = listener.accept()
             with connection:
                 assert as_42(connection, MESSAGES[3:5], 0.1) == 2

@@ -1,4 +1,6 @@
-"""Senders whose rates are not those of their quaternions, over real sockets: what is drawn, and where it is said."""
+"""Senders whose rates are not those of their quaternions, over real sockets: what is drawn, and
+where it is said.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ pytestmark = pytest.mark.e2e
 TURN_DEG_S = 0.5
 TURN_RAD_S = np.radians([0.0, 0.0, TURN_DEG_S])
 AS_DEG_S = (0.0, 0.0, TURN_DEG_S)  # as rad/s they turn the sky by 28 deg/s: 515 arcsec in 5 ms
-# Between exact quaternions the turn is exact; the clock's estimate is off by the road's delay, here of a busy machine.
+# Between exact quaternions the turn is exact; the clock's estimate is off by the road's delay, here
+# of a busy machine.
 MAX_OWN_ARCSEC = 0.5 * 3600 * TURN_DEG_S * 0.01
 MIN_BELIEVED_ARCSEC = 100.0  # of some 500 to 900, by how the packets fall between the frames
 FRAMES_AFTER = 90

@@ -17,7 +17,9 @@ CLOSES_WITHIN_S = 0.2  # libzmq closes a socket from a thread of its own
 
 @pytest.mark.parametrize("kind", ["packets", "vizard"])
 def test_who_asks_while_the_display_is_prepared_is_not_turned_away(kind: str) -> None:
-    """A REQ socket whose request is lost with a connection waits for ever: nothing that was connected may be closed."""
+    """A REQ socket whose request is lost with a connection waits for ever: nothing that was
+    connected may be closed.
+    """
     anywhere = "tcp://127.0.0.1:*"
     with ZmqLockstep(anywhere) if kind == "packets" else VizardLive(anywhere, follower()) as link:
         address = ("127.0.0.1", int(link.endpoint.rpartition(":")[2]))

@@ -93,7 +93,9 @@ def test_lost_corrupted_and_reordered_packets_add_up(cable, bench_file):
 
 
 def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
-    """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32 rate predicts in 100 ms."""
+    """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32
+    rate predicts in 100 ms.
+    """
     rate = np.radians([0.0, 0.0, 20.0])
     with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
         faults = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), road.put)
@@ -121,7 +123,9 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
 
 
 def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
-    """A second and a half of packets in the kernel's buffer and at the sender, which had to wait for room."""
+    """A second and a half of packets in the kernel's buffer and at the sender, which had to wait
+    for room.
+    """
     with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
         stop = threading.Event()
         faults = BadCable(Faults(0, 0, 0), np.random.default_rng(7), road.put)
@@ -135,7 +139,8 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
         sender.join()
     assert summary["packets"]["refused"] == 0
     assert summary["clock"]["jumps"] == 0
-    # Both ends have one clock; what is left after the first seconds is the line's delay, or half of an exchange's.
+    # Both ends have one clock; what is left after the first seconds is the line's delay, or half of
+    # an exchange's.
     assert abs(summary["clock"]["offset_ms"]) < summary["clock"]["uncertainty_ms"] + 2.0
     assert age_ns < 250_000_000
     assert summary["receive_latency_ms"]["p50"] < 30
@@ -161,14 +166,17 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
         summary = interrupted(process)
     assert summary["reconnects"] == 1
     assert summary["packets"]["accepted"] == 100
-    assert summary["stale_events"] >= 1, summary  # a second where the last packet is old before the end
-    # Frames go on at 60 Hz through the whole second without a line and the rest, to the last one begun.
+    # a second where the last packet is old before the end
+    assert summary["stale_events"] >= 1, summary
+    # Frames go on at 60 Hz through the whole second without a line and the rest, to the last one
+    # begun.
     assert lasted_s > 2.0
     assert summary["frames"] + summary["missed_frames"] >= 60 * lasted_s - 2
 
 
 def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(cable, bench_file):
-    bench_file.write_text(bench_file.read_text() + "time_requests = false\n")  # an answer would end the garbage
+    # an answer would end the garbage
+    bench_file.write_text(bench_file.read_text() + "time_requests = false\n")
     with listening(bench_file, "reading serial:") as process:
         with SerialSender(str(cable.sender), BAUD) as road:
             for _ in range(50):
@@ -194,7 +202,9 @@ def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
 
 @best_of_three("a busy machine writes less than a flood to its pty")
 def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_order(tmp_path):
-    """Every packet in a write of its own, as a USB-CDC device sends them, whatever its baud rate, to the end."""
+    """Every packet in a write of its own, as a USB-CDC device sends them, whatever its baud
+    rate, to the end.
+    """
     master, slave = os.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)

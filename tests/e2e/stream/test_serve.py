@@ -45,7 +45,9 @@ SUMMARY_KEYS |= {
 
 
 def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
-    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes of no form."""
+    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes
+    of no form.
+    """
     with publisher() as (sender, port), serving(tmp_path, port) as process, CoreWaits(process.pid) as waited:
         process.shows()
         start = time.monotonic_ns()
@@ -69,7 +71,8 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
     assert packets["received"] == 1500
     assert packets["refused_by"] == {"crc": 100, "norm": 100, "nan": 100, "time": 100, "format": 100}
     assert packets["refused"] == 500
-    # A frame or a missed one for each sixtieth of the five seconds, whatever else the machine had to do.
+    # A frame or a missed one for each sixtieth of the five seconds, whatever else the machine had
+    # to do.
     assert summary["frames"] + summary["missed_frames"] >= 299
     assert summary["frames"] + missed_in(waited.s) > 200, (summary, waited.s)
     assert summary["stars_drawn"]["max"] > 0
@@ -161,7 +164,9 @@ def test_a_silent_sender_shows_blank_frames_and_ends_in_order(tmp_path):
 
 @pytest.mark.parametrize(("on_stale", "stars_at_end"), [("hold", True), ("blank", False)])
 def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale, stars_at_end):
-    """One packet, then a second of silence: the frames after 100 ms are stale, and blank only where that was asked."""
+    """One packet, then a second of silence: the frames after 100 ms are stale, and blank only
+    where that was asked.
+    """
     attitude = f'stale_after_ms = 100\nmax_extrapolation_ms = 50\non_stale = "{on_stale}"'
     with publisher() as (sender, port), serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process:
         process.shows()
@@ -206,7 +211,8 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
             for k in range(50):
                 sender.send(packet(k, start_ns + k * 5_000_000))
                 time.sleep(0.005)
-            # What arrives before the first frame teaches the clock nothing; a loaded machine takes seconds to draw that.
+            # What arrives before the first frame teaches the clock nothing; a loaded machine takes
+            # seconds to draw that.
             while start_ns and "the first attitude has come" not in (line := process.stderr.readline()):
                 assert line, "serve ended before its first frame"
             time.sleep(0.5)  # between the two runs
@@ -226,7 +232,9 @@ def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
 
 
 def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
-    """Packets and JSON, a simulator's time that runs at any speed and goes back, and what is wrong: each gets its answer."""
+    """Packets and JSON, a simulator's time that runs at any speed and goes back, and what is
+    wrong: each gets its answer.
+    """
     port = free_port()
     with serving(tmp_path, port, attitude="lockstep = true") as process, connected(port, zmq.REQ) as asker:
         for k in range(50):
@@ -273,7 +281,9 @@ def test_send_beyond_loopback_needs_keys_too():
 
 
 def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
-    """hilstar binds, with an allow-list; the stranger has keys of its own, and the server's public one."""
+    """hilstar binds, with an allow-list; the stranger has keys of its own, and the server's
+    public one.
+    """
     port = free_port()
     for directory in ("mine", "strange"):
         assert run_hilstar_here("keys", "-o", tmp_path / directory).returncode == 0
@@ -309,7 +319,9 @@ def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
 
 
 def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
-    """50 000 messages of 200 kB as fast as they go: what hilstar keeps of them is bounded, and frames go on."""
+    """50 000 messages of 200 kB as fast as they go: what hilstar keeps of them is bounded, and
+    frames go on.
+    """
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         process.shows()
         message = bytes(200_000)

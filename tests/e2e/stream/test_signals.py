@@ -1,4 +1,6 @@
-"""Signals, from outside: every command is gone within a second, whatever it is at, and leaves no process behind."""
+"""Signals, from outside: every command is gone within a second, whatever it is at, and leaves no
+process behind.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def test_a_hang_up_ends_nothing_under_nohup(tmp_path):
 
 
 def ends(process: subprocess.Popen, number: int) -> tuple[int, str, str]:
-    """Exit code and what was said, after a signal; within a second, and nothing of its session is left."""
+    """Exit code and what was said, after a signal; within a second, and nothing of its session
+    is left.
+    """
     with CoreWaits(process.pid) as waited:
         begin_s = time.monotonic()
         process.send_signal(number)
@@ -104,7 +108,9 @@ def serve_file(folder: Path, port: int, more: str = "") -> Path:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_run_in_order(tmp_path, number):
-    """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`; not where SIGHUP is (nohup)."""
+    """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`; not
+    where SIGHUP is (nohup).
+    """
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port):
         command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
@@ -139,7 +145,9 @@ def test_a_draw_without_end_is_ended(tmp_path, small_bench_file, number, before)
 
 
 def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench_file):
-    """There the GL library is called by Python and calls Python, and an exception of that is a crash."""
+    """There the GL library is called by Python and calls Python, and an exception of that is a
+    crash.
+    """
     before = (
         "import os, signal, _moderngl\nmake = _moderngl.make_uniform\n"
         "def told(*arguments):\n    os.kill(os.getpid(), signal.SIGINT)\n    return make(*arguments)\n"
@@ -154,7 +162,9 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
 
 
 def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_python_s(tmp_path):
-    """numba's LLVM does: ctypes prints an exception that comes of a callback, and goes on. Here qsort does, with no numba."""
+    """numba's LLVM does: ctypes prints an exception that comes of a callback, and goes on. Here
+    qsort does, with no numba.
+    """
     before = (
         "import ctypes, os, signal\nfrom hilstar.instruments.study.speed import benchmark\n"
         "kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\n"
@@ -171,7 +181,9 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
 
 
 def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
-    """Python runs a handler between any two steps of the main thread, and there it may hold the lock of what it waits for."""
+    """Python runs a handler between any two steps of the main thread, and there it may hold the
+    lock of what it waits for.
+    """
     before = (
         "import os, signal\nfrom hilstar.basics.process.scheduling import HostClock\nwait = HostClock.wait_until\n"
         "def told(clock, due_ns, stop):\n    with stop._cond:\n        os.kill(os.getpid(), signal.SIGINT)\n"
@@ -193,18 +205,22 @@ def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
         process.send_signal(signal.SIGTERM)
         time.sleep(0.2)
-        with repeating(lambda: process.send_signal(signal.SIGTERM), 0.15):  # a watcher that was held up takes two for one
+        # a watcher that was held up takes two for one
+        with repeating(lambda: process.send_signal(signal.SIGTERM), 0.15):
             _, _, err = ends(process, signal.SIGTERM)
     assert "second signal" in err
 
 
 def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_path):
-    """The ledger's writer never returns from a write: the summary comes all the same, says it, and the exit code is 1."""
+    """The ledger's writer never returns from a write: the summary comes all the same, says it,
+    and the exit code is 1.
+    """
     still = "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
     command = ["serve", str(serve_file(tmp_path, free_port())), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
     with running(program(*command, before=still)) as process:
         assert process.stderr is not None
-        while b"no attitude yet" not in (line := process.stderr.readline()):  # said after two seconds of frames
+        # said after two seconds of frames
+        while b"no attitude yet" not in (line := process.stderr.readline()):
             assert line
         code, out, err = ends(process, signal.SIGTERM)
     assert code == 1, err
@@ -275,7 +291,9 @@ def test_a_summary_that_nobody_reads_does_not_hold_up_the_end(tmp_path):
 
 
 def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
-    """A DEALER that leaves out the empty part: libzmq's poll says that something is there, and nothing ever is."""
+    """A DEALER that leaves out the empty part: libzmq's poll says that something is there, and
+    nothing ever is.
+    """
     port = free_port()
     context = zmq.Context()
     wrong, right = context.socket(zmq.DEALER), context.socket(zmq.REQ)

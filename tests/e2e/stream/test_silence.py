@@ -21,13 +21,16 @@ from tests.support.live_runs import median_age_ns, serve_until
 from tests.support.senders import LYRA, ORION, free_port, packet, publisher, talking
 from tests.support.servers import serving, summary_of, until_said
 
-# The road's delay on a loaded machine; the sender's clock is this process's own, so the offset is that delay alone.
+# The road's delay on a loaded machine; the sender's clock is this process's own, so the offset is
+# that delay alone.
 MAX_MIN_DELAY_MS = 2.0
 
 
 @pytest.mark.parametrize("queued_s", [0.3, 1.5])
 def test_packets_that_waited_for_the_display_mislead_nobody(small_bench_file, queued_s):
-    """The link is open while the display is measured: what queues up there is shown, and teaches no clock."""
+    """The link is open while the display is measured: what queues up there is shown, and teaches
+    no clock.
+    """
     with (
         publisher() as (sender, port),
         ZmqReceiver(f"tcp://127.0.0.1:{port}") as link,
@@ -67,7 +70,9 @@ def test_silence_and_its_end_are_said_while_they_happen(tmp_path):
 
 
 def test_a_sender_that_hangs_is_stale_in_every_frame_and_nothing_flickers(small_bench_file):
-    """A turn of 1 deg/s for a second, then its last packet at 500 Hz: shown as it was last predicted, and stale to the end."""
+    """A turn of 1 deg/s for a second, then its last packet at 500 Hz: shown as it was last
+    predicted, and stale to the end.
+    """
     rate = (0.0, 0.0, 0.0174533)
     with publisher() as (sender, port), ZmqReceiver(f"tcp://127.0.0.1:{port}") as link, load(small_bench_file) as bench:
         stop, hangs = threading.Event(), threading.Event()

@@ -42,7 +42,8 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
         while words not in seen:
             assert time.monotonic() < deadline_s, f"no {words!r} in {seen[-2000:]}"
             if select.select([ours], [], [], 0.1)[0]:
-                raw += os.read(ours, 65536)  # which may end within a letter, or within an escape sequence
+                # which may end within a letter, or within an escape sequence
+                raw += os.read(ours, 65536)
                 seen = ESCAPES.sub("", raw.decode(errors="ignore"))
 
     with publisher() as (sender, port):

@@ -1,4 +1,6 @@
-"""`temporal`, whose frames hang on those before them: a live run's ledger gives its codes again, whatever the run missed."""
+"""`temporal`, whose frames hang on those before them: a live run's ledger gives its codes again,
+whatever the run missed.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,8 @@ def test_a_live_run_is_replayed_from_its_ledger_code_for_code_and_from_its_middl
     assert all(np.array_equal(codes[number], again[number]) for number in codes)
     assert max(levels.max() for levels in codes.values()) > 0
     assert later.keys() < codes.keys()
-    # From the middle stars begin anew: other codes about the same light, all but a few within a level.
+    # From the middle stars begin anew: other codes about the same light, all but a few within a
+    # level.
     apart = np.concatenate(
         [np.abs(codes[number].astype(int) - later[number])[codes[number] != later[number]] for number in later]
     )

@@ -1,4 +1,6 @@
-"""A tracker in the loop: a stub of it in a process of its own, on a serial line, before a real run with its page and ledger."""
+"""A tracker in the loop: a stub of it in a process of its own, on a serial line, before a real
+run with its page and ledger.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +93,9 @@ def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_p
 
 
 def follow(page: Any, count: int) -> tuple[list[float], dict[str, Any]]:
-    """How long after its writing each of so many answers reached the page, s, and the last one's figures."""
+    """How long after its writing each of so many answers reached the page, s, and the last one's
+    figures.
+    """
     delays_s: list[float] = []
     with live(page) as link:
         for message in link.messages():

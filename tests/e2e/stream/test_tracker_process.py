@@ -1,4 +1,6 @@
-"""`hilstar tracker` before a running display, over real sockets and a pty; a watcher that stands still holds up no frame."""
+"""`hilstar tracker` before a running display, over real sockets and a pty; a watcher that stands
+still holds up no frame.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ pytestmark = pytest.mark.e2e
 
 ARCSEC = 180 * 3600 / np.pi
 SPIN_RAD_S = np.radians(0.2)
-# Of the tracker alone, before anything is planted: 400 x 400 pixels of 107 arcsec, some 20 stars; measured 0.6 and 6 arcsec.
+# Of the tracker alone, before anything is planted: 400 x 400 pixels of 107 arcsec, some 20 stars;
+# measured 0.6 and 6 arcsec.
 OWN_ARCSEC = (5.0, 5.0, 40.0)
 BIAS = (100.0, -50.0, 300.0)
 
@@ -78,7 +81,8 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
         answers = [json.loads(ear.recv(65536)) for _ in range(found["answers"])]
     assert len(answers) >= 5
     assert answers[0]["mode"] == "lost in space"
-    assert found["modes"]["tracking"] >= len(answers) / 2  # all but the first, unless the machine is too busy to follow
+    # all but the first, unless the machine is too busy to follow
+    assert found["modes"]["tracking"] >= len(answers) / 2
     assert np.all(np.abs(found["own_bias_arcsec"]) < OWN_ARCSEC)
     assert np.all(np.array(found["own_sigma_arcsec"]) < OWN_ARCSEC)
     rows = read_telemetry(tmp_path / "answers.csv")
@@ -111,7 +115,9 @@ def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(di
 
 
 def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display):
-    """The example's solver gets a FITS file; on a busy machine it takes seconds, and the exposure after that one follows."""
+    """The example's solver gets a FITS file; on a busy machine it takes seconds, and the
+    exposure after that one follows.
+    """
     solver = f"{sys.executable} {ROOT / 'examples' / 'star_solver.py'} {{image}} {25e3 / 13}"
     with tracker(display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver) as process:
         found = summary(process)
@@ -121,7 +127,9 @@ def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display
 
 
 def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():
-    """64 frames of 4 MB: the sockets' buffers and the few that are kept for it are full after some."""
+    """64 frames of 4 MB: the sockets' buffers and the few that are kept for it are full after
+    some.
+    """
     head = FrameHead(0, 0, 4096, 256, 8)
     big = ShownFrame(head, np.arange(4096 * 256, dtype=np.uint32), np.ones(4096 * 256, dtype=np.uint8))
     context = zmq.Context()

@@ -96,7 +96,9 @@ def as_json(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("form", [bytes, as_json], ids=["packets", "JSON"])
 def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[bytes], bytes]):
-    """A turn of 20 deg/s; datagrams lost, corrupted, reordered, every fifth twice: each attitude drawn is that of its time."""
+    """A turn of 20 deg/s; datagrams lost, corrupted, reordered, every fifth twice: each attitude
+    drawn is that of its time.
+    """
     count = doubled = 0
     port = free_port()
     allowed, notices = AllowedSenders(), Notices()
@@ -225,7 +227,8 @@ def unread_bytes(port: int) -> int:
 
 def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     port = free_port()
-    # For a second, and until stdin closes: a machine without a free core takes longer to send more than may come.
+    # For a second, and until stdin closes: a machine without a free core takes longer to send more
+    # than may come.
     flood = "import select, socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
     flood += "end = time.time() + 1\n"
     flood += "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _ in range(500)]"
@@ -239,7 +242,8 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
         process.has_accepted(20)
         summary = interrupted(process)
     assert summary["packets"]["accepted"] == 20
-    assert 1 <= summary["events"]["flood"] <= 3  # one, and more where the sender stood still for a second
+    # one, and more where the sender stood still for a second
+    assert 1 <= summary["events"]["flood"] <= 3
     assert summary["link"]["flooded"] > 500
     assert summary["frames"] + summary["missed_frames"] >= 60
 

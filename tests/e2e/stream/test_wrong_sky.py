@@ -1,4 +1,6 @@
-"""A sky that is wrong though its attitudes are fresh: where it is said while it lasts, and what is said of the run after it."""
+"""A sky that is wrong though its attitudes are fresh: where it is said while it lasts, and what
+is said of the run after it.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ Sent = Callable[[int, np.ndarray, tuple[float, ...]], dict[str, object]]
 
 @contextmanager
 def turning(sender: zmq.Socket, sent: Sent) -> Iterator[None]:
-    """A sender that turns by TURN_RAD_S at 100 Hz, and says what `sent` makes of time, attitude and rate."""
+    """A sender that turns by TURN_RAD_S at 100 Hz, and says what `sent` makes of time, attitude
+    and rate.
+    """
     from_ns, sequences = time.time_ns(), itertools.count(1)
 
     def say() -> None:
@@ -97,7 +101,9 @@ def test_a_conjugate_is_said_with_the_line_to_write(tmp_path):
 
 
 def test_what_only_a_person_can_judge_is_said_at_the_first_attitude(tmp_path):
-    """A conjugate without rates is as good a quaternion: where it points is said, and the page has the same."""
+    """A conjugate without rates is as good a quaternion: where it points is said, and the page
+    has the same.
+    """
     with bound(tmp_path, "--console", "127.0.0.1:0") as served:
         page = page_of(served)
         with connected(served.port) as sender, turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}):

@@ -1,4 +1,6 @@
-"""Benches by chance: a bench file as its user writes it from data sheets, and the truth that the user does not know."""
+"""Benches by chance: a bench file as its user writes it from data sheets, and the truth that the
+user does not know.
+"""
 
 from __future__ import annotations
 
@@ -44,10 +46,12 @@ EXPOSURES_S = (0.05, 0.1, 0.2, 0.5)  # 20 s of the longest are answers enough fo
 REFRESH_HZ = 60
 STARS_IN_FIELD = 40  # that a user wants, and chooses the faintest magnitude for
 DECADES_FAINTER = 5.5  # magnitudes from the brightest star that is shown whole to the faintest
-# Hipparcos has 0.12 stars to a square degree up to V = 6 and three times as many a magnitude fainter.
+# Hipparcos has 0.12 stars to a square degree up to V = 6 and three times as many a magnitude
+# fainter.
 STARS_A_DEG2_AT_6, STARS_A_MAG = 0.12, 0.48
 FAINTEST_V_MAG = (4.0, 9.5)
-# Electrons a second and a square metre from V = 0 through 0.85 of glass with a quantum efficiency of 0.6 over the visible.
+# Electrons a second and a square metre from V = 0 through 0.85 of glass with a quantum efficiency
+# of 0.6 over the visible.
 V0_E_PER_S_M2 = 1.5e10
 FAINTEST_SNR = 5.0
 GRID = (9, 16)
@@ -135,7 +139,9 @@ class DrawnBench:
 
 
 def drawn_bench(seed: int, number: int, *, is_small: bool = False) -> DrawnBench:
-    """Bench `number` of a seed; the same whatever other benches are drawn. A small one has few pixels, and is another."""
+    """Bench `number` of a seed; the same whatever other benches are drawn. A small one has few
+    pixels, and is another.
+    """
     rng = np.random.default_rng((seed, number))
     while True:
         panel, detector = _panel(rng), _detector(rng)
@@ -220,7 +226,9 @@ def _mounting(rng: np.random.Generator, detector: Detector) -> Mounting:
 
 
 def _with_sky(bench: DrawnBench) -> DrawnBench:
-    """The faintest star and the exposure that a user takes: so many stars in view, each above the noise."""
+    """The faintest star and the exposure that a user takes: so many stars in view, each above
+    the noise.
+    """
     across, down = bench.detector.tangents
     field_deg2 = math.degrees(2 * math.atan(across)) * math.degrees(2 * math.atan(down))
     field_deg2 *= min(1.0, 1 / bench.seen)
@@ -246,7 +254,8 @@ def true_light(panel: Panel) -> FloatArray:
     elif panel.law == "gamma":
         light = codes**panel.gamma
     else:
-        # Between a power law and a logistic's rise: steep in the middle, flat towards white, still rising everywhere.
+        # Between a power law and a logistic's rise: steep in the middle, flat towards white, still
+        # rising everywhere.
         rise = np.tanh(2.2 * codes - 0.4) + np.tanh(0.4)
         light = codes ** (panel.gamma - 1) * rise
         light = light / light[-1]
@@ -254,7 +263,9 @@ def true_light(panel: Panel) -> FloatArray:
 
 
 def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
-    """Write bench.toml, which knows nothing of the truth, and truth.toml with its files; their paths."""
+    """Write bench.toml, which knows nothing of the truth, and truth.toml with its files; their
+    paths.
+    """
     panel, detector, mounting = bench.panel, bench.detector, bench.mounting
     tracker = {
         "aperture_mm": round(detector.focal_mm / detector.f_number, 2),

@@ -1,6 +1,8 @@
-"""What a bench by chance came to: each figure of its session against the plant, and the outcome in one word.
+"""What a bench by chance came to: each figure of its session against the plant, and the outcome in
+one word.
 
-Places and light are compared on the screen's own pixels, so that a mounting that was found differently is an error like any.
+Places and light are compared on the screen's own pixels, so that a mounting that was found
+differently is an error like any.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from tests.support.any_bench.draw import DrawnBench, true_light
 
 STEPS = ("orientation", "focus", "warm-up", "geometry", "uniformity", "photometry", "scale", "latency", "verify")
 MAX_SIGMAS = 4.0
-REFUSED_CODE = 2  # the file was wrong: any other end without a step is a fault of the program or the machine
+# the file was wrong: any other end without a step is a fault of the program or the machine
+REFUSED_CODE = 2
 MAX_MEMORY_MB = 2048.0
 PLACES = 41  # along each side of the screen
 DECADES = (1e-1, 1e-2, 1e-3)
@@ -50,7 +53,9 @@ FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
 
 @dataclass(frozen=True)
 class CommandResult:
-    """A command that has ended: exit code (None where it was stopped for its time), what it took and printed."""
+    """A command that has ended: exit code (None where it was stopped for its time), what it took
+    and printed.
+    """
 
     code: int | None
     seconds: float
@@ -77,7 +82,9 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A figure as it was found and as it was planted, and the difference in its own sigmas; None where it has none."""
+    """A figure as it was found and as it was planted, and the difference in its own sigmas; None
+    where it has none.
+    """
 
     found: float | str
     planted: float | str
@@ -107,7 +114,9 @@ def in_image(monitor: Monitor, x_px: FloatArray, y_px: FloatArray) -> tuple[Floa
 
 @dataclass(frozen=True)
 class SeenScreen:
-    """Pixels of the screen that the tracker sees: where bench and truth have them on the detector, and how bright."""
+    """Pixels of the screen that the tracker sees: where bench and truth have them on the
+    detector, and how bright.
+    """
 
     bench_px: FloatArray
     truth_px: FloatArray
@@ -137,7 +146,9 @@ class SeenScreen:
 
     @property
     def off_px(self) -> FloatArray:
-        """How far the bench file has each place from where it is, tracker pixels (n,); NaN where it has none."""
+        """How far the bench file has each place from where it is, tracker pixels (n,); NaN where
+        it has none.
+        """
         return np.asarray(np.hypot(*(self.bench_px - self.truth_px)))
 
     @property
@@ -225,7 +236,9 @@ def _sigmas(off: float, error: float | None) -> float | None:
 
 
 def held_by_certificate(found: Mapping[str, Any]) -> dict[str, tuple[int, int]]:
-    """How many intervals of a virtual bench's certificate hold the truth, and how many there are, of each quantity."""
+    """How many intervals of a virtual bench's certificate hold the truth, and how many there
+    are, of each quantity.
+    """
     counts: dict[str, tuple[int, int]] = {}
     for figure in found.get("figures", []):
         if figure.get("truth") is None:
@@ -242,7 +255,9 @@ def outcome_of(results: Mapping[str, CommandResult], compared: Mapping[str, Comp
 
 
 def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparison]) -> tuple[str, str] | None:
-    """What must never happen: a traceback, a figure beyond its sigmas, a command that takes too much memory."""
+    """What must never happen: a traceback, a figure beyond its sigmas, a command that takes too
+    much memory.
+    """
     for name, result in results.items():
         if "Traceback" in result.stderr:
             return TRACEBACK, f"{name}: {result.last_line}"
@@ -257,7 +272,9 @@ def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparis
 
 
 def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
-    """A session that is refused or fails, and a bench that its twin does not pass; None where all is well."""
+    """A session that is refused or fails, and a bench that its twin does not pass; None where
+    all is well.
+    """
     session = results[FIRST_LIGHT]
     steps = {step["name"]: step for step in session.found.get("steps", [])}
     if not steps:
@@ -283,7 +300,9 @@ def _without_steps(session: CommandResult) -> tuple[str, str]:
 
 
 def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
-    """A later command that fails, or the star that was said to be too wide; None where all is well."""
+    """A later command that fails, or the star that was said to be too wide; None where all is
+    well.
+    """
     later = [name for name in COMMANDS[2:] if name in results and results[name].code]
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)

@@ -1,4 +1,6 @@
-"""The commands of a bench by chance, one after the other; each result is a file, and what is there is not run again."""
+"""The commands of a bench by chance, one after the other; each result is a file, and what is
+there is not run again.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ MB = 1024.0  # of ru_maxrss, kB
 
 
 def run_bench(seed: int, number: int, folder: Path, limit_s: float = LIMIT_S, *, keep: bool = False) -> dict[str, Any]:
-    """The row of a bench: taken from `folder` where it is there, else of the commands that are still to run."""
+    """The row of a bench: taken from `folder` where it is there, else of the commands that are
+    still to run.
+    """
     row_path = folder / ROW
     if row_path.exists():
         return dict(json.loads(row_path.read_text()))
@@ -90,7 +94,9 @@ def _result(folder: Path, limit_s: float, name: str, *words: str) -> CommandResu
 
 
 def _ended(folder: Path, limit_s: float, commands: dict[str, Sequence[str]]) -> list[CommandResult]:
-    """Commands that run side by side, the last of them to its end; their results, which are written too."""
+    """Commands that run side by side, the last of them to its end; their results, which are
+    written too.
+    """
     started_s = time.monotonic()
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     running: dict[str, subprocess.Popen[bytes]] = {}

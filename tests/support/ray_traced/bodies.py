@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-COLUMN_KM, COLUMN_STEPS = 1500.0, 3000  # each way along a ray: 175 km up at the end, at which exp(-22) of the air is left
+# each way along a ray: 175 km up at the end, at which exp(-22) of the air is left
+COLUMN_KM, COLUMN_STEPS = 1500.0, 3000
 TABLE_KM = np.linspace(0.0, 400.0, 81)  # the logarithm is as good as straight
 HEIGHT_ROUNDS = 6  # of Bowring's iteration: 1e-9 km
 
@@ -16,8 +17,8 @@ HEIGHT_ROUNDS = 6  # of Bowring's iteration: 1e-9 km
 class Body:
     """A spheroid at `centre_km` from the observer; all vectors (3,) in the axes of the rays.
 
-    `normal` is the radiance where sunlight and sight are at right angles to the ground. `air` is the scale height, km, and the
-    depth straight down.
+    `normal` is the radiance where sunlight and sight are at right angles to the ground. `air` is
+    the scale height, km, and the depth straight down.
     """
 
     centre_km: np.ndarray
@@ -52,12 +53,15 @@ def sunlit(mu0: np.ndarray, mu: np.ndarray) -> np.ndarray:
 
 
 def traced(body: Body, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (n,) and the share (n,) of what lies behind that comes through, along rays (n, 3) of any length."""
+    """Radiance (n,) and the share (n,) of what lies behind that comes through, along rays (n, 3)
+    of any length.
+    """
     d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     turn = _axes(body.pole)
     squeeze = np.array([1 / body.equator_km, 1 / body.equator_km, 1 / body.polar_km])
     p, q = -(turn @ body.centre_km) * squeeze, (d @ turn.T) * squeeze
-    # |p + t q| = 1; by the ray's nearest point, which keeps the digits that b^2 - a c would lose at a far body
+    # |p + t q| = 1; by the ray's nearest point, which keeps the digits that b^2 - a c would lose at
+    # a far body
     nearest = -(q @ p) / np.einsum("ij,ij->i", q, q)
     from_centre = p + nearest[:, None] * q
     half = 1.0 - np.einsum("ij,ij->i", from_centre, from_centre)
@@ -76,7 +80,9 @@ def traced(body: Body, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def limb(body: Body, count: int) -> np.ndarray:
-    """Directions (count, 3) of the limb all round: rays that touch the spheroid, by the polar plane of the observer."""
+    """Directions (count, 3) of the limb all round: rays that touch the spheroid, by the polar
+    plane of the observer.
+    """
     turn = _axes(body.pole)
     axes = np.array([body.equator_km, body.equator_km, body.polar_km])
     p = -(turn @ body.centre_km) / axes
@@ -98,7 +104,9 @@ def _axes(pole: np.ndarray) -> np.ndarray:
 
 
 def _air(body: Body, d: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance and share let through of rays (n, 3) beside the ground: the light of one that touches it, by depth."""
+    """Radiance and share let through of rays (n, 3) beside the ground: the light of one that
+    touches it, by depth.
+    """
     _, up, tau = columns(body, d)
     full = float(np.exp(_log_columns(body)[0]))
     lit = body.normal * np.maximum(up @ turn @ body.sun, 0.0)
@@ -106,7 +114,8 @@ def _air(body: Body, d: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def columns(body: Body, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Height (n,), km, and vertical (n, 3) in the body's axes where unit rays (n, 3) are lowest, and their air's depth (n,).
+    """Height (n,), km, and vertical (n, 3) in the body's axes where unit rays (n, 3) are lowest,
+    and their air's depth (n,).
 
     The depth is that over a globe as curved as the ground is there along the ray.
     """
@@ -140,7 +149,9 @@ def direct_columns(body: Body, d: np.ndarray) -> np.ndarray:
 
 
 def _log_columns(body: Body) -> np.ndarray:
-    """Logarithm of the depth of rays that are lowest at TABLE_KM above a globe as large as the equator, step by step."""
+    """Logarithm of the depth of rays that are lowest at TABLE_KM above a globe as large as the
+    equator, step by step.
+    """
     assert body.air is not None
     scale_km, depth = body.air
     steps = np.linspace(-COLUMN_KM, COLUMN_KM, COLUMN_STEPS)
@@ -149,7 +160,9 @@ def _log_columns(body: Body) -> np.ndarray:
 
 
 def _above(places: np.ndarray, body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Geodetic height, km, and the vertical of places (..., 3) in the body's axes, by Bowring's iteration."""
+    """Geodetic height, km, and the vertical of places (..., 3) in the body's axes, by Bowring's
+    iteration.
+    """
     a, c = body.equator_km, body.polar_km
     rho, z = np.hypot(places[..., 0], places[..., 1]), places[..., 2]
     tan_u = z / np.maximum(rho, 1e-9) * (a / c)

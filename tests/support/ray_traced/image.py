@@ -1,4 +1,6 @@
-"""What a camera's pixels collect of a body, by many rays a pixel, and where an image has its limb."""
+"""What a camera's pixels collect of a body, by many rays a pixel, and where an image has its
+limb.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,12 @@ BLOCK = 1 << 14  # rays at once: they stay in a cache
 def image(
     body: Body, rays: Directions, resolution_px: tuple[int, int], rng: np.random.Generator, across: int = 4, at_limb: int = 24
 ) -> np.ndarray:
-    """Of radiance times solid angle, each pixel's (height, width); `rays` gives the directions (n, 3) of pixels (n,), (n,).
+    """Of radiance times solid angle, each pixel's (height, width); `rays` gives the directions
+    (n, 3) of pixels (n,), (n,).
 
-    Each pixel has `across` squared rays, one anywhere in each of as many squares; those where one ray in some meets the body
-    and another does not, or where brightness changes by much, have `at_limb` squared.
+    Each pixel has `across` squared rays, one anywhere in each of as many squares; those where one
+    ray in some meets the body and another does not, or where brightness changes by much, have
+    `at_limb` squared.
     """
     width, height = resolution_px
     y, x = (part.ravel().astype(float) for part in np.mgrid[:height, :width])
@@ -92,12 +96,16 @@ def _sampled(
 
 
 def blurred(sharp: np.ndarray, sigma_px: tuple[float, float]) -> np.ndarray:
-    """An image whose pixels' light is spread by a Gaussian, each as if it came evenly from its own square; dark beyond it."""
+    """An image whose pixels' light is spread by a Gaussian, each as if it came evenly from its
+    own square; dark beyond it.
+    """
     return _kernel(sharp.shape[0], sigma_px[1]) @ sharp @ _kernel(sharp.shape[1], sigma_px[0]).T
 
 
 def _kernel(size: int, sigma_px: float) -> np.ndarray:
-    """What each pixel of a line gets of each other's light (size, size): a Gaussian averaged over both pixels."""
+    """What each pixel of a line gets of each other's light (size, size): a Gaussian averaged
+    over both pixels.
+    """
 
     def twice(t: float) -> float:  # the integral of the integral of a Gaussian
         return t * (1 + erf(t / (sigma_px * 2**0.5))) / 2 + sigma_px * np.exp(-((t / sigma_px) ** 2) / 2) / (2 * np.pi) ** 0.5
@@ -108,9 +116,11 @@ def _kernel(size: int, sigma_px: float) -> np.ndarray:
 
 
 def edge_px(picture: np.ndarray, places: np.ndarray, outward: np.ndarray, reach_px: float = 5.0) -> np.ndarray:
-    """How far outward of places (n, 2) on a limb an image falls to half of what it has `reach_px` inside, px.
+    """How far outward of places (n, 2) on a limb an image falls to half of what it has `reach_px`
+    inside, px.
 
-    `outward` (n, 2) are unit vectors. NaN where the image is dark inside. Between pixels the image is a cubic spline.
+    `outward` (n, 2) are unit vectors. NaN where the image is dark inside. Between pixels the image
+    is a cubic spline.
     """
     steps = np.arange(-reach_px, reach_px + 0.05, 0.05)
     at = places[:, None, :] + steps[None, :, None] * outward[:, None, :]

@@ -27,7 +27,9 @@ def cic_text(rows: Sequence[str], comment: str = "", **meta: str | None) -> str:
 def stk_text(
     rows: Sequence[str], form: str = "AttitudeTimeQuaternions", end: str = "END Attitude", **keywords: str | None
 ) -> str:
-    """An attitude file of STK of these rows; `keywords` changes those of its head, and None leaves one out."""
+    """An attitude file of STK of these rows; `keywords` changes those of its head, and None
+    leaves one out.
+    """
     lines = ["stk.v.11.0", "# made by a test", "BEGIN Attitude", f"NumberOfAttitudePoints {len(rows)}"]
     lines += [f"{key} {value}" for key, value in (STK_KEYWORDS | keywords).items() if value is not None]
     return "\n".join([*lines, form, *rows, end, ""])

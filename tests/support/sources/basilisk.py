@@ -47,7 +47,9 @@ def basilisk(folder: Path, **scenario: Any) -> Iterator[Basilisk]:
 
 
 class Truth:
-    """What Basilisk recorded: times (ns, since the beginning), attitudes, rates (rad/s, body), v and r (m/s and m, N)."""
+    """What Basilisk recorded: times (ns, since the beginning), attitudes, rates (rad/s, body), v
+    and r (m/s and m, N).
+    """
 
     def __init__(self, folder: Path) -> None:
         with np.load(folder / "truth.npz") as table:

@@ -1,8 +1,9 @@
 """A tumbling spacecraft in Basilisk, in a process of its own: python basilisk_run.py SCENARIO.json
 
-The scenario says how it is shown ("broadcastStream" in real time, "liveStream" or "noDisplay" as fast as the other side
-answers), where it begins, and its camera, if it has one. Basilisk's own record of every step goes to `truth` (.npz), and each
-picture that its camera got to `pictures`-<ns>.png. Its sockets are open before it waits for a line on stdin.
+The scenario says how it is shown ("broadcastStream" in real time, "liveStream" or "noDisplay" as
+fast as the other side answers), where it begins, and its camera, if it has one. Basilisk's own
+record of every step goes to `truth` (.npz), and each picture that its camera got to
+`pictures`-<ns>.png. Its sockets are open before it waits for a line on stdin.
 """
 
 from __future__ import annotations

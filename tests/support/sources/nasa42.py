@@ -1,10 +1,12 @@
 """42's stream as 42 wrote it, its own report of the same run, and messages of the same form.
 
-`stream_2025.txt` is what commit 11e3cc3 (27 March 2025) of github.com/ericstoneking/42 sent, built with
-`make GUIFLAG= SHADERFLAG=`; `report_2025.csv` has columns of its output files time.42, svn.42, svb.42, qbn.42, PosN.42 and
-PosW.42 of that run: InOut/ as it comes, but PASSIVE_FSW, 6 s of 0.1 s, 2, -1.5 and 3 deg/s at the start, only the Earth and its
-Moon, prefixes "SC[0].B[0]" and "SC[0].svb". `stream_2024.txt` is the beginning of what commit 0019f24 (2 January 2024) sends,
-the form until 2025.
+`stream_2025.txt` is what commit 11e3cc3 (27 March 2025) of github.com/ericstoneking/42 sent, built
+with
+`make GUIFLAG= SHADERFLAG=`; `report_2025.csv` has columns of its output files time.42, svn.42,
+svb.42, qbn.42, PosN.42 and PosW.42 of that run: InOut/ as it comes, but PASSIVE_FSW, 6 s of 0.1 s,
+2, -1.5 and 3 deg/s at the start, only the Earth and its Moon, prefixes "SC[0].B[0]" and
+"SC[0].svb". `stream_2024.txt` is the beginning of what commit 0019f24 (2 January 2024) sends, the
+form until 2025.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ BEGIN_NS = 1_712_534_400_000_000_000  # 2024-04-08 00:00:00 UTC
 
 
 def report() -> dict[int, dict[str, FloatArray]]:
-    """42's own figures by time (ns, as hilstar counts): `svn`, `svb`, `q` (scalar last), `posn_m`, `posw_m`."""
+    """42's own figures by time (ns, as hilstar counts): `svn`, `svb`, `q` (scalar last),
+    `posn_m`, `posw_m`.
+    """
     rows = {}
     with (FOLDER / "report_2025.csv").open() as file:
         for row in csv.DictReader(file):
@@ -38,7 +42,8 @@ def report() -> dict[int, dict[str, FloatArray]]:
 def message(
     seconds_of_day: float, n_to_b: Rotation, rate: FloatArray | None = None, *, old: bool = False, number: int = 0
 ) -> str:
-    """A message of 8 April 2024: vectors turn from N to B by `n_to_b`; rate in B, rad/s. 42's q is then that of B to N.
+    """A message of 8 April 2024: vectors turn from N to B by `n_to_b`; rate in B, rad/s. 42's q is
+    then that of B to N.
 
     That it is so is what the recorded stream shows.
     """

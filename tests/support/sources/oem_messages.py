@@ -14,7 +14,9 @@ STATION = TleOrbit(STATION_TLE, "station.tle")
 
 
 def segment(seconds: Iterable[float], ahead_s: float = 0.0, day_of_year: bool = False, **keywords: str | None) -> str:
-    """One segment of the station's orbit at these seconds after START_NS, in a scale that is so far ahead of UTC."""
+    """One segment of the station's orbit at these seconds after START_NS, in a scale that is so
+    far ahead of UTC.
+    """
     meta = {
         "OBJECT_NAME": "ISS",
         "OBJECT_ID": "1998-067A",

@@ -1,4 +1,6 @@
-"""Bags as ROS programs write them: rosbags's own writers, and for MCAP the mcap library with ROS's schemas."""
+"""Bags as ROS programs write them: rosbags's own writers, and for MCAP the mcap library with
+ROS's schemas.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""SPICE kernels written for tests by the CSPICE of spiceypy: C-kernels of all types, and the text kernels that they need."""
+"""SPICE kernels written for tests by the CSPICE of spiceypy: C-kernels of all types, and the
+text kernels that they need.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ SCLK01_COEFFICIENTS_{name}   = ( 0.0 {start_s!r} 1.0 )
 
 
 def frame_kernel(name="PROBE_BUS", number=BODY):
-    """A frame kernel that names a structure, and a fixed frame PROBE_TABLE, 30 degrees about z from J2000."""
+    """A frame kernel that names a structure, and a fixed frame PROBE_TABLE, 30 degrees about z
+    from J2000.
+    """
     return rf"""KPL/FK
 \begindata
 FRAME_{name}          = {number}
@@ -94,7 +98,9 @@ class Motion:
         return self._first * swing * self._axis * spin
 
     def rate(self, seconds, h=1e-3):
-        """rad/s in the structure's components, by a difference of fourth order: h^4 w^5 / 30 = 1e-15, rounding 1e-13."""
+        """rad/s in the structure's components, by a difference of fourth order: h^4 w^5 / 30 =
+        1e-15, rounding 1e-13.
+        """
         one, two = ((self.turn(seconds - n * h).inv() * self.turn(seconds + n * h)).as_rotvec() / (2 * n * h) for n in (1, 2))
         return (4 * one - two) / 3
 
@@ -127,7 +133,9 @@ def new_ck(path):
 
 
 def write_segment(handle, kind, motion, times, body=BODY, reference="J2000", rates=True, starts=None, subtype=1):
-    """One segment of a type at times in seconds; `starts` are those of the intervals that it interpolates in."""
+    """One segment of a type at times in seconds; `starts` are those of the intervals that it
+    interpolates in.
+    """
     ticks = np.asarray(times, dtype=float) * TICKS_PER_S
     head = (handle, ticks[0], ticks[-1], body, reference)
     q = quaternions(motion, times)
@@ -168,7 +176,9 @@ def _sign(motion, t, q):
 
 
 def write_type_2(handle, steps, body=BODY, reference="J2000"):
-    """Intervals (start s, stop s, turn to the reference at the start, rate in the reference's components)."""
+    """Intervals (start s, stop s, turn to the reference at the start, rate in the reference's
+    components).
+    """
     starts, stops = (np.array([step[k] for step in steps]) * TICKS_PER_S for k in (0, 1))
     q = np.array([np.roll(step[2].inv().as_quat(), 1) for step in steps])
     rate = np.array([step[3] for step in steps])
@@ -179,7 +189,9 @@ def write_type_2(handle, steps, body=BODY, reference="J2000"):
 
 
 def write_type_6(handle, motion, spans, body=BODY, reference="J2000", rates=True, subtype=3):
-    """Mini-segments over spans (arrays of times in s), by CSPICE's own Fortran routine, which spiceypy does not wrap."""
+    """Mini-segments over spans (arrays of times in s), by CSPICE's own Fortran routine, which
+    spiceypy does not wrap.
+    """
     ticks = [np.asarray(span) * TICKS_PER_S for span in spans]
     packets = np.ascontiguousarray(np.vstack([packets_of(motion, span, subtype) for span in spans]))
     bounds = np.array([span[0] for span in ticks] + [ticks[-1][-1]])
@@ -204,7 +216,9 @@ def write_type_6(handle, motion, spans, body=BODY, reference="J2000", rates=True
 
 
 def write_texts(folder, **texts):
-    """Text kernels beside a CK: leap seconds and the clock, unless `texts` (file stem to text) says otherwise."""
+    """Text kernels beside a CK: leap seconds and the clock, unless `texts` (file stem to text)
+    says otherwise.
+    """
     files = {"leap.tls": LEAP_SECONDS, "clock.tsc": clock_kernel()} | {name.replace("_", "."): t for name, t in texts.items()}
     for name, text in files.items():
         if text is not None:

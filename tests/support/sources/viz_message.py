@@ -1,4 +1,6 @@
-"""Basilisk's VizMessage by Google's own protobuf library: the fields that hilstar reads, and two that it skips."""
+"""Basilisk's VizMessage by Google's own protobuf library: the fields that hilstar reads, and two
+that it skips.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,8 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-# Numbers and types as in Basilisk's vizMessage.proto: name, number, type (a message's by its name), repeated.
+# Numbers and types as in Basilisk's vizMessage.proto: name, number, type (a message's by its name),
+# repeated.
 FIELDS: dict[str, list[tuple[str, int, str, bool]]] = {
     "TimeStamp": [("frameNumber", 1, "int64", False), ("simTimeElapsed", 2, "double", False)],
     "Spacecraft": [

@@ -1,4 +1,6 @@
-"""A serial line without hardware: two real ptys whose masters are joined, so that both ends open a device."""
+"""A serial line without hardware: two real ptys whose masters are joined, so that both ends open
+a device.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from tests.support.waiting import real_time
 
 
 class Cable:
-    """`sender` and `host` are paths to open; `pull` takes the line away, `plug` brings it back under the same paths."""
+    """`sender` and `host` are paths to open; `pull` takes the line away, `plug` brings it back
+    under the same paths.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.sender, self.host = folder / "ttySender", folder / "ttyHost"

@@ -17,7 +17,8 @@ def greeted(port: int, kind: bytes = b"PUB") -> socket.socket:
     connection = socket.create_connection(("127.0.0.1", port))
     ready = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
     connection.sendall(GREETING + b"\x04" + bytes([len(ready)]) + ready)
-    with contextlib.suppress(TimeoutError):  # a message before the other's READY is against the protocol
+    # a message before the other's READY is against the protocol
+    with contextlib.suppress(TimeoutError):
         connection.settimeout(SILENT_S)
         said = b""
         while len(said) < 66 or len(said) < 66 + said[65]:

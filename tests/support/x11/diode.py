@@ -1,4 +1,6 @@
-"""A photodiode: a watcher of the X server's real frame buffer that tells of edges on a serial line."""
+"""A photodiode: a watcher of the X server's real frame buffer that tells of edges on a serial
+line.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from tests.support.x11.screens import Screen
 
 
 class Diode:
-    """Watches the screen's bottom left pixel and tells of its edges on a serial line, `added_ms` late."""
+    """Watches the screen's bottom left pixel and tells of its edges on a serial line, `added_ms`
+    late.
+    """
 
     def __init__(self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
         self._file, self._line, self._added_s, self._device = screen.file, line, added_ms / 1e3, device_clock
@@ -39,7 +43,8 @@ class Diode:
                     seen_s = time.monotonic()
                     level = not level
                     stamp = f",{(seen_s - started_s + 1000 + self._added_s) * 1e6:.0f}" if self._device else ""
-                    time.sleep(0.001 if self._device else self._added_s)  # the line itself is late, the stamp is not
+                    # the line itself is late, the stamp is not
+                    time.sleep(0.001 if self._device else self._added_s)
                     os.write(out, f"{int(level)}{stamp}\n".encode())
                 time.sleep(0.0001)
             os.close(out)

@@ -1,4 +1,6 @@
-"""Xvfb, whose screen is read back from its own frame buffer, and a run of hilstar in a window on it."""
+"""Xvfb, whose screen is read back from its own frame buffer, and a run of hilstar in a window on
+it.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ SCREEN = "640x480x24"
 
 @dataclass
 class Screen:
-    """An X server: its process, what to put into DISPLAY, and the file of its screen (X window dump)."""
+    """An X server: its process, what to put into DISPLAY, and the file of its screen (X window
+    dump).
+    """
 
     process: subprocess.Popen[bytes]
     display: str
@@ -50,7 +54,9 @@ class Screen:
 
 @contextmanager
 def xvfb(folder: Path, screen: str = SCREEN) -> Iterator[Screen]:
-    """An X server whose screen is in a file of `folder`, on the first display number that is free."""
+    """An X server whose screen is in a file of `folder`, on the first display number that is
+    free.
+    """
     read, write = os.pipe()
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", screen, "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
     with (folder / "server.log").open("wb") as told:
@@ -113,7 +119,9 @@ def recorded(ledger: Path) -> list[FrameRecord]:
 
 
 def codes_of(bench_file: Path) -> np.ndarray:
-    """The code values of the attitude, by another command and without a window; (height, width, 3)."""
+    """The code values of the attitude, by another command and without a window; (height, width,
+    3).
+    """
     path = bench_file.parent / "codes.png"
     assert run_hilstar_here("frame", bench_file, "--quaternion", ATTITUDE, "--codes", path).returncode == 0
     with Image.open(path) as picture:
@@ -122,9 +130,12 @@ def codes_of(bench_file: Path) -> np.ndarray:
 
 
 def lines_over(codes: np.ndarray, keys: str) -> np.ndarray:
-    """The codes with a grid of 100 px about the boresight, and the crosshair through it, of code 96."""
+    """The codes with a grid of 100 px about the boresight, and the crosshair through it, of
+    code 96.
+    """
     rows, columns = np.mgrid[0 : codes.shape[0], 0 : codes.shape[1]]
-    # The middle of 640 x 480 is at 319.5, 239.5; the screen has its lines at whole pixels, half rounded to even.
+    # The middle of 640 x 480 is at 319.5, 239.5; the screen has its lines at whole pixels, half
+    # rounded to even.
     dx, dy = columns - 320, rows - 240
     wanted = codes.copy()
     if "g" in keys:

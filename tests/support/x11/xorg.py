@@ -1,4 +1,6 @@
-"""A real X.Org server with the dummy driver: monitors with names and refresh rates, gamma ramps, and plugs to pull."""
+"""A real X.Org server with the dummy driver: monitors with names and refresh rates, gamma ramps,
+and plugs to pull.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,9 @@ class Xorg:
 
     @contextmanager
     def property(self, output: str, name: str, value: str | bytes | tuple[int, ...]) -> Iterator[None]:
-        """An output with a property, as a driver gives it: a word (an atom), bytes, or integers of 32 bits."""
+        """An output with a property, as a driver gives it: a word (an atom), bytes, or integers
+        of 32 bits.
+        """
         x11, xrandr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
         pointer, number = ctypes.c_void_p, ctypes.c_ulong
         x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = pointer, [ctypes.c_char_p]
@@ -118,7 +122,9 @@ class Xorg:
 
 @contextmanager
 def xorg(folder: Path) -> Iterator[Xorg]:
-    """An X server with one monitor DUMMY0 of 640 x 480 at 59.94 Hz, also 119.88, and a second, DUMMY1, to be switched on."""
+    """An X server with one monitor DUMMY0 of 640 x 480 at 59.94 Hz, also 119.88, and a second,
+    DUMMY1, to be switched on.
+    """
     config, log = folder / "xorg.conf", folder / "xorg.log"
     config.write_text(SERVER_CONFIG)
     read, write = os.pipe()

@@ -1,4 +1,6 @@
-"""What goes back to the sender: statuses at their rate, time requests while they are due, and the exchanges they complete."""
+"""What goes back to the sender: statuses at their rate, time requests while they are due, and
+the exchanges they complete.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +113,9 @@ def test_a_request_of_the_sender_is_answered_with_its_own_time_and_the_arrival()
 
 
 class Answering(Wire):
-    """A sender 7 s ahead that sends an attitude each millisecond and answers time requests at once."""
+    """A sender 7 s ahead that sends an attitude each millisecond and answers time requests at
+    once.
+    """
 
     def __init__(self) -> None:
         super().__init__()

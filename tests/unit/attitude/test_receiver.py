@@ -1,4 +1,6 @@
-"""What a stream does to the receiver: what waited, who sends, what hangs, what breaks. Times are simulated: known exactly."""
+"""What a stream does to the receiver: what waited, who sends, what hangs, what breaks. Times are
+simulated: known exactly.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ class Clock:
 
 @dataclass
 class Script:
-    """A link that hands out what it was given, what was read at the same time at once; and what its user does after each."""
+    """A link that hands out what it was given, what was read at the same time at once; and what
+    its user does after each.
+    """
 
     arrivals: list[Arrival]
     clock: Clock
@@ -105,7 +109,9 @@ def seconds(begin_s: float, end_s: float, period_ns: int = PERIOD_NS) -> range:
 
 
 class Run:
-    """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just after each message."""
+    """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just
+    after each message.
+    """
 
     def __init__(
         self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, unix_offset=HOST_CLOCK.unix_offset, **script
@@ -163,7 +169,9 @@ def test_a_plain_stream_is_no_event():
 @pytest.mark.parametrize("repeat_hz", [50, 200, 1000])
 @pytest.mark.parametrize("same", [True, False])
 def test_a_sender_that_hangs_is_stale_and_taken_up_again_at_once(repeat_hz, same):
-    """The last packet over and over for two seconds, or a clock that stands while the attitude turns."""
+    """The last packet over and over for two seconds, or a clock that stands while the attitude
+    turns.
+    """
     hung_s = seconds(2.0, 4.0, NS_PER_S // repeat_hz)
 
     def make(t0: int) -> list[Arrival]:
@@ -278,7 +286,9 @@ A_DAY_NS = 86_400 * NS_PER_S
 @pytest.mark.parametrize("burst", [1, 2, 3, 10])
 @pytest.mark.parametrize("offset_ns", [0, 1, 7 * NS_PER_MS, 300 * NS_PER_MS, 3 * A_DAY_NS, -NS_PER_S, -3 * A_DAY_NS])
 def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, offset_ns):
-    """Equal counters, two skies, clocks that are nanoseconds or days apart: the second one is never shown."""
+    """Equal counters, two skies, clocks that are nanoseconds or days apart: the second one is
+    never shown.
+    """
     run = Run(beside(Sender(), Sender(LYRA, offset_ns=offset_ns), burst))
     assert run.events == {"second-sender": 1}
     assert (run.accepted, run.counts.refused_by["source"] + run.counts.refused_by["time"]) == (600, 600)
@@ -421,7 +431,8 @@ def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
 )
 def test_one_sender_however_it_counts_is_one(sequences):
     rng = np.random.default_rng(4)
-    qs = [propagate(ORION, rng.normal(size=3) * 1e-3, 1.0) for _ in range(1000)]  # noise of 200 arcsec
+    # noise of 200 arcsec
+    qs = [propagate(ORION, rng.normal(size=3) * 1e-3, 1.0) for _ in range(1000)]
     run = Run(lambda t0: many(t0, qs, sequences))
     assert (run.accepted, run.events) == (1000, {})
 
@@ -488,7 +499,9 @@ def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
 
 
 class SteppingUnixTime:
-    """This machine's clock of Unix time: `error_ns` as its kernel states it, and a step after so many readings."""
+    """This machine's clock of Unix time: `error_ns` as its kernel states it, and a step after so
+    many readings.
+    """
 
     def __init__(self, error_ns: int, step_ns: int = 0, steps_after: int = 10**9) -> None:
         self.error_ns, self.step_ns, self.left = error_ns, step_ns, steps_after
@@ -587,7 +600,9 @@ def test_the_kernel_states_how_well_it_keeps_unix_time():
 
 
 def test_what_was_queued_before_the_frames_teaches_nothing():
-    """Two seconds of packets that waited are read at once; then the stream goes on. None refused, no jump, right at once."""
+    """Two seconds of packets that waited are read at once; then the stream goes on. None
+    refused, no jump, right at once.
+    """
 
     def make(t0: int) -> list[Arrival]:
         queued = Sender().packets(t0 - 3 * NS_PER_S, seconds(0, 2))

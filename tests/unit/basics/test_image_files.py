@@ -1,4 +1,6 @@
-"""Pictures of a user's: small files that unpack to gigabytes, and files of other formats under a picture's name."""
+"""Pictures of a user's: small files that unpack to gigabytes, and files of other formats under a
+picture's name.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ SIDE_PX = 13_000  # 1.4 GB as float64
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\n(x) run\n%%EOF\n"
 READERS = [read_image, lambda path: read_photographs(path, None), read_map]
 OPENERS = {("Image", "open"), ("fits", "open"), ("fits", "getdata"), ("np", "load"), ("plt", "imread")}
-# Of hilstar's own files, such as the frames that `compare` takes, of tables that are read by columns, and of its own process.
+# Of hilstar's own files, such as the frames that `compare` takes, of tables that are read by
+# columns, and of its own process.
 OWN = {
     "image_files.py",
     "ck.py",

@@ -26,7 +26,9 @@ def test_an_event_holds_text_whatever_a_file_in_it_is_called():
 
 
 def test_a_kind_that_comes_on_is_said_less_and_less_and_summed_up_at_the_end(caplog, monkeypatch):
-    """Once a second for an hour: it was said three times each ten seconds, and recorded 3600 times."""
+    """Once a second for an hour: it was said three times each ten seconds, and recorded 3600
+    times.
+    """
     now_s = 1000.0
     monkeypatch.setattr("hilstar.basics.notices.time.monotonic_ns", lambda: round(now_s * 1e9))
     notices, heard = Notices(), []

@@ -1,4 +1,6 @@
-"""Files that a user names: whatever is no regular file of a sensible size is refused in one line, and never awaited."""
+"""Files that a user names: whatever is no regular file of a sensible size is refused in one
+line, and never awaited.
+"""
 
 from __future__ import annotations
 

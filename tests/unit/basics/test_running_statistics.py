@@ -7,7 +7,8 @@ import pytest
 
 from hilstar.basics.running_statistics import STEP, Percentiles, RunningStatistics
 
-# A value is known to half a bin; a percentile of n values besides to the gap between its neighbours, here far less.
+# A value is known to half a bin; a percentile of n values besides to the gap between its
+# neighbours, here far less.
 RELATIVE = STEP
 
 

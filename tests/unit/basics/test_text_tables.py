@@ -1,4 +1,6 @@
-"""Text tables: every dialect reads the same, units are taken as stated, and what is not plain is refused or said."""
+"""Text tables: every dialect reads the same, units are taken as stated, and what is not plain is
+refused or said.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The directory after -o: refused before any work where nothing can be written, and not made for an input that is refused."""
+"""The directory after -o: refused before any work where nothing can be written, and not made for
+an input that is refused.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def test_a_directory_is_looked_at_before_the_work_and_made_after_the_input_is_re
     line = [part.format(bench=broken) for part in command]
     assert_refused(run_hilstar_here(*line, "-o", tmp_path / "out"), 2, "broken.toml")
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)  # root may write anywhere
+    # root may write anywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)
     line = [part.format(bench=small_bench_file) for part in command]
     refused = run_hilstar_here(*line, "-o", tmp_path / "out" / "deep")
     assert_refused(refused, 2, "out/deep: cannot be written (Permission denied); choose another place")

@@ -20,7 +20,8 @@ from tests.support.waiting import PATIENCE_S
 def bench(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.delenv("HILSTAR_TOKEN", raising=False)
-    monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: True)  # as on a bench PC, whatever container this is
+    # as on a bench PC, whatever container this is
+    monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: True)
     (tmp_path / "room 7.toml").write_text(SMALL_BENCH)
     return tmp_path / "room 7.toml"
 
@@ -102,7 +103,8 @@ def test_the_unit_exposes_less_than_4_of_10(bench):
 
 def test_the_unit_takes_nothing_that_a_run_needs(bench):
     keys = keys_of(install(bench, "--print").stdout)
-    # Devices (GPU, serial ports), /tmp (the X server's socket), real-time priority, OpenGL's compiler, ledgers anywhere.
+    # Devices (GPU, serial ports), /tmp (the X server's socket), real-time priority, OpenGL's
+    # compiler, ledgers anywhere.
     for key in ("PrivateDevices", "DevicePolicy", "PrivateTmp", "RestrictRealtime", "MemoryDenyWriteExecute", "ProtectHome"):
         assert key not in keys
     assert "@resources" not in keys["SystemCallFilter"]

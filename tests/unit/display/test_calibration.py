@@ -88,7 +88,8 @@ def test_primaries_add_to_grey_by_their_white_light_or_by_given_weights(write):
 def test_codes_between_the_rows_follow_the_light_s_power(write):
     rows = "".join(f"{code},{0.25 + 250 * (code / 255) ** 2.2!r}\n" for code in (0, 4, 16, 40, 90, 160, 255))
     calibration = load_calibration(write(HEAD.replace("bits = 2", "bits = 8"), "code,w\n" + rows), 8)
-    # A power law is a straight line in log light over log code, which PCHIP keeps; so is what lies below the first row.
+    # A power law is a straight line in log light over log code, which PCHIP keeps; so is what lies
+    # below the first row.
     assert calibration.response.light == pytest.approx((np.arange(256) / 255) ** 2.2, rel=1e-9)
 
 
@@ -96,7 +97,8 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
     path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0.8\n0.6,0.4\n")
     light = load_calibration(path, 2).uniformity_map((4, 4))
     assert light.dtype == np.float32
-    plane = np.add.outer([0, -0.2, -0.4, -0.6], [0, -0.1, -0.2, -0.3]) + 1.15  # the grid is a plane: -0.2 and -0.4 a field
+    # the grid is a plane: -0.2 and -0.4 a field
+    plane = np.add.outer([0, -0.2, -0.4, -0.6], [0, -0.1, -0.2, -0.3]) + 1.15
     assert light == pytest.approx(plane / plane.max(), rel=1e-6)
 
 

@@ -19,12 +19,14 @@ from tests.support.centroiders import family_errors_px
 WHITE = 1e6
 SIGMA = (0.85, 0.85)
 FIELD = (160, 120)
-# Bits, flux at its worst phase, the magnitudes under the brightest star (its peak is white) that it holds to, the plain moment.
+# Bits, flux at its worst phase, the magnitudes under the brightest star (its peak is white) that it
+# holds to, the plain moment.
 AIMS = [(10, 0.02, 8.0, 0.05), (8, 0.05, 6.0, 0.03)]
 # Light in float32 (6e-8 of it, summed over 100 pixels) and steps called equal within SAME_STEP.
 EXCESS = 1 + 1e-3
-# Of the error of `round`, by each centroider; measured 0.19 to 0.33 at 32 x 32 phases on sRGB, 0.11 to 0.28 on a power law. The
-# choice among many is chaotic: another order of float32 sums moves it by some hundredths.
+# Of the error of `round`, by each centroider; measured 0.19 to 0.33 at 32 x 32 phases on sRGB, 0.11
+# to 0.28 on a power law. The choice among many is chaotic: another order of float32 sums moves it
+# by some hundredths.
 OF_ROUND = 0.35
 FLUX_MAG = 0.01
 
@@ -76,7 +78,8 @@ def test_flux_and_moments_are_right_at_every_phase_down_to_the_aim_s_magnitude(b
     for mag in np.linspace(0, range_mag, 9):
         sprites, tile = phases(12, mag)
         side = 12 * tile
-        # At most phases of mag = 0 nothing is clipped; one of the pixels may be over white by a rounding.
+        # At most phases of mag = 0 nothing is clipped; one of the pixels may be over white by a
+        # rounding.
         flux, x, y = errors(sprites, exact(sprites, panel, (side, side)), panel, SIGMA, tile)
         assert np.abs(flux).max() <= aim_mag
         assert max(np.abs(x).max(), np.abs(y).max()) <= aim_px
@@ -124,7 +127,9 @@ def test_whatever_centroider_a_tracker_has_finds_the_star_a_third_as_far_off_as_
 @pytest.mark.parametrize("sigma", [(0.6, 0.6), (0.85, 0.85), (1.5, 1.5), (1.4, 0.7)])
 @pytest.mark.parametrize("steps", [0.8, 3.3, 17.6, 41.4, 59.2])
 def test_on_equal_steps_no_light_could_be_nearer(sigma, steps):
-    """Shown light is a whole number of steps: half of one is the limit. Wide stars of few steps may miss it by one."""
+    """Shown light is a whole number of steps: half of one is the limit. Wide stars of few steps
+    may miss it by one.
+    """
     response = srgb_response(10)
     panel = Panel(response, WHITE)
     step = response.light[1] * WHITE
@@ -140,7 +145,9 @@ def test_on_equal_steps_no_light_could_be_nearer(sigma, steps):
 
 
 def test_along_a_path_the_light_is_handed_on():
-    """A streak of 15 px in 26 sprites of 6 steps each: its light and its middle are as right as a point's of 167 steps."""
+    """A streak of 15 px in 26 sprites of 6 steps each: its light and its middle are as right as
+    a point's of 167 steps.
+    """
     response = srgb_response(8)
     panel = Panel(response, WHITE)
     count, nodes, size = 5, 26, (200, 200)
@@ -179,7 +186,9 @@ def test_every_pixel_shows_one_of_the_two_levels_about_its_light(rng):
 
 
 def test_no_light_is_put_where_the_star_has_none(rng):
-    """Beyond 3 sigma (of Gaussian and pixel together) and a pixel's diagonal only light of its own lights a pixel."""
+    """Beyond 3 sigma (of Gaussian and pixel together) and a pixel's diagonal only light of its
+    own lights a pixel.
+    """
     response = srgb_response(10)
     panel = Panel(response, WHITE)
     sprites, tile = phases(10, 7.3)
@@ -264,7 +273,9 @@ def test_stars_in_several_chunks_are_those_of_one(rng, monkeypatch):
 
 
 def test_a_uniformity_map_is_made_up_for(rng):
-    """Pixels 5 % apart and a fall of 14 % to the corners; measured 0.0012 mag and 0.003 px at the worst of 100 stars."""
+    """Pixels 5 % apart and a fall of 14 % to the corners; measured 0.0012 mag and 0.003 px at
+    the worst of 100 stars.
+    """
     response = srgb_response(10)
     sprites, tile = phases(10, 5.0)
     side = 10 * tile

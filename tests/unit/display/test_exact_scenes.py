@@ -1,4 +1,6 @@
-"""`exact` where it might fail, in NumPy: at edges, among neighbours, narrow, on uneven, coarse and fine panels, over white."""
+"""`exact` where it might fail, in NumPy: at edges, among neighbours, narrow, on uneven, coarse
+and fine panels, over white.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from tests.support.exact_scenes import (
     uneven,
 )
 
-# Of `round`'s error, by the worst of seven centroiders; measured 0.27 to 0.92, and of a fit of the sprite's own PSF to stars
-# narrower than a pixel, which then hangs on single pixels, 1.53.
+# Of `round`'s error, by the worst of seven centroiders; measured 0.27 to 0.92, and of a fit of the
+# sprite's own PSF to stars narrower than a pixel, which then hangs on single pixels, 1.53.
 FAMILY = {"sigma 0.3 px": 0.8, "sigma 0.3 px, faint": 1.7, "uneven": 0.35, "uneven, faint": 0.5, "2 bits": 0.6, "16 bits": 0.75}
 
 

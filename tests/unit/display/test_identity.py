@@ -1,4 +1,6 @@
-"""Which monitor this is: EDIDs of 30 real monitors, 10 000 damaged ones, and how two identities differ."""
+"""Which monitor this is: EDIDs of 30 real monitors, 10 000 damaged ones, and how two identities
+differ.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def test_30_real_edids_are_read_as_edid_decode_reads_them():
 
 
 def test_10_000_damaged_blocks_are_read_or_doubted_and_never_taken_for_the_whole_one():
-    """Bits turned, bytes drawn anew, blocks cut short or made of noise; every other one with its checksum mended."""
+    """Bits turned, bytes drawn anew, blocks cut short or made of noise; every other one with its
+    checksum mended.
+    """
     drawn, blocks, read = random.Random(SEED), [one.block for one in real()], 0
     for number in range(MUTATED):
         whole = drawn.choice(blocks)
@@ -113,7 +117,9 @@ SERIALS = ("F00BAR", "CN0ABC1234", "7", "16843010", "0x01010102", "1234567891234
 
 
 def with_serial_text(text):
-    """A real EDID whose number is 0 and whose last descriptor, that of its serial number, holds this text."""
+    """A real EDID whose number is 0 and whose last descriptor, that of its serial number, holds
+    this text.
+    """
     block = bytearray(real()[0].block)
     block[12:16] = bytes(4)
     block[108:126] = b"\0\0\0\xff\0" + f"{text}\n".encode()[:13].ljust(13)

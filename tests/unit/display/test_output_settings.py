@@ -130,7 +130,8 @@ def test_values_of_properties_are_words_integers_or_a_few_of_them():
     names = {7: "Full"}.__getitem__
     assert property_value("ATOM", 32, (7,), names) == "Full"
     assert property_value("INTEGER", 32, (8,), names) == 8
-    assert property_value("INTEGER", 32, (2**32 - 90,), names) == -90  # Xlib gives longs without a sign
+    # Xlib gives longs without a sign
+    assert property_value("INTEGER", 32, (2**32 - 90,), names) == -90
     assert property_value("INTEGER", 32, UNITY, names) == UNITY
     assert property_value("INTEGER", 16, tuple(range(256)), names) is None  # a table
     assert property_value("ATOM", 32, (), names) is None

@@ -23,7 +23,8 @@ def bump(middle_nm, width_nm, nm=NM):
     return np.exp(-(((nm - middle_nm) / width_nm) ** 2))
 
 
-# Peaks in nm and 1/e half widths: as of a wide OLED, of an sRGB LCD whose red phosphor has two peaks, and of lasers.
+# Peaks in nm and 1/e half widths: as of a wide OLED, of an sRGB LCD whose red phosphor has two
+# peaks, and of lasers.
 PANELS = {
     "oled": [bump(625, 40), bump(530, 45), 0.8 * bump(460, 30)],
     "lcd": [bump(612, 12) + 0.6 * bump(645, 15), bump(540, 35), 1.2 * bump(450, 15)],
@@ -116,7 +117,8 @@ def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path)
     bench.write_text(bench_text({"tracker": keys, "sky": {"faintest_v_mag": 5.0}}, tables))
     whole = json.loads(run_hilstar_here("budget", bench, "--json").stdout)
     found, red = whole["primaries"], whole["near_infrared"]
-    assert [row["from_nm"] for row in red] == [700.0] * 4 + [710.0] * 4 and red[4]["channel"] == "all"  # 1 % of red at 711 nm
+    # 1 % of red at 711 nm
+    assert [row["from_nm"] for row in red] == [700.0] * 4 + [710.0] * 4 and red[4]["channel"] == "all"
     assert set(red[5]["by_class"]) == set("OBAFGKM")
     wanted = channel_matrix(read_primaries(tmp_path / "p.csv"), optics_of(PASSBANDS), WHITE_E_PER_S)
     digits = 1e-8 * WHITE_E_PER_S  # of the files

@@ -20,9 +20,11 @@ from hilstar.display.response import encode, gamma_response, srgb_response
 from tools.make_blue_noise import SEED, void_and_cluster
 
 WHITE = 1e6
-# The mask's thresholds are the middles of 4096 equal parts, so a mean over them is half a part off at most.
+# The mask's thresholds are the middles of 4096 equal parts, so a mean over them is half a part off
+# at most.
 MASK_LIMIT = 0.5 / 4096
-# A light in float32 against a step: the steps here are 1e-4 of their light at least, its rounding 6e-8.
+# A light in float32 against a step: the steps here are 1e-4 of their light at least, its rounding
+# 6e-8.
 ROUNDING_OF_A_STEP = 1e-3
 
 
@@ -39,7 +41,9 @@ def test_the_mask_is_the_one_that_its_script_makes():
 
 
 def test_the_mask_has_no_low_frequencies(rng):
-    """Waves longer than 8 px: of white noise they have the same power as others, of blue noise hardly any."""
+    """Waves longer than 8 px: of white noise they have the same power as others, of blue noise
+    hardly any.
+    """
     wave = np.hypot(*np.meshgrid(np.fft.fftfreq(64), np.fft.fftfreq(64)))
 
     def share(mask):
@@ -97,7 +101,8 @@ def test_over_aligned_turns_of_the_mask_the_error_is_under_a_step_over_their_num
     shown = [shown_light(dither_levels(image, panel, turn), panel) for turn in turns]
     error = np.abs(np.mean(shown, axis=0) / WHITE - light) / steps_of(light, response)
     assert error.max() < 1 / frames + ROUNDING_OF_A_STEP
-    assert error.max() > 0.5 / frames  # and no method of so few equal frames does better for every light
+    # and no method of so few equal frames does better for every light
+    assert error.max() > 0.5 / frames
 
 
 def test_the_mask_s_turns_begin_again():
@@ -108,7 +113,9 @@ def test_the_mask_s_turns_begin_again():
 
 
 def test_the_uniformity_map_is_taken_out_of_the_light(rng):
-    """A dim pixel asks for more: what the monitor then makes is within half a step of the light wanted."""
+    """A dim pixel asks for more: what the monitor then makes is within half a step of the light
+    wanted.
+    """
     response = srgb_response(8)
     uniformity = rng.uniform(0.7, 1.1, (60, 80)).astype(np.float32)
     panel = Panel(response, WHITE, uniformity)

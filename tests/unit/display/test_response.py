@@ -77,7 +77,9 @@ def test_the_renderer_s_table_counts_thresholds(bits, white, rng):
 @pytest.mark.parametrize("bits", [1, 2, 8, 10, 12])
 @pytest.mark.parametrize("white", [1e-3, 1.0, 4.1e7, 1e12])
 def test_one_word_a_bin_says_the_level(bits, white, rng):
-    """What encode.frag does with `steps`, in NumPy, against a plain search: at each threshold and next to it."""
+    """What encode.frag does with `steps`, in NumPy, against a plain search: at each threshold
+    and next to it.
+    """
     thresholds = srgb_response(bits).thresholds_e_per_s(white)
     table = code_table(thresholds)
     steps = table.steps()
@@ -107,7 +109,8 @@ def test_a_table_is_rounded_to_the_nearest_light(rng):
     wanted = rng.uniform(0, 1, 5000)
     codes = encode(wanted.astype(np.float32), table_response(8, light), 1.0)
     nearest = np.abs(wanted[:, None] - light).min(axis=1)
-    assert np.all(np.abs(wanted - light[codes]) <= nearest + 1e-7)  # a float32 tie may go either way
+    # a float32 tie may go either way
+    assert np.all(np.abs(wanted - light[codes]) <= nearest + 1e-7)
 
 
 def test_bit_stealing_has_six_levels_between_greys():

@@ -9,7 +9,9 @@ from hilstar.display.window.watch import is_straight, ramp_bits
 
 
 def entries(curve: np.ndarray, bits: int) -> np.ndarray:
-    """A curve (steps,) from 0 to 1 as a driver of so many bits gives it back: 16 bits, its own repeated to fill them."""
+    """A curve (steps,) from 0 to 1 as a driver of so many bits gives it back: 16 bits, its own
+    repeated to fill them.
+    """
     full = 2**bits - 1
     codes = np.rint(curve * full)
     return np.rint(codes / full * 65535).astype(np.uint16)

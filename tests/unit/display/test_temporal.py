@@ -21,12 +21,15 @@ SIGMA = (0.85, 0.85)
 SIZE = (264, 264)
 TILE, SIDE = 22, 12  # px of a star's own, stars along a side
 FRAMES = 6
-# The aims, rms over all phases, for any six frames; on 24 x 24 phases the worst are off by 0.0013 mag and 0.0035 px (5 x 5).
+# The aims, rms over all phases, for any six frames; on 24 x 24 phases the worst are off by 0.0013
+# mag and 0.0035 px (5 x 5).
 AIM_MAG, AIM_PX = 0.003, 0.004
-# Of 144 stars the worst of some exposures is a tenth above all: a pixel lit once in six frames is at the threshold of 5 x 5.
+# Of 144 stars the worst of some exposures is a tenth above all: a pixel lit once in six frames is
+# at the threshold of 5 x 5.
 OF_FEW = 1.15
 PARTS = (0.0, 0.37, 0.8)  # of its first frame that an exposure misses; it ends as much later
-# A whole number of steps is within half a step of the light, two such remainders within one; a hundredth for float32.
+# A whole number of steps is within half a step of the light, two such remainders within one; a
+# hundredth for float32.
 ONE_STEP = 1.01
 
 
@@ -61,7 +64,9 @@ def shown(panel, frames):
 
 
 def exposures(frames, count=FRAMES, every=1):
-    """The means over exposures of `count` frames: each beginning of a frame, and parts of one later."""
+    """The means over exposures of `count` frames: each beginning of a frame, and parts of one
+    later.
+    """
     for first in range(0, len(frames) - count, every):
         for part in PARTS:
             weight = np.ones(count + 1)
@@ -70,7 +75,9 @@ def exposures(frames, count=FRAMES, every=1):
 
 
 def worst(frames, wanted, every=1):
-    """Flux, mag, and each centroider, px: rms over phases and exposures, or over the phases of the worst exposure / OF_FEW."""
+    """Flux, mag, and each centroider, px: rms over phases and exposures, or over the phases of
+    the worst exposure / OF_FEW.
+    """
     errors = []
     for mean, sky in zip(exposures(frames, every=every), exposures(wanted, every=every), strict=True):
         flux = 2.5 * np.log10(mean.sum((1, 2)) / sky.sum((1, 2)))
@@ -91,9 +98,11 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(name
     flux_mag, *off_px = worst(frames, skies([sprites] * 14), every=3)
     assert flux_mag < AIM_MAG
     assert max(off_px) < AIM_PX
-    assert abs(frames.mean(axis=0).sum() / (len(sprites) * flux_of(6.0)) - 1) < 1e-3  # no bias, tails of a footprint aside
+    # no bias, tails of a footprint aside
+    assert abs(frames.mean(axis=0).sum() / (len(sprites) * flux_of(6.0)) - 1) < 1e-3
     one = worst(np.repeat(frames[3:4], 7, axis=0), skies([sprites] * 7))
-    assert one[0] > 2 * flux_mag and max(one[1:]) > 2 * max(off_px)  # frames differ: no single one is as right
+    # frames differ: no single one is as right
+    assert one[0] > 2 * flux_mag and max(one[1:]) > 2 * max(off_px)
 
 
 @pytest.mark.parametrize("make", [srgb_response, gamma_response])
@@ -107,7 +116,9 @@ def test_a_slow_star_is_as_right_as_a_still_one(make):
 
 
 def test_a_fast_star_has_its_light_and_its_middle():
-    """1.8 px a frame, 1 deg/s on the demo's bench, as a path of two sprites: its ends are a step of light or less."""
+    """1.8 px a frame, 1 deg/s on the demo's bench, as a path of two sprites: its ends are a step
+    of light or less.
+    """
     panel, way = Panel(srgb_response(8), WHITE), np.arange(SIDE**2) * 2.4
     frames = []
     for n in range(9):
@@ -120,7 +131,8 @@ def test_a_fast_star_has_its_light_and_its_middle():
     for mean, wanted in zip(exposures(lit), exposures(sky), strict=True):
         flux = 2.5 * np.log10(mean.sum((1, 2)) / wanted.sum((1, 2)))
         assert np.sqrt(np.mean(flux**2)) < AIM_MAG
-        # Half a step of light at 3.6 px from the middle, of 6 x 66 steps: 0.0026 px rms along the path beside the aim.
+        # Half a step of light at 3.6 px from the middle, of 6 x 66 steps: 0.0026 px rms along the
+        # path beside the aim.
         assert np.sqrt(np.mean(np.square(np.subtract(moment(mean), moment(wanted))))) < AIM_PX + 0.0026
 
 
@@ -136,7 +148,8 @@ def test_on_few_equal_levels_the_light_of_any_exposure_is_within_a_step(bits, st
     asked = steps * len(frames)
     if asked > 50:
         off = np.subtract(moment(frames.mean(axis=0)), moment(skies([sprites])[0]))
-        assert np.abs(off).max() < 4 / asked  # steps times px, over the steps of all frames; measured 2.7
+        # steps times px, over the steps of all frames; measured 2.7
+        assert np.abs(off).max() < 4 / asked
 
 
 def test_alike_faint_stars_do_not_blink_in_step():

@@ -1,4 +1,6 @@
-"""`temporal` where it might fail: over exposures of six refreshes, and of six and a part, that begin at any phase."""
+"""`temporal` where it might fail: over exposures of six refreshes, and of six and a part, that
+begin at any phase.
+"""
 
 from __future__ import annotations
 

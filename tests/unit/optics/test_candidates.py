@@ -41,7 +41,8 @@ def assert_same(kept: Sprites, fresh: Sprites) -> None:
 def test_sprites_are_those_of_a_fresh_look(sky, start, focal_mm, step_of_limit, rng):
     camera, candidates, q = camera_of(focal_mm), Candidates(), from_radec_roll_deg(*STARTS[start])
     for k in range(STEPS):
-        axis = np.array([0.0, 0.0, 1.0]) if k % 3 == 0 else rng.normal(size=3)  # every third step is roll alone
+        # every third step is roll alone
+        axis = np.array([0.0, 0.0, 1.0]) if k % 3 == 0 else rng.normal(size=3)
         q = propagate(q, axis / np.linalg.norm(axis), step_of_limit * KEPT_TURN_RAD)
         kept = make_sprites(sky, to_matrix(q), camera, FOOTPRINT, candidates)
         assert_same(kept, make_sprites(sky, to_matrix(q), camera, FOOTPRINT))

@@ -1,4 +1,6 @@
-"""Only the stars near the image are turned and projected, and none that is on it is lost; who clips is asked near by."""
+"""Only the stars near the image are turned and projected, and none that is on it is lost; who
+clips is asked near by.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ SIGMA = (0.85, 0.85)
 FOOTPRINT = GaussianPsf(SIGMA).footprint_px
 SIZE = (1920, 1080)
 STARS = 30_000
-FAST_KM_S = np.array([12_000.0, -9_000.0, 4_000.0])  # a twentieth of light: stars are seen up to 3 degrees away
+# a twentieth of light: stars are seen up to 3 degrees away
+FAST_KM_S = np.array([12_000.0, -9_000.0, 4_000.0])
 COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 
 
@@ -54,7 +57,9 @@ def test_no_star_on_the_image_is_lost(sky, focal_mm, cell_deg, rng):
 
 
 def test_the_sides_of_a_wide_image_are_left_out_of_its_circle(sky, rng):
-    """A circle around 16:9 has 1.85 times the image's area; with cells of 4 degrees about it, two thirds remain."""
+    """A circle around 16:9 has 1.85 times the image's area; with cells of 4 degrees about it,
+    two thirds remain.
+    """
     camera = monitor_camera(SIZE, 57.65, 200.0, IDENTITY)
     turn = to_matrix(normalise(rng.normal(size=4)))
     edges, radius_rad = camera.edges(6.0) @ turn, camera.field_radius_rad(6.0)

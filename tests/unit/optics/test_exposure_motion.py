@@ -55,7 +55,8 @@ def test_a_path_is_the_mean_of_its_instants(rate):
     drawn = linear_image(smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA)), SIZE, GaussianPsf(SIGMA))
     path_px = np.radians(np.hypot(*rate[:2]) * CAMERA.focal_length_px + abs(rate[2]) * SIZE[0] / 4)
     exact = brute_force(stars, at, max(400, round(38 * path_px)))
-    # The mean of midpoints is itself off by (path / steps)^2 / 24 times the PSF's curvature: 1e-7 for 38 steps a pixel,
+    # The mean of midpoints is itself off by (path / steps)^2 / 24 times the PSF's curvature: 1e-7
+    # for 38 steps a pixel,
     # but for the footprints' edges, which pass pixels in steps of 1 / steps times the cut.
     assert np.abs(drawn - exact).max() < PIXEL_LIMIT
 
@@ -82,13 +83,15 @@ def test_a_star_on_the_axis_of_rotation_needs_one_sprite_and_a_far_one_more():
     centre, corner = star_on((159.5, 119.5), at), star_on((300, 220), at)
     assert len(smeared_sprites(centre, at, CAMERA, GaussianPsf(SIGMA))) == 1
     count = len(smeared_sprites(corner, at, CAMERA, GaussianPsf(SIGMA)))
-    # 0.5 deg at 172 px is 1.5 px, 2.5 of the smaller sigma: 1.02 * 2.5 + 3, rounded up by at most 15 %.
+    # 0.5 deg at 172 px is 1.5 px, 2.5 of the smaller sigma: 1.02 * 2.5 + 3, rounded up by at most
+    # 15 %.
     assert 5 <= count <= 8
 
 
 def test_a_star_that_enters_during_the_exposure_is_drawn_in_part():
     at = motion((0, -2.0, 0))
-    stars = star_on((-30.0, 100.0), at, 1.0)  # 2 deg/s is 188 px in a second: half of its path is inside
+    # 2 deg/s is 188 px in a second: half of its path is inside
+    stars = star_on((-30.0, 100.0), at, 1.0)
     sprites = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA))
     inside = linear_image(sprites, SIZE, GaussianPsf(SIGMA)).sum()
     path_px = CAMERA.focal_length_px * np.radians(2.0)
@@ -132,4 +135,5 @@ def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkey
     assert len(coarse) <= len(whole) // 2
     assert (whole.capped, coarse.capped) == (0, len(np.unique(whole.star)))
     light = [float(sprites.data["electrons_per_s"].sum(dtype=np.float64)) for sprites in (whole, coarse)]
-    assert light[1] == pytest.approx(light[0], rel=0.02)  # paths end at the image's edge, a node more or less
+    # paths end at the image's edge, a node more or less
+    assert light[1] == pytest.approx(light[0], rel=0.02)

@@ -84,7 +84,9 @@ def test_a_path_is_the_mean_of_its_instants_and_keeps_its_flux(rate):
 
 
 def test_paths_of_following_frames_join():
-    """Where one frame's path ends the next one's begins: the streak has no gap and no overlap along a row."""
+    """Where one frame's path ends the next one's begins: the streak has no gap and no overlap
+    along a row.
+    """
     stars, at = stars_on([(160.3, 20.0)]), turn((0.0, 2.0, 0.0))
     following = CameraTurn(propagate(Q, at.rate_cam_rad_s, FRAME_S), at.rate_cam_rad_s)
     path, begins = Scan((0, 1), FRAME_S, FRAME_S), Scan((0, 1), FRAME_S, 0.0)
@@ -176,12 +178,15 @@ def test_a_path_that_is_too_coarse_still_has_all_its_light_in_its_middle(rng):
     assert light == pytest.approx(1.0, rel=1e-6)
     x_px, y_px = (np.bincount(sprites.star, sprites.data["electrons_per_s"] * part) for part in (sprites.x_px, sprites.y_px))
     middle = place_px(stars, at, FRAME_S / 2)
-    # The mean of a path lies off its middle by its bend: (path / focal length)^2 / 24 of the distance from the axis.
+    # The mean of a path lies off its middle by its bend: (path / focal length)^2 / 24 of the
+    # distance from the axis.
     assert np.hypot(x_px - middle[:, 0], y_px - middle[:, 1]).max() < 0.01
 
 
 def test_nodes_belong_to_what_of_a_path_lies_on_the_image():
-    """One star crosses the whole image, one only its corner, one passes outside: 1, a few and no sprites."""
+    """One star crosses the whole image, one only its corner, one passes outside: 1, a few and no
+    sprites.
+    """
     at, scan = turn((0, 120.0, 0)), Scan(hold_s=FRAME_S)  # 188 px in a frame
     crossing, cutting, outside = (stars_on([place]) for place in ((200.0, 120.0), (-20.0, 5.0), (160.0, -40.0)))
     towards = np.sign(place_px(crossing, at, FRAME_S)[0, 0] - 200.0)

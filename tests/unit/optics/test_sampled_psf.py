@@ -1,4 +1,6 @@
-"""A sampled PSF: its light in pixels against brute force at 121 places in a pixel, and where it fails."""
+"""A sampled PSF: its light in pixels against brute force at 121 places in a pixel, and where it
+fails.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from tests.support.psfs import airy, coma, gaussian, in_pixels, sampled
 
 PHASES = np.linspace(-0.5, 0.5, 11, endpoint=False) + 0.013  # beside the table's own places
 FLUX_LIMIT = 1e-7  # float32's rounding of a table whose phases sum to 1
-CENTRE_PX = 5  # within which a centroid is taken: further out the wings' end, a footprint's edge, is that of the samples
+# within which a centroid is taken: further out the wings' end, a footprint's edge, is that of the
+# samples
+CENTRE_PX = 5
 CENTROID_LIMIT_PX = 2e-4  # the cut wings' share, of 1e-4, times how unevenly they lie
 
 
@@ -26,7 +30,9 @@ def centroid_px(share: np.ndarray, pixel: np.ndarray) -> np.ndarray:
 
 
 def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
-    """The largest errors of a star's flux (relative), centroid (px) and pixel (relative to its flux) over all phases."""
+    """The largest errors of a star's flux (relative), centroid (px) and pixel (relative to its
+    flux) over all phases.
+    """
     nodes = 5 if psf.footprint_px > 15 else 8
     pixel = np.arange(psf.footprint_px) - psf.footprint_px // 2
     found = []
@@ -38,8 +44,9 @@ def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
     return tuple(np.max(found, axis=0).tolist())
 
 
-# Limits of a pixel: the table's step and the spline; of an Airy pattern, whose rings go on, also the light beyond its samples.
-# Measured, in this order: 1.2e-4, 6.9e-5, 2.1e-5, 1.4e-5, 1.5e-6; 7.5e-5, 5.8e-5; 8.4e-4, 5.7e-4. Centroids: 1.1e-4 px at most.
+# Limits of a pixel: the table's step and the spline; of an Airy pattern, whose rings go on, also
+# the light beyond its samples. Measured, in this order: 1.2e-4, 6.9e-5, 2.1e-5, 1.4e-5, 1.5e-6;
+# 7.5e-5, 5.8e-5; 8.4e-4, 5.7e-4. Centroids: 1.1e-4 px at most.
 @pytest.mark.parametrize(
     ("profile", "per_px", "half_px", "limit"),
     [
@@ -63,7 +70,9 @@ def test_a_sampled_psf_has_its_light_in_the_right_pixels_at_every_phase(profile,
 
 
 def test_an_image_that_reaches_far_keeps_its_core():
-    """A table of 99 px has coarser steps: measured 3.1e-4, and 1.2e-3 were they not doubled there."""
+    """A table of 99 px has coarser steps: measured 3.1e-4, and 1.2e-3 were they not doubled
+    there.
+    """
     psf, light = SampledPsf(sampled(airy(1.5), 3, 48), 3), sampled(airy(1.5), 3, 48).sum() / 9
     assert psf.footprint_px > 90
     pixel = np.arange(-3.0, 4.0)
@@ -92,7 +101,8 @@ def test_a_sampled_gaussian_is_the_gaussian():
     assert np.abs(psf.spread(x, y, light, region) - exact.spread(x, y, light, region)).max() < 5e-4
     assert psf.shares(pixel, pixel[:, None]).shape == (13, 13)
     assert psf.peak_share == pytest.approx(exact.peak_share, abs=1e-4)
-    # A Gaussian and a pixel together are not quite a Gaussian, which adaptive moments weigh by: 1.4 % at a sigma of 0.55 px.
+    # A Gaussian and a pixel together are not quite a Gaussian, which adaptive moments weigh by: 1.4
+    # % at a sigma of 0.55 px.
     assert psf.width_px == pytest.approx(sigma, rel=0.015)
     assert psf.cut_share(5) == pytest.approx(exact.cut_share(5), rel=1e-3)
     assert psf.outside_share(5) == pytest.approx(exact.outside_share(5), rel=2e-3)
@@ -112,7 +122,8 @@ def test_footprint_and_reach_hold_what_they_say(profile, half_px):
         share, away = psf.shares(pixel - x, (pixel - y)[:, None]), (pixel - x) ** 2 / x2 + (pixel - y)[:, None] ** 2 / y2
         assert (share <= factor * np.exp(-away)).all()
         assert share.max() <= psf.peak_share
-    # A star that lights its first pixel at 1 % of its light is drawn in an ellipse, not in a whole square.
+    # A star that lights its first pixel at 1 % of its light is drawn in an ellipse, not in a whole
+    # square.
     assert np.pi * np.sqrt(x2 * y2) * np.log(100 * factor) < psf.footprint_px**2
 
 

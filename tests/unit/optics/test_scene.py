@@ -63,7 +63,9 @@ def test_a_star_behind_the_camera_has_no_pixel():
 
 
 def test_the_alignment_turns_the_image():
-    """q_cam_to_mon of +90 degrees about the boresight takes cam +x to mon +y: right becomes down."""
+    """q_cam_to_mon of +90 degrees about the boresight takes cam +x to mon +y: right becomes
+    down.
+    """
     half = np.sqrt(0.5)
     camera = monitor_camera((1000, 1000), 10.0, 10.0, np.array([half, 0, 0, half]))
     x, y = camera.project((camera.cam_to_image @ np.array([0.1, 0.0, 1.0]))[None, :])

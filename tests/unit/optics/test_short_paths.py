@@ -1,4 +1,6 @@
-"""Short paths against exact ones: through a pinhole and a strong lens with a field of degree 6, over the whole screen."""
+"""Short paths against exact ones: through a pinhole and a strong lens with a field of degree 6,
+over the whole screen.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from tests.support.stars import stars_at
 
 SIZE = (1920, 1080)
 FRAME_S = 1 / 60
-HALF = 0.6  # of a frame, to both sides: a row holds its light for one, and the row is known to a tenth
+# of a frame, to both sides: a row holds its light for one, and the row is known to a tenth
+HALF = 0.6
 FOOTPRINT, SIGMA = 10, (0.85, 0.85)
 MARGIN_PX = FOOTPRINT / 2 + 1
 AXES = ((0.3, 0.9, 0.2), (-0.8, 0.4, 0.1), (0.9, -0.3, 0.4), (0.1, -0.1, 1.0))
@@ -44,7 +47,9 @@ CAMERAS = {"pinhole": pinhole(200.0), "wide": lens_camera(200.0), "narrow": lens
 
 
 def off_px(camera, axis, half_turn_rad, points):
-    """Paths that begin all over the screen: their error (moments, stars), exact x and y (2, moments, stars), and lengths."""
+    """Paths that begin all over the screen: their error (moments, stars), exact x and y (2,
+    moments, stars), and lengths.
+    """
     x, y = np.meshgrid(np.linspace(-0.5, SIZE[0] - 0.5, 49), np.linspace(-0.5, SIZE[1] - 0.5, 33))
     seen = camera.rays(x.ravel(), y.ravel()) @ camera.cam_to_image.T
     exact = Paths(seen / np.linalg.norm(seen, axis=1, keepdims=True), np.array(axis), camera)
@@ -67,7 +72,8 @@ def test_a_place_is_off_by_no_more_than_the_limit_over_the_whole_screen(camera, 
     half_turn_rad = np.radians(rate_deg_s) * FRAME_S * HALF
     points = points_within(camera, half_turn_rad)
     if points is None:
-        assert (camera, rate_deg_s) == (CAMERAS["narrow"], 30.0)  # its stars come from beyond the field's end: see below
+        # its stars come from beyond the field's end: see below
+        assert (camera, rate_deg_s) == (CAMERAS["narrow"], 30.0)
         return
     off, places, length = off_px(camera, axis, half_turn_rad, points)
     seen = on_screen(places)
@@ -79,7 +85,9 @@ def test_a_place_is_off_by_no_more_than_the_limit_over_the_whole_screen(camera, 
     "camera", [CAMERAS["wide"], CAMERAS["narrow"], lens_camera(200.0, degree=10)], ids=["wide", "narrow", "wild"]
 )
 def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
-    """At 40 000 places, a half of them within 8 px of the image's border, where the field is steepest."""
+    """At 40 000 places, a half of them within 8 px of the image's border, where the field is
+    steepest.
+    """
     size = np.array(SIZE)[:, None]
     px = rng.uniform(-0.5, size - 0.5, (2, 40_000))
     px[:, ::4] = np.where(px[:, ::4] < size / 2, rng.uniform(-0.5, 7.5), size - 0.5 - rng.uniform(0, 8))
@@ -93,7 +101,9 @@ def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
 
 @pytest.mark.parametrize(("points", "camera"), [(1, CAMERAS["narrow"]), (2, CAMERAS["pinhole"]), (3, CAMERAS["narrow"])])
 def test_the_limit_is_where_it_fails(points, camera):
-    """A turn that is twice the longest for its points is off by more than it may be: the limit is no mere caution."""
+    """A turn that is twice the longest for its points is off by more than it may be: the limit
+    is no mere caution.
+    """
     turns = np.geomspace(1e-5, 0.1, 400)
     longest = max(turn for turn in turns if (points_within(camera, turn) or 9) <= points)
     worst = 0.0
@@ -105,7 +115,9 @@ def test_the_limit_is_where_it_fails(points, camera):
 
 
 def test_a_turn_too_long_for_a_few_points_has_exact_paths():
-    """Of 350 mm at 30 deg/s a star of the border comes from 60 px outside: past FIELD_EDGE, where the field stands still."""
+    """Of 350 mm at 30 deg/s a star of the border comes from 60 px outside: past FIELD_EDGE,
+    where the field stands still.
+    """
     camera = CAMERAS["narrow"]
     half_turn_rad = np.radians(30.0) * FRAME_S
     assert points_within(camera, half_turn_rad) is None
@@ -120,7 +132,9 @@ def test_a_turn_too_long_for_a_few_points_has_exact_paths():
 @pytest.mark.parametrize("rate_deg_s", [0.5, 5.0, 25.0])
 @pytest.mark.parametrize("camera", [pinhole(350.0), lens_camera(350.0)], ids=["pinhole", "lens"])
 def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng, monkeypatch):
-    """The same stars and light: also of those that cross the border, or the end of the lens beyond its corner."""
+    """The same stars and light: also of those that cross the border, or the end of the lens
+    beyond its corner.
+    """
     q, axis = from_radec_roll_deg(84.0, -1.0, 20.0), np.array([0.4, -0.7, 0.3])
     turn = CameraTurn(q, np.radians(rate_deg_s) * axis / np.linalg.norm(axis))
     reach = camera.field_radius_rad(MARGIN_PX) * 1.3
@@ -134,7 +148,8 @@ def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng
     exact = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
     places = [_means(sprites) for sprites in (short, exact)]
     (light, *of_short), (true, *of_exact) = places
-    assert np.abs(light - true).max() < 0.02  # a path that ends at the border may have a node more or less there
+    # a path that ends at the border may have a node more or less there
+    assert np.abs(light - true).max() < 0.02
     whole = (light > 0.999) & (true > 0.999)
     assert whole.sum() > 500
     path_px = np.radians(rate_deg_s) * FRAME_S * camera.scales_px_rad()[1]

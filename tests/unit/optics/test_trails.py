@@ -94,7 +94,8 @@ def test_a_streak_is_the_light_of_all_its_moments(rate_deg_s, exposure_s):
     found = streak(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
     wanted = moment_by_moment(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
     total = wanted.sum()
-    assert found.electrons_per_s[0] == pytest.approx(total, rel=5e-4) or exposure_s == 2.0  # part of it is off the image
+    # part of it is off the image
+    assert found.electrons_per_s[0] == pytest.approx(total, rel=5e-4) or exposure_s == 2.0
     assert image_of(found.sprites).sum() == pytest.approx(total, rel=5e-4)
     assert np.abs(image_of(found.sprites) - wanted).max() < PIXEL_LIMIT * total
     assert np.allclose(to_matrix(q) @ found.middle[0], [0, 0, 1], atol=1e-6)
@@ -111,7 +112,8 @@ def test_its_length_is_its_own_rate_against_the_camera_s():
     found = streak(sky, t_ns, q, np.zeros(3), 1.0).sprites
     wide_px = np.hypot(np.ptp(found.x_px), np.ptp(found.y_px))
     assert length_px > 1
-    assert wide_px == pytest.approx(length_px * (1 - 1 / len(found)), rel=1e-3)  # from the first sprite to the last
+    # from the first sprite to the last
+    assert wide_px == pytest.approx(length_px * (1 - 1 / len(found)), rel=1e-3)
 
 
 def test_a_flash_shines_where_the_satellite_is_at_its_time():
@@ -147,7 +149,8 @@ def test_a_path_into_the_shadow_ends_there():
     found = streak(sky, t_ns, q, np.zeros(3), 10.0)
     wanted = moment_by_moment(sky, t_ns, q, np.zeros(3), 10.0)
     assert wanted.sum() > 0
-    assert image_of(found.sprites).sum() == pytest.approx(wanted.sum(), rel=0.01)  # a sprite each 0.25 s; measured 0.3 %
+    # a sprite each 0.25 s; measured 0.3 %
+    assert image_of(found.sprites).sum() == pytest.approx(wanted.sum(), rel=0.01)
 
 
 def test_streaks_follow_the_stars_of_an_image():

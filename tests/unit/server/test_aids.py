@@ -1,4 +1,6 @@
-"""What lies over the sky without a screen: the same as a screen's shader makes (tests/screen holds that to the same oracle)."""
+"""What lies over the sky without a screen: the same as a screen's shader makes (tests/screen
+holds that to the same oracle).
+"""
 
 from __future__ import annotations
 

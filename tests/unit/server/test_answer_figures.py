@@ -21,7 +21,9 @@ SIGMA_ARCSEC, IN_FAULT = np.array([2.0, 3.0, 10.0]), 3.0
 
 
 def records_of_a_run(seconds: float = 60.0) -> list[AnswerRecord | FaultRecord]:
-    """Answers with a noise that triples in the fault, wrong for a second, then lost until two seconds after its end."""
+    """Answers with a noise that triples in the fault, wrong for a second, then lost until two
+    seconds after its end.
+    """
     rng = np.random.default_rng(5)
     found: list[AnswerRecord | FaultRecord] = []
     for t_s in np.arange(0.3, seconds - 0.5, CYCLE_S).tolist():
@@ -64,7 +66,8 @@ def test_a_fault_is_reported_with_the_answers_before_during_and_after_it(ledger)
     (fault,) = found.faults
     assert (fault.name, fault.start_s, fault.end_s) == ("sunlit", *FAULT_S)
     assert (fault.before.availability, fault.before.wrong) == (1.0, 0)
-    # Right for two seconds and one more of ten, then lost; after its end lost for two seconds of ten.
+    # Right for two seconds and one more of ten, then lost; after its end lost for two seconds of
+    # ten.
     assert (fault.during.availability, fault.during.wrong, fault.during.invalid) == pytest.approx((0.3, 10, 60), abs=0.011)
     assert (fault.after.availability, fault.after.invalid) == pytest.approx((0.8, 20), abs=0.011)
     # 100 and 30 answers: the rms of each axis within four of its own sigmas, rms / sqrt(2 n).

@@ -1,4 +1,6 @@
-"""What exposures see of a screen that refreshes, against a simulation of it; and the rates proposed instead."""
+"""What exposures see of a screen that refreshes, against a simulation of it; and the rates
+proposed instead.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ CASES = {
 
 
 def simulated(exposures, phase):
-    """Brute force: the light of the rows, and the middle of the frames seen, at STEPS moments of an exposure."""
+    """Brute force: the light of the rows, and the middle of the frames seen, at STEPS moments of
+    an exposure.
+    """
     t = phase + (np.arange(STEPS) + 0.5) / STEPS * exposures.refreshes
     frame = np.floor(t)
     lit = t - frame < exposures.lit
@@ -85,7 +89,8 @@ def test_where_nothing_beats_nothing_is_said_to():
     assert beat(Exposures(60.0, 0.1)).period_s is None
     assert beat(Exposures(60.0, 0.105, triggered=True)).worst_arcsec_per_deg_s == 0.0
     assert beat(Exposures(60.0, 0.0)).worst_arcsec_per_deg_s is None
-    assert beat(Exposures(60.0, 0.105, frame_hz=7.5)).period_s is None  # the phase stands, where it happens to
+    # the phase stands, where it happens to
+    assert beat(Exposures(60.0, 0.105, frame_hz=7.5)).period_s is None
     assert beat(Exposures(60.0, 0.105, frame_hz=7.5)).worst_arcsec_per_deg_s > 0.9
     assert beat(Exposures(59.94, 0.1, 10.0)).period_s == pytest.approx(1 / 0.06)
 

@@ -17,7 +17,9 @@ def test_a_jump_between_frames_is_not_taken_for_a_motion() -> None:
 
 
 def test_between_frames_the_commanded_attitude_is_that_of_the_motion() -> None:
-    """The scan's third derivative is 3 deg (2 pi / 271 s)^3 = 0.13 arcsec/s^3 at most: dt^3 / 15 of it is 1e-5 arcsec."""
+    """The scan's third derivative is 3 deg (2 pi / 271 s)^3 = 0.13 arcsec/s^3 at most: dt^3 / 15
+    of it is 1e-5 arcsec.
+    """
     t_s = np.arange(0.0, 100.0, 0.1)
     commanded = Commanded(t_s, scalar_first(attitude(scan, t_s)))
     between = t_s[5:-5] + 0.037

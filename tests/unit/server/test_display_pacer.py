@@ -1,4 +1,6 @@
-"""The pacer of a display, against a screen that swaps on a grid of its own and sometimes skips: no X server, no waiting."""
+"""The pacer of a display, against a screen that swaps on a grid of its own and sometimes skips:
+no X server, no waiting.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ SETTLED = DrawBudget.FRAMES // 4  # frames after which the budget follows what f
 
 
 class FakeScreen:
-    """A screen whose swap ends at the first refresh that it can still reach; `closes_at` is its last frame."""
+    """A screen whose swap ends at the first refresh that it can still reach; `closes_at` is its
+    last frame.
+    """
 
     def __init__(self, clock: FakeClock, by_screen: bool = True, closes_at: int | None = None) -> None:
         self.clock = SwapClock(FIRST_SWAP_NS, PERIOD_NS, by_screen)

@@ -1,4 +1,6 @@
-"""The frame loop and the pacer of a run without a screen, on a clock of the test's own: every slot is a frame or missed."""
+"""The frame loop and the pacer of a run without a screen, on a clock of the test's own: every
+slot is a frame or missed.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ OLD = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 10**9, True)
 
 
 class SlowBench:
-    """A bench whose sprites take as many ns as `cost` says of a frame's number, and whose drawing takes a millisecond."""
+    """A bench whose sprites take as many ns as `cost` says of a frame's number, and whose
+    drawing takes a millisecond.
+    """
 
     def __init__(self, tmp_path, clock: FakeClock, cost, more: str = "") -> None:
         self.config = parse_config(tmp_path / "bench.toml", SMALL_BENCH + more)

@@ -1,4 +1,6 @@
-"""A pulse at each frame: its width and level, whose frames have one, what a slow or lost line costs the frames: nothing."""
+"""A pulse at each frame: its width and level, whose frames have one, what a slow or lost line
+costs the frames: nothing.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from hilstar.server.frame_pulse import FramePulse
 from tests.support.rts_server import KeptLine
 from tests.support.waiting import PATIENCE_S, wait_for
 
-# Between frames here; a pulse is 1 ms. On a machine whose cores are busy a thread may be given none for some of them.
+# Between frames here; a pulse is 1 ms. On a machine whose cores are busy a thread may be given none
+# for some of them.
 FRAME_S = 0.02
 
 
@@ -88,7 +91,8 @@ def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
     stamps = []
     with FramePulse(Line(), settings(), Notices()) as pulse:
         for number in range(12):
-            stamps.append(time.monotonic_ns() - 2_000_000)  # swapped 2 ms ago, as far as the driver knows
+            # swapped 2 ms ago, as far as the driver knows
+            stamps.append(time.monotonic_ns() - 2_000_000)
             pulse.frame(number, stamps[-1])
             time.sleep(FRAME_S)
     raised = [at_ns for at_ns, level in kept[0].edges if level]
@@ -118,7 +122,8 @@ def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
             pulse.frame(number, time.monotonic_ns())
             costs_s.append(time.monotonic() - start_s)
             time.sleep(0.01)
-        # A frame that waited for the line would cost 0.1 s, each of them; a busy machine holds up some.
+        # A frame that waited for the line would cost 0.1 s, each of them; a busy machine holds up
+        # some.
         assert sorted(costs_s)[5] < 0.005, costs_s
         assert time.thread_time() - begin_s < 0.1
         busy_s = time.monotonic() - asked_s
@@ -149,7 +154,9 @@ def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
 
 
 def test_a_port_without_modem_lines_is_refused_in_a_line():
-    """A pty has none: the kernel says so when RTS is set, which pyserial keeps to itself while it opens."""
+    """A pty has none: the kernel says so when RTS is set, which pyserial keeps to itself while
+    it opens.
+    """
     ours, theirs = os.openpty()
     try:
         with pytest.raises(InputError, match=r"\[sync\] port = /dev/pts/\d+: has no line RTS .*write a serial port with modem"):

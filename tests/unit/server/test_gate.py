@@ -1,4 +1,6 @@
-"""The start-up gate: which displays it refuses, by the intervals between their swaps and by what the system says of them."""
+"""The start-up gate: which displays it refuses, by the intervals between their swaps and by what
+the system says of them.
+"""
 
 from __future__ import annotations
 

@@ -133,7 +133,9 @@ def write_over(path, _):
 
 
 def harm_until_said(path, harm, notices):
-    """The harmed file and its bytes. The newest file is harmed, and the next one where the ledger had just gone on to that."""
+    """The harmed file and its bytes. The newest file is harmed, and the next one where the
+    ledger had just gone on to that.
+    """
     seen, harmed, left = set(), None, None
 
     def said():

@@ -1,4 +1,6 @@
-"""A ledger that is begun and ended in a run: what reaches it, and what a later one is told of what lasts."""
+"""A ledger that is begun and ended in a run: what reaches it, and what a later one is told of
+what lasts.
+"""
 
 from __future__ import annotations
 

@@ -92,7 +92,8 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
     assert wrong.verdict == "wrong" and abs(wrong.residual_arcsec[1] - np.degrees(0.2) * 3600) < 1e-3
     assert len(wrong.mode) == 40
     assert (invalid.verdict, invalid.q, invalid.q_lit) == ("invalid", None, None)
-    for record in kept.records:  # as the ledger writes and reads it, with a schema that readers of MCAP know
+    # as the ledger writes and reads it, with a schema that readers of MCAP know
+    for record in kept.records:
         assert msgspec.json.decode(msgspec.json.encode(record), type=AnswerRecord) == record
     types = {field["type"] for field in msgspec.json.decode(schema_of(AnswerRecord, "x"))["properties"].values()}
     assert types == {"integer", "string", "array", "boolean", "number"}

@@ -1,4 +1,6 @@
-"""What is told of an attitude that comes and goes, and of frames that are late or hang; on a clock of the test's own."""
+"""What is told of an attitude that comes and goes, and of frames that are late or hang; on a
+clock of the test's own.
+"""
 
 from __future__ import annotations
 

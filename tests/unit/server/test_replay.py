@@ -1,4 +1,6 @@
-"""What of a log, or of an earlier run, is replayed: which frames, at which times, with which attitudes."""
+"""What of a log, or of an earlier run, is replayed: which frames, at which times, with which
+attitudes.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def config(tmp_path):
 
 @pytest.fixture
 def log(tmp_path):
-    """Two seconds of a turn about the boresight at 0.1 rad/s, a sample each 0.1 s, which begins at 100 s of its clock."""
+    """Two seconds of a turn about the boresight at 0.1 rad/s, a sample each 0.1 s, which begins
+    at 100 s of its clock.
+    """
     lines = [f"{100 + k / 10},{math.cos(0.005 * k)},0,0,{math.sin(0.005 * k)}" for k in range(21)]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]) + "\n")
@@ -41,7 +45,9 @@ def ledger(tmp_path, small_bench_file):
 
 
 def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
-    """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last two on paths."""
+    """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last
+    two on paths.
+    """
     bench = SimpleNamespace(
         file=SimpleNamespace(
             path=small_bench_file,

@@ -1,4 +1,6 @@
-"""Swaps of a model display with more back buffers, deadlines and time stamps than the usual: gate, clock and pacer are real."""
+"""Swaps of a model display with more back buffers, deadlines and time stamps than the usual:
+gate, clock and pacer are real.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,10 @@ from tests.support.model_display import model_screen
 
 HZ = (60, 144, 240)
 MS = 1e6
-ON_TIME_NS = 20_000  # of the swap clock's prediction, which stamps of a steady display settle to nanoseconds
-QUEUED_NS = 250_000  # while a queue fills, swaps return between refreshes and pull the clock a little
+# of the swap clock's prediction, which stamps of a steady display settle to nanoseconds
+ON_TIME_NS = 20_000
+# while a queue fills, swaps return between refreshes and pull the clock a little
+QUEUED_NS = 250_000
 TURNING = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 0, False, rate_cam_rad_s=np.array([0.0, 0.03, 0.0]))
 
 
@@ -38,7 +42,9 @@ class Run:
         self.loop = FrameLoop(self.screen.bench, self.shown.append, self.pacer, notices=self.notices)
 
     def frames(self, slots: int) -> np.ndarray:
-        """Show so many refresh periods; how much later than predicted the light of each frame came, ns."""
+        """Show so many refresh periods; how much later than predicted the light of each frame
+        came, ns.
+        """
         self.moments.clear()
         before = len(self.display.flips_ns)
         self.loop.paced(Limit(slots=slots), self._draw)
@@ -53,7 +59,9 @@ class Run:
 @pytest.mark.parametrize("hz", HZ)
 @pytest.mark.parametrize("stamp_ms", [-0.3, 0.0, 0.2, 0.5])
 def test_a_stamp_ahead_of_now_is_the_driver_s_time_of_the_swap(tmp_path, hz, stamp_ms):
-    """Linux stamps the end of a blank at its beginning: with stamps refused, light was a refresh late behind three buffers."""
+    """Linux stamps the end of a blank at its beginning: with stamps refused, light was a refresh
+    late behind three buffers.
+    """
     run = Run(tmp_path, hz, buffers=3, stamp_ns=round(stamp_ms * MS))
     late_ns = run.frames(100)
     assert run.display.timestamp_source == "GLX_OML_sync_control"
@@ -93,7 +101,9 @@ def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(
 
 @pytest.mark.parametrize(("deadline_ms", "hz"), [(0.2, 60), (0.9, 60), (1.3, 60), (1.3, 240), (3.1, 60), (3.1, 144)])
 def test_a_driver_that_needs_longer_is_found_by_the_gate(tmp_path, deadline_ms, hz):
-    """With a guard of 1 ms and a driver that needs 1.3, every frame was a refresh late, at half the rate, for good."""
+    """With a guard of 1 ms and a driver that needs 1.3, every frame was a refresh late, at half
+    the rate, for good.
+    """
     run = Run(tmp_path, hz, deadline_ns=round(deadline_ms * MS))
     assert run.timing.guard_ms == pytest.approx(
         min(next(guard_ms for guard_ms in GUARDS_MS if guard_ms > deadline_ms), 500 / hz)

@@ -22,7 +22,8 @@ ROWS = (
     "   |       |     |     |    | | | |224690|B-20 6688 |          |          |1.04|K3V         |4 ",
 )
 
-# Of the 116 812 stars that are used: types P, U and M of field H52, and those with a separation in field H64.
+# Of the 116 812 stars that are used: types P, U and M of field H52, and those with a separation in
+# field H64.
 VARIABLES, RESOLVED = 11_189, 10_860
 
 

@@ -29,7 +29,9 @@ def test_every_star_within_the_radius_is_found(vectors, rng):
 
 
 def test_few_others_are_found(vectors):
-    """The index earns its place: stars found lie within a cell's diagonal, and its margin, of the radius."""
+    """The index earns its place: stars found lie within a cell's diagonal, and its margin, of
+    the radius.
+    """
     grid = cell_grid(vectors)
     axis, radius = np.array([0.6, 0.0, 0.8]), 0.18
     found = grid.order[grid.near(axis, radius)]

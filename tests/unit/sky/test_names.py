@@ -1,4 +1,6 @@
-"""Designations and names of stars, held to Skyfield's own list and to stars whose numbers everybody knows."""
+"""Designations and names of stars, held to Skyfield's own list and to stars whose numbers
+everybody knows.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +8,10 @@ from skyfield.named_stars import named_star_dict
 
 from hilstar.sky.catalog import label_of, load_catalog, star_names
 
-MIN_SHARED = 80  # of Skyfield's 119 names; the others are spelt otherwise, or not the ones that the IAU approved
-# Names that the IAU (WGSN, 2016 to 2018) gave to another star than Skyfield's older list: γ Crv, α Cen B, γ Peg and α Peg.
+# of Skyfield's 119 names; the others are spelt otherwise, or not the ones that the IAU approved
+MIN_SHARED = 80
+# Names that the IAU (WGSN, 2016 to 2018) gave to another star than Skyfield's older list: γ Crv, α
+# Cen B, γ Peg and α Peg.
 GIVEN_ANEW = {"Gienah": 59803, "Toliman": 71681, "Algenib": 1067, "Markab": 113963}
 KNOWN = {
     27989: "α Ori",
@@ -35,7 +39,9 @@ def test_labels_are_designations_where_there_are_any():
 
 
 def test_every_bright_star_has_a_designation():
-    """Stars over V = 3.0 all have a Bayer letter or a Flamsteed number, but for the few of Lacaille's and Gould's south."""
+    """Stars over V = 3.0 all have a Bayer letter or a Flamsteed number, but for the few of
+    Lacaille's and Gould's south.
+    """
     catalog = load_catalog()
     bright = catalog.hip[catalog.v_mag < 3.0].tolist()
     without = [hip for hip in bright if not star_names().get(hip, ("", ""))[0]]

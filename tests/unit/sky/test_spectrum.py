@@ -29,9 +29,11 @@ def test_a_black_body_neither_overflows_nor_turns_negative():
 
 def test_the_source_s_temperature_scale_jumps_at_zero_and_the_default_does_not():
     around = np.array([-1e-9, 0.0])
-    assert temperature_wang2021_k(around) == pytest.approx([9259.8, 8909.7], abs=0.1)  # thesis eq. 3.13
+    # thesis eq. 3.13
+    assert temperature_wang2021_k(around) == pytest.approx([9259.8, 8909.7], abs=0.1)
     assert np.diff(temperature_ballesteros2012_k(around))[0] == pytest.approx(0, abs=1e-4)
-    assert temperature_ballesteros2012_k(np.array([0.65]))[0] == pytest.approx(5778, abs=40)  # the Sun, Ballesteros 2012
+    # the Sun, Ballesteros 2012
+    assert temperature_ballesteros2012_k(np.array([0.65]))[0] == pytest.approx(5778, abs=40)
 
 
 def test_temperature_scales_are_finite_over_every_colour_of_the_catalogue():
@@ -47,7 +49,8 @@ def test_integration_nodes_integrate_pieces_of_straight_lines():
     wavelength_nm, weight_m = integration_nodes(a, b)
     fine = np.linspace(350, 700, 3_500_001)
     exact = np.trapezoid(a(fine) * b(fine), fine) * 1e-9
-    # Gauss is exact here; the trapezium with 1e-4 nm steps is off by h^2/12 times the slopes: below 1e-12.
+    # Gauss is exact here; the trapezium with 1e-4 nm steps is off by h^2/12 times the slopes: below
+    # 1e-12.
     assert a(wavelength_nm) * b(wavelength_nm) @ weight_m == pytest.approx(exact, rel=1e-10)
 
 

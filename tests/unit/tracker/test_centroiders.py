@@ -11,7 +11,8 @@ from scipy.special import ndtr
 from hilstar.tracker.centroiders import Centroider, brightest, star_places
 
 SIGMA = (1.05, 0.95)
-# Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x 3 most of them.
+# Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
+# 3 most of them.
 BIAS_PX = {"moment": 1e-6, "window": 2e-3, "wide": 2e-3, "fit": 1e-6, "psf": 1e-6, "box3": 0.3, "box5": 0.1}
 
 

@@ -15,12 +15,15 @@ from hilstar.tracker.centroids import (
 
 SIZE_PX = 40
 BACKGROUND = LocalBackground(0.0, 1.0)
-SAME_PX = 1e-6  # the sums of a turned window run the other way round; Newton's iteration ends within 1e-7
+# the sums of a turned window run the other way round; Newton's iteration ends within 1e-7
+SAME_PX = 1e-6
 
 
 @pytest.mark.parametrize("window", ["gaussian", "plain"])
 def test_a_centre_that_leaves_the_image_is_measured_alike_at_all_four_edges(window):
-    """A star on the last row, and a pixel under the background on the row within: the moment points out of the image."""
+    """A star on the last row, and a pixel under the background on the row within: the moment
+    points out of the image.
+    """
     image = np.zeros((SIZE_PX, SIZE_PX))
     image[0, 19:22] = 30.0, 100.0, 50.0
     image[1, 20] = -120.0
@@ -43,7 +46,8 @@ def test_the_noise_of_the_noisier_parts_is_found_beside_a_clipped_one():
     image = np.zeros((256, 384))
     image[:, :128] = np.rint(rng.normal(0, 2.0, (256, 128)))
     found = noisiest_background(image)
-    # 32 blocks of 1024 pixels: each is known to 2 %, and the 90th percentile lies among the upper third of them.
+    # 32 blocks of 1024 pixels: each is known to 2 %, and the 90th percentile lies among the upper
+    # third of them.
     assert found.noise == pytest.approx(2.0, rel=0.06)
     assert found.level == 0
     assert noisiest_background(np.zeros((40, 40)), 5.0).noise == pytest.approx(5 / np.sqrt(12))
@@ -51,7 +55,9 @@ def test_the_noise_of_the_noisier_parts_is_found_beside_a_clipped_one():
 
 @pytest.mark.parametrize("shape", [(64, 64), (63, 65)])  # an even number of pixels, and an odd one
 def test_the_background_of_whole_numbers_is_that_of_their_pixels(shape):
-    """Counted value by value, as DN are, and pixel by pixel, as electrons are: the same, but for the order of a sum."""
+    """Counted value by value, as DN are, and pixel by pixel, as electrons are: the same, but for
+    the order of a sum.
+    """
     image = np.random.default_rng(5).poisson(20.0, shape).astype(np.uint16)
     image[3:6, 3:6] = 4000
     counted, by_pixel = estimate_background(image), estimate_background(image.astype(np.float64), step=1.0)

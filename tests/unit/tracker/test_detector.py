@@ -1,4 +1,6 @@
-"""The virtual detector: its order of steps, its seeds, and what it does with the extreme and the wrong."""
+"""The virtual detector: its order of steps, its seeds, and what it does with the extreme and the
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ SIZE_PX = (160, 128)
 SHAPE = (128, 160)
 PIXELS = 128 * 160
 
-# A mean of n samples lies 5 of its own sigmas off once in 1.7 million; seeds are fixed, so this is a margin, not a flake.
+# A mean of n samples lies 5 of its own sigmas off once in 1.7 million; seeds are fixed, so this is
+# a margin, not a flake.
 SIGMAS = 5.0
 # The relative error of a sigma from n samples is 1 / sqrt(2 n): 0.5 % for the pixels of one frame.
 SIGMA_ERROR = SIGMAS / math.sqrt(2 * PIXELS)
@@ -61,7 +64,8 @@ def test_another_frame_seed_changes_only_the_frames_noise():
     detector = Detector(settings, SIZE_PX)
     first, second = (detector.expose(flat(10_000.0), 1.0, generator(seed)).astype(float) for seed in (1, 2))
     assert (first != second).mean() > 0.9
-    # Shot noise of 11 000 e- is 105 e-, the fixed pattern 540 e-: the difference holds the first and not the second.
+    # Shot noise of 11 000 e- is 105 e-, the fixed pattern 540 e-: the difference holds the first
+    # and not the second.
     shot_e = math.sqrt(11_000.0)
     rounding = 1 / 12
     assert (first - second).std() == pytest.approx(math.sqrt(2 * (shot_e**2 + rounding)), rel=SIGMA_ERROR)
@@ -71,7 +75,8 @@ def test_another_frame_seed_changes_only_the_frames_noise():
 def test_another_device_seed_changes_every_map():
     one, other = (Detector(replace(EVERYTHING, device_seed=seed), SIZE_PX) for seed in (1, 2))
     for name in ("gain_map", "dark_map_e_per_s", "column_e"):
-        # Two continuous draws agree nowhere but on the few pixels that are dead, or cut at no dark, in both.
+        # Two continuous draws agree nowhere but on the few pixels that are dead, or cut at no dark,
+        # in both.
         assert (getattr(one, name) == getattr(other, name)).mean() < 0.01
 
 
@@ -87,7 +92,8 @@ def test_switching_one_defect_on_leaves_the_other_maps_as_they_were():
 def test_the_gain_map_acts_on_light_before_its_shot_noise():
     detector = Detector(DetectorSettings(gain_e_per_dn=1.0, bits=16, prnu=0.3), SIZE_PX)
     first, second = (detector.expose(flat(5000.0), 0.0, generator(seed)).astype(float) for seed in (1, 2))
-    # Before: a variance of 5000 <g>. After: 5000 <g^2>, 9 % more. The variance of 20 480 differences is good to 1 %.
+    # Before: a variance of 5000 <g>. After: 5000 <g^2>, 9 % more. The variance of 20 480
+    # differences is good to 1 %.
     variance_e2 = (first - second).var() / 2 - 1 / 12
     assert variance_e2 == pytest.approx(5000.0, rel=0.045)
 
@@ -95,7 +101,8 @@ def test_the_gain_map_acts_on_light_before_its_shot_noise():
 def test_the_full_well_clips_before_read_noise_and_adc():
     settings = DetectorSettings(gain_e_per_dn=1.0, full_well_e=3000.0, bits=16, offset_dn=100.0, read_noise_e=20.0)
     image = Detector(settings, SIZE_PX).expose(flat(1e6), 1.0, generator()).astype(float)
-    # Read noise after the clip is whole; before it, the image would be a constant 3100. No shot noise survives the clip.
+    # Read noise after the clip is whole; before it, the image would be a constant 3100. No shot
+    # noise survives the clip.
     noise_e = math.sqrt(20.0**2 + 1 / 12)
     assert image.mean() == pytest.approx(3100.0, abs=SIGMAS * noise_e / math.sqrt(PIXELS))
     assert image.std() == pytest.approx(noise_e, rel=SIGMA_ERROR)
@@ -131,7 +138,8 @@ def test_the_adc_clips_at_its_largest_code_and_at_zero(bits):
     assert (detector.expose(flat(2e4), 1.0, generator()) == 2**bits - 1).all()
     dark = detector.expose(flat(0.0), 1.0, generator())
     assert dark.max() > 0
-    # Half of the read noise is below no electrons, and what rounds to 0 (half a DN, 0.05 e-, 0.017 sigma): 0.507.
+    # Half of the read noise is below no electrons, and what rounds to 0 (half a DN, 0.05 e-, 0.017
+    # sigma): 0.507.
     assert (dark == 0).mean() == pytest.approx(0.507, abs=SIGMAS * 0.5 / math.sqrt(PIXELS))
 
 
@@ -195,7 +203,8 @@ def test_quantisation_noise_is_roundings_unless_the_thesis_gaussian_is_asked_for
     ramp_e = np.linspace(1000.0, 50_000.0, PIXELS).reshape(SHAPE)
     detector = Detector(DetectorSettings(gain_e_per_dn=24.0), SIZE_PX)
     error_e = detector.expose_noiseless(ramp_e, 0.0) * 24.0 - ramp_e
-    # A ramp over 2042 whole DN: the error is uniform, its sigma gain / sqrt 12, to the 1e-3 of the ramp's ends.
+    # A ramp over 2042 whole DN: the error is uniform, its sigma gain / sqrt 12, to the 1e-3 of the
+    # ramp's ends.
     assert error_e.std() == pytest.approx(24.0 / math.sqrt(12), rel=1e-3)
     added = DetectorSettings(gain_e_per_dn=1.0, offset_dn=100.0, quantisation_noise=True)
     assert added.adc_noise_e == pytest.approx(4.93, abs=0.005)  # table 4.2, two digits
@@ -208,13 +217,15 @@ def test_dark_is_the_datasheets_at_the_reference_and_falls_with_the_cold():
         assert DetectorSettings(dark_law=law).dark_factor == 1.0
         factors = [DetectorSettings(dark_law=law, temperature_k=t).dark_factor for t in (240.0, 260.0, 280.0, 300.0)]
         assert factors == sorted(factors)
-    # The datasheet's own figure at 293 K must be the 1 that it is relative to; its coefficients have 3 digits.
+    # The datasheet's own figure at 293 K must be the 1 that it is relative to; its coefficients
+    # have 3 digits.
     assert e2v_dark("ccd47-20", 293.0) == pytest.approx(1.0, abs=0.005)
     assert e2v_dark("e2v-nimo", 293.0) == pytest.approx(1.0, abs=0.005)
 
 
 def test_arrhenius_doubles_over_the_textbook_interval():
-    # d ln D / dT = E / (k T^2): 0.56 eV at 293 K gives ln 2 in 9.2 K (taken at the middle of the interval).
+    # d ln D / dT = E / (k T^2): 0.56 eV at 293 K gives ln 2 in 9.2 K (taken at the middle of the
+    # interval).
     interval_k = math.log(2) * 8.617333e-5 * 293.0**2 / 0.56
     colder, warmer = (DetectorSettings(temperature_k=293.0 + side * interval_k / 2).dark_factor for side in (-1, 1))
     second_order = (interval_k / 293.0) ** 2
@@ -284,7 +295,8 @@ def test_a_law_is_fitted_to_measured_quantiles(law, of):
     assert (settings.dark_e_per_s, settings.dsnu_e_per_s) == pytest.approx((of.mean(), of.std()), rel=1e-5)
     assert replace(settings, prnu=0.01).dark_e_per_s == settings.dark_e_per_s
     rates = Detector(settings, (600, 600)).dark_map_e_per_s
-    # A quantile of 360 000 pixels: 1 % of the sigma at 99 %, which is its largest error by five of its own sigmas.
+    # A quantile of 360 000 pixels: 1 % of the sigma at 99 %, which is its largest error by five of
+    # its own sigmas.
     assert np.quantile(rates, QUANTILE_SHARES) == pytest.approx(of.ppf(QUANTILE_SHARES), abs=0.05 * of.std())
 
 
@@ -333,7 +345,8 @@ def test_read_noise_follows_the_readout_frequency():
     assert white.read_noise_now_e == pytest.approx(16.0)  # four times the band
     assert replace(white, readout_hz=1e6).read_noise_now_e == pytest.approx(8.0)
     corner = replace(white, read_noise_corner_hz=1e6)
-    assert replace(corner, readout_hz=1.0).read_noise_now_e == pytest.approx(8.0 / math.sqrt(2), rel=1e-5)  # 1/f alone
+    # 1/f alone
+    assert replace(corner, readout_hz=1.0).read_noise_now_e == pytest.approx(8.0 / math.sqrt(2), rel=1e-5)
     table = DetectorSettings(read_noise_table=((1e4, 2.0), (1e6, 8.0)), readout_hz=1e5)
     assert table.read_noise_now_e == pytest.approx(4.0)
     image = Detector(replace(table, gain_e_per_dn=0.1, offset_dn=500.0, bits=16), SIZE_PX).expose(flat(0.0), 0.0, generator())
@@ -377,10 +390,12 @@ def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
     shape, expected = (512, 512), 1000.0 * 0.512**2
     image_e = cosmic_rays_e(settings, shape, 1.0, generator(), pixel_pitch_um=10.0)
     labels, found = ndimage.label(image_e, structure=np.ones((3, 3)))
-    # Tracks of a few pixels on 262 144: two of 262 touch about as often as 262^2 / 2 * 25 / 262 144 = 3 times.
+    # Tracks of a few pixels on 262 144: two of 262 touch about as often as 262^2 / 2 * 25 / 262
+    # 144 = 3 times.
     assert found == pytest.approx(expected - 3, abs=SIGMAS * math.sqrt(expected))
     charge_e = ndimage.sum_labels(image_e, labels, range(1, found + 1))
-    # cos^2 even from 0 to 1: half of the paths are longer than sqrt 2 of the depth. The median's error is
+    # cos^2 even from 0 to 1: half of the paths are longer than sqrt 2 of the depth. The median's
+    # error is
     # 1 / (2 f sqrt n) = 3 %, f = 0.7 the density there.
     assert np.median(charge_e) == pytest.approx(math.sqrt(2) * RAY_DEPTH_UM * RAY_E_PER_UM, rel=SIGMAS * 0.03)
 
@@ -396,11 +411,13 @@ def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
     rng = generator()
     first, second = (false_stars_e(settings, SHAPE, 0.5, rng) for _ in range(2))
     assert np.count_nonzero((first > 100) & (second > 100)) < 10
-    # A reach of 5 sigma cuts 6e-7 of a star along an axis; on this many pixels, none lies over the edge.
+    # A reach of 5 sigma cuts 6e-7 of a star along an axis; on this many pixels, none lies over the
+    # edge.
     inside = false_stars_e(settings, (2000, 2000), 0.5, generator())
     assert inside.sum() == pytest.approx(10 * 2500.0, rel=2 * 6e-7)
     frame = Detector(replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(flat(0.0), 0.5, generator())
-    # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-, with 23 e- of noise.
+    # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-,
+    # with 23 e- of noise.
     assert frame.max() > 540 - SIGMAS * 23
 
 

@@ -1,4 +1,5 @@
-"""A frame's random numbers, by pushing what they are made of through the same arithmetic: exact, without sampling.
+"""A frame's random numbers, by pushing what they are made of through the same arithmetic: exact,
+without sampling.
 
 `python -m tests.unit.tracker.test_frame_noise` prints the errors by mean.
 """
@@ -24,7 +25,8 @@ CDF_ERROR = 3e-4
 MOMENT_ERROR = 1e-4
 TAIL_ERROR = 0.05
 TAIL = 2.87e-7  # 5 sigmas
-# What is exact rounds the normal number to float32: 2.4e-7 of up to 5 sigmas, times the density; and 24 bits of a share.
+# What is exact rounds the normal number to float32: 2.4e-7 of up to 5 sigmas, times the density;
+# and 24 bits of a share.
 FLOAT32_CDF_ERROR = 2e-7
 MEANS_E = (0.01, 0.3, 1.0, 2.5, 7.99, 8.0, 20.5, 63.9, 64.0, 100.0, 1000.0, 1e5)
 NUMBERS_END = 6.77
@@ -32,7 +34,9 @@ NUMBERS_END = 6.77
 
 @dataclass
 class PoissonErrors:
-    """Of the law that `poisson` keeps: largest error of its CDF, relative ones of mean, variance and tails to 5 sigmas."""
+    """Of the law that `poisson` keeps: largest error of its CDF, relative ones of mean, variance
+    and tails to 5 sigmas.
+    """
 
     cdf: float
     mean: float
@@ -83,7 +87,8 @@ def test_the_expansion_alone_fails_the_limits_below_its_range(monkeypatch):
 
 
 def test_counts_rise_with_their_number_for_every_mean():
-    # Bisection sees one step of each count; between table and expansion, doubt and none, there could be others.
+    # Bisection sees one step of each count; between table and expansion, doubt and none, there
+    # could be others.
     number = np.linspace(-NUMBERS_END, NUMBERS_END, 20_001, dtype=np.float32)
     for mean_e in (0.0, 0.005, 0.7, 3.3, 7.999, 8.001, 11.0, 63.0, 65.0):
         counts = poisson(np.full_like(number, mean_e), number)
@@ -106,7 +111,8 @@ def test_a_part_of_faint_and_bright_pixels_counts_each_as_if_alone():
     counts = poisson(mean_e, number)
     exact = mean_e < frame_noise.EXACT_BELOW_E
     np.testing.assert_array_equal(counts[exact], wanted[exact])
-    # At a step, float32 and the expansion may take the count beside it: 0.01 e- off, of one, is one pixel in 100 at most.
+    # At a step, float32 and the expansion may take the count beside it: 0.01 e- off, of one, is one
+    # pixel in 100 at most.
     assert np.abs(counts - wanted).max() <= 1
     assert (counts != wanted).mean() < 0.01
 

@@ -1,4 +1,6 @@
-"""Found stars become an attitude: near an expected one, and lost in space by tetra3rs, against the truth."""
+"""Found stars become an attitude: near an expected one, and lost in space by tetra3rs, against
+the truth.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def lost_in_space(sky):
 
 
 class Sky:
-    """Stars that a camera of 10.9 degrees sees at an attitude, with noise, false ones and one that a neighbour pulled away."""
+    """Stars that a camera of 10.9 degrees sees at an attitude, with noise, false ones and one
+    that a neighbour pulled away.
+    """
 
     def __init__(self, sky, q, rng, false=5):
         self.vectors, v_mag = sky

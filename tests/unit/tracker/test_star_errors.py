@@ -1,4 +1,6 @@
-"""The tracker that judges codes, against one put together from fine samples and centroiders that share no code with it."""
+"""The tracker that judges codes, against one put together from fine samples and centroiders that
+share no code with it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ COUNT, FINE, FAR_PX = 5, 40, 8
 # Samples of 1/40 px: their light is within 1e-4 of the integral, and a place within 1e-4 px.
 SAMPLED_PX = 2e-4
 WINGS = 1e-6  # of a star's light are cut by its footprint
-# A shift along x moves nothing along y, but where it takes a pixel over a box's threshold, 2 % of the brightest.
+# A shift along x moves nothing along y, but where it takes a pixel over a box's threshold, 2 % of
+# the brightest.
 ACROSS_PX = {"moment": 1e-9, "window": 1e-4, "wide": 1e-4, "fit": 1e-4, "box3": 0.02, "box5": 0.02}
 FIT_PX = 0.02  # a tenth of a pixel aside widens a star, which a fit of fixed width sees askew
 
@@ -90,7 +93,9 @@ def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
 
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.3, 0.2), Seen(1.1, 2.3)])
 def test_a_grid_s_stars_and_the_same_as_squares_are_as_far_off(seen):
-    """They meet the tracker's pixels at other phases: what differs is an S-curve's, a fifth of the error; a moment has none."""
+    """They meet the tracker's pixels at other phases: what differs is an S-curve's, a fifth of
+    the error; a moment has none.
+    """
     wanted, shown, tile = codes("round", 5.0, seen)
     places = line_places(phase_grid(COUNT, GaussianPsf(SIGMA))[0])
     grid = Judge(wanted, places, SIGMA, seen.blur_px, seen.pixel_px).errors(shown)

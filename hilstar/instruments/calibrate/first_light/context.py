@@ -1,4 +1,5 @@
-"""The context of a step: the bench file as it stands, the step's folder, the source of images, and figures of earlier steps.
+"""The context of a step: the bench file as it stands, the step's folder, the source of images, and
+figures of earlier steps.
 
 Before it the session's records: session.json, and the keys set in the bench file.
 """
@@ -58,7 +59,9 @@ class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StepNumber(msgspec.Struct, frozen=True):
-    """The one figure of a step: value, standard error (None for a count or a figure without one), unit, and what it is."""
+    """The one figure of a step: value, standard error (None for a count or a figure without
+    one), unit, and what it is.
+    """
 
     value: float
     error: float | None
@@ -67,7 +70,9 @@ class StepNumber(msgspec.Struct, frozen=True):
 
 
 class FittedFigure(NamedTuple):
-    """A figure of a fit, and the ends of its model: a figure at an end was not found there, the model stopped it."""
+    """A figure of a fit, and the ends of its model: a figure at an end was not found there, the
+    model stopped it.
+    """
 
     name: str
     value: float
@@ -83,9 +88,11 @@ class FittedFigure(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """The result of a step: one line, figures, files made, pictures for the page, keys to set, and its one figure.
+    """The result of a step: one line, figures, files made, pictures for the page, keys to set, and
+    its one figure.
 
-    `fitted` has the figures of its fits whose models have ends; a step with one at an end is never done (see `checked`).
+    `fitted` has the figures of its fits whose models have ends; a step with one at an end is never
+    done (see `checked`).
     """
 
     verdict: Verdict
@@ -98,7 +105,9 @@ class StepOutcome:
     fitted: tuple[FittedFigure, ...] = ()
 
     def checked(self) -> "StepOutcome":
-        """This outcome; failed, and without its changes, where a figure is at an end of its model."""
+        """This outcome; failed, and without its changes, where a figure is at an end of its
+        model.
+        """
         at_end = [each for each in self.fitted if each.is_at_end]
         if self.verdict != "done" or not at_end:
             return self
@@ -110,7 +119,9 @@ class StepOutcome:
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A step in session.json: `state_sha256` is of what it depends on, `files` has each file's SHA-256 by its path there."""
+    """A step in session.json: `state_sha256` is of what it depends on, `files` has each file's
+    SHA-256 by its path there.
+    """
 
     name: str
     verdict: Verdict
@@ -129,8 +140,9 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
 class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     """session.json: the bench, where its patterns are seen, and the steps in their order.
 
-    `unfinished` has the state of each interrupted step: while it is the same, the images taken are used again. `beat` is that
-    of the tracker's exposures with the display's refresh, measured where it could be; `forced` what --force shows it on.
+    `unfinished` has the state of each interrupted step: while it is the same, the images taken are
+    used again. `beat` is that of the tracker's exposures with the display's refresh, measured where
+    it could be; `forced` what --force shows it on.
     """
 
     kind: str
@@ -146,7 +158,9 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_session(folder: Path) -> SessionFile | None:
-    """The session in a directory, None where there is none. Raises InputError for a file that is no session."""
+    """The session in a directory, None where there is none. Raises InputError for a file that is
+    no session.
+    """
     path = folder / SESSION_FILE
     if not exists(path):
         return None
@@ -173,7 +187,9 @@ INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
 
 
 def with_changes(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
-    """The bench file with the changes, without writing it. Raises InputError where a key cannot be set in this file."""
+    """The bench file with the changes, without writing it. Raises InputError where a key cannot
+    be set in this file.
+    """
     text = file.text
     for change in changes:
         text = with_key(text, change.table, change.key, change.after, INSTEAD_OF.get(change.key, ()))
@@ -193,7 +209,8 @@ def rewrite(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
     return read_bench_file(file.path)
 
 
-# Figures of the step `orientation`: the monitor's camera as the figure was seen, with its q_cam_to_mon.
+# Figures of the step `orientation`: the monitor's camera as the figure was seen, with its
+# q_cam_to_mon.
 SEEN_FOCAL, SEEN_Q = "seen_focal_length_px", ("seen_qw", "seen_qx", "seen_qy", "seen_qz")
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
@@ -204,7 +221,8 @@ LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 class DarkSubtracted:
     """An image of the tracker: its file, and its light above the dark frame (h, w), DN.
 
-    `raw_peak` is the peak before subtraction, without hot pixels; `floor_dn` is the median of the dark frame.
+    `raw_peak` is the peak before subtraction, without hot pixels; `floor_dn` is the median of the
+    dark frame.
     """
 
     path: Path
@@ -217,10 +235,12 @@ class DarkSubtracted:
 class StepContext:
     """Everything that a step works with.
 
-    Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt, which are not taken again.
-    `known` has the figures of earlier steps; `patches` is the maximum number of readings of the response. `watch` is called
-    with each pattern before it is shown. White is watched for `watched_s` at most, 0 for not at all.
-    `frames` images of each field of stars are averaged, 0: as many as their noise asks for. `stage` is told what begins.
+    Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt,
+    which are not taken again. `known` has the figures of earlier steps; `patches` is the maximum
+    number of readings of the response. `watch` is called with each pattern before it is shown.
+    White is watched for `watched_s` at most, 0 for not at all.
+    `frames` images of each field of stars are averaged, 0: as many as their noise asks for. `stage`
+    is told what begins.
     """
 
     file: BenchFile
@@ -252,7 +272,9 @@ class StepContext:
 
     @property
     def tracker_psf(self) -> Psf:
-        """How collimator and tracker spread a monitor's point, as the bench file has it. Raises InputError."""
+        """How collimator and tracker spread a monitor's point, as the bench file has it. Raises
+        InputError.
+        """
         return before_detector(self.file.config, self.file.folder, self.geometry().monitor)
 
     def geometry(self) -> BenchGeometry:
@@ -265,7 +287,9 @@ class StepContext:
 
     @property
     def seen_screen(self) -> SeenScreen:
-        """The part of the screen that the tracker sees, by the figure of the step `orientation` where it was measured."""
+        """The part of the screen that the tracker sees, by the figure of the step `orientation`
+        where it was measured.
+        """
         geometry, psf_px = self.geometry(), psf_sigma_of(self.file)
         focal_px = self.known.get(f"orientation.{SEEN_FOCAL}")
         if focal_px is None:
@@ -276,11 +300,15 @@ class StepContext:
 
     @property
     def psf_sigma_px(self) -> float:
-        """The sigma of the tracker's PSF: that of the step `focus` where it is done, else the bench file's."""
+        """The sigma of the tracker's PSF: that of the step `focus` where it is done, else the
+        bench file's.
+        """
         return float(self.known.get("focus.psf_sigma_px", np.mean(self.tracker_psf.width_px)))
 
     def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
-        """The change of a key of the bench file that names a file of the session; none where it does already."""
+        """The change of a key of the bench file that names a file of the session; none where it
+        does already.
+        """
         return self.change(table, key, os.path.relpath(path, self.file.folder))
 
     def change(self, table: str, key: str, after: TomlValue) -> tuple[KeyChange, ...]:
@@ -303,7 +331,9 @@ class StepContext:
         return self.source.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
-        """Take the tracker's image of a pattern, or by hand the key that says how it looks; `keys` has their meanings."""
+        """Take the tracker's image of a pattern, or by hand the key that says how it looks;
+        `keys` has their meanings.
+        """
         if isinstance(self.source, ByHand) and pattern.name not in self.kept:
             stem = make_directory(self.folder) / pattern.name
             self.watch(pattern)
@@ -320,11 +350,15 @@ class StepContext:
         return self.take(Pattern(f"dark_{number:03}", black(self.resolution_px)))
 
     def look(self, pattern: Pattern, dark: FloatArray) -> DarkSubtracted:
-        """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""
+        """The tracker's image of a pattern, above its dark frame. Raises InputError for one that
+        cannot be read.
+        """
         return self.looked(self.take(pattern), dark)
 
     def looked(self, path: Path, dark: FloatArray) -> DarkSubtracted:
-        """An image of the tracker above its dark frame. Raises InputError for one that cannot be read."""
+        """An image of the tracker above its dark frame. Raises InputError for one that cannot be
+        read.
+        """
         pixels, cold = self.pixels(path), dark < HOT_FILL * self.full_dn
         seen = software_image(pixels, self.file.config.tracker.detector)
         return DarkSubtracted(path, seen - dark, float(pixels[cold].max(initial=0.0)), float(np.median(dark)))

@@ -1,8 +1,10 @@
-"""The step `focus`: how sharp the tracker sees dots, by its PSF's sigma and the side of a dot, fitted together to their pixels.
+"""The step `focus`: how sharp the tracker sees dots, by its PSF's sigma and the side of a dot,
+fitted together to their pixels.
 
-A dot is a square of light, turned as the screen is turned before the tracker. Where a monitor pixel is wide for the tracker its
-edges say how sharp the tracker is; where the PSF is wide the whole width does, and the side has to be known. So both are
-fitted, with the side as well known as the step `orientation` leaves it, and the error says how well the two can be told apart.
+A dot is a square of light, turned as the screen is turned before the tracker. Where a monitor pixel
+is wide for the tracker its edges say how sharp the tracker is; where the PSF is wide the whole
+width does, and the side has to be known. So both are fitted, with the side as well known as the
+step `orientation` leaves it, and the error says how well the two can be told apart.
 """
 
 import math
@@ -33,26 +35,35 @@ from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_bac
 from hilstar.tracker.settings import DetectorSettings
 
 THRESHOLD_SIGMA = 8.0
-MIN_DOTS, MAX_DOTS = 5, 40  # of which the brightest are fitted: 40 leave 0.2 % of error where a dot leaves 1 %
-MIN_ALONE_DOTS, MIN_WINGS_PX = 8, 2.0  # with fewer alone, a dot's square of pixels is made smaller, to so much about its side
+# of which the brightest are fitted: 40 leave 0.2 % of error where a dot leaves 1 %
+MIN_DOTS, MAX_DOTS = 5, 40
+# with fewer alone, a dot's square of pixels is made smaller, to so much about its side
+MIN_ALONE_DOTS, MIN_WINGS_PX = 8, 2.0
 MAX_ALL_POINTS = 24_000  # of all dots together: fewer dots where each has many points
 SIGMAS_PX = (0.1, 12.0)  # ends of the model
 STARTS_PX = np.geomspace(0.2, 8.0, 12)
-START_SIGMAS, MIN_HALF_PX, MAX_HALF_PX = 4.0, 5, 40  # of a dot's wings in its square of pixels, beside its own half side
-POINTS_A_SIGMA, MIN_POINTS, MAX_POINTS = 2.5, 5, 48  # along a dot's side: 2.5 in a sigma make its edge softer by 0.7 %
+# of a dot's wings in its square of pixels, beside its own half side
+START_SIGMAS, MIN_HALF_PX, MAX_HALF_PX = 4.0, 5, 40
+# along a dot's side: 2.5 in a sigma make its edge softer by 0.7 %
+POINTS_A_SIGMA, MIN_POINTS, MAX_POINTS = 2.5, 5, 48
 ROUNDS, FIRST_DAMPING, SETTLED = 40, 1e-3, 1e-4
 SIDE_SHARE = 0.01  # sigma of a dot's side: lens and tilt change it so much over the field
-# What the model leaves, relative to the PSF's sigma: a pixel is no even square, and the points are not infinitely many.
+# What the model leaves, relative to the PSF's sigma: a pixel is no even square, and the points are
+# not infinitely many.
 MODEL_SHARE = 0.01
-# Sigma of the PSF by an edge that is softer than a square's, relative to a dot's side: of 19.5 px it was 0.019 px off.
+# Sigma of the PSF by an edge that is softer than a square's, relative to a dot's side: of 19.5 px
+# it was 0.019 px off.
 EDGE_SHARE = 3.5e-4
 FLUX_FLOOR = 1e-9
-WILD_SIGMAS = 5.0  # a dot whose own sigma is so far from the others' has a neighbour, dust or a dead pixel
+# a dot whose own sigma is so far from the others' has a neighbour, dust or a dead pixel
+WILD_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class DotNoise:
-    """What the tracker's detector adds to a dot's pixels beside the noise of the background: gain and PRNU."""
+    """What the tracker's detector adds to a dot's pixels beside the noise of the background:
+    gain and PRNU.
+    """
 
     gain_e_per_dn: float = math.inf
     prnu: float = 0.0
@@ -60,9 +71,11 @@ class DotNoise:
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
-    """Dots in the tracker's image: places (n,), the PSF's sigma by each (n,), and by all together with its error, tracker px.
+    """Dots in the tracker's image: places (n,), the PSF's sigma by each (n,), and by all together
+    with its error, tracker px.
 
-    `dot_side_px` is the side that was fitted with it, with its error. Where the fit did not settle `has_settled` is False.
+    `dot_side_px` is the side that was fitted with it, with its error. Where the fit did not settle
+    `has_settled` is False.
     """
 
     x_px: FloatArray
@@ -76,7 +89,9 @@ class Sharpness:
 
 
 class _Dots(NamedTuple):
-    """Squares of pixels (n, k, k) about dots, and the offsets of their middles from the dots' first places (n,)."""
+    """Squares of pixels (n, k, k) about dots, and the offsets of their middles from the dots'
+    first places (n,).
+    """
 
     values: FloatArray
     x_px: FloatArray
@@ -85,7 +100,9 @@ class _Dots(NamedTuple):
 
 
 class _Shape(NamedTuple):
-    """A dot's points (p, 2) of a side of 1, turned; and what is common to all dots: the PSF's sigma and the side, px."""
+    """A dot's points (p, 2) of a side of 1, turned; and what is common to all dots: the PSF's
+    sigma and the side, px.
+    """
 
     points: FloatArray
     sigma_px: float
@@ -93,7 +110,9 @@ class _Shape(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """The shape common to all dots, their places (n, 2), and the standard errors of the PSF's sigma and of the side."""
+    """The shape common to all dots, their places (n, 2), and the standard errors of the PSF's
+    sigma and of the side.
+    """
 
     shape: _Shape
     places: FloatArray
@@ -105,8 +124,8 @@ class _Fitted(NamedTuple):
 def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, noise: DotNoise | None = None) -> Sharpness:
     """Measure the sharpness of dots in an image (h, w) above its dark frame.
 
-    A dot is a square of about `dot_side_px` tracker px, turned by `turn_deg` in the image. Raises InputError where too few dots
-    are there, or none stands alone.
+    A dot is a square of about `dot_side_px` tracker px, turned by `turn_deg` in the image. Raises
+    InputError where too few dots are there, or none stands alone.
     """
     background = noisiest_background(image)
     settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
@@ -118,7 +137,8 @@ def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, nois
     # The wings of a first look at the dots: the blob's pixels are those above the threshold.
     blob_px = math.sqrt(float(np.median(found.pixels)) / math.pi)
     half = int(np.clip(math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX))
-    # Where dots stand closer together, smaller squares hold less of the wings and the fit's error says so.
+    # Where dots stand closer together, smaller squares hold less of the wings and the fit's error
+    # says so.
     smallest = math.ceil(half_side + MIN_WINGS_PX)
     while True:
         dots = _alone(image, background.level, found.x_px, found.y_px, half)
@@ -155,7 +175,9 @@ def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, nois
 
 
 def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, half: int) -> _Dots:
-    """The brightest dots whose square of pixels has no other dot's middle and is within the image."""
+    """The brightest dots whose square of pixels has no other dot's middle and is within the
+    image.
+    """
     height, width = image.shape
     apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px))
     apart += np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
@@ -206,7 +228,9 @@ def _amplitudes(own: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, ...]:
-    """Shares of dots' light in pixels (n, k, k), and their derivatives by x, y, the PSF's sigma and the side's logarithm."""
+    """Shares of dots' light in pixels (n, k, k), and their derivatives by x, y, the PSF's sigma
+    and the side's logarithm.
+    """
     across, down = (_along(shape, places[:, k], shape.points[:, k], half) for k in (0, 1))
     weight = 1 / len(shape.points)
     (share_x, by_x, sigma_x, side_x), (share_y, by_y, sigma_y, side_y) = across, down
@@ -224,7 +248,9 @@ def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, .
 
 
 def _along(shape: _Shape, place: FloatArray, points: FloatArray, half: int) -> tuple[FloatArray, ...]:
-    """Along one axis, of each point's light in each pixel (n, p, k): the share, and its derivatives as in `_slopes`."""
+    """Along one axis, of each point's light in each pixel (n, p, k): the share, and its
+    derivatives as in `_slopes`.
+    """
     edges = np.arange(2 * half + 2) - half - 0.5
     middle = place[:, None] + shape.side_px * points
     reach = (edges - middle[:, :, None]) / shape.sigma_px
@@ -244,7 +270,8 @@ def _weights(own: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise
 def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise) -> _Fitted:
     """The shape common to all dots and their places, fitted to their pixels.
 
-    Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from the normal equations.
+    Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from
+    the normal equations.
     """
     shape, places, damping = start, _first_places(dots), FIRST_DAMPING
     value, settled = math.inf, False
@@ -262,7 +289,8 @@ def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: 
         common = (normal[:, 4:, 4:] - normal[:, 4:, :4] @ by_own[:, :, :2]).sum(axis=0)
         aim = (right[:, 4:] - normal[:, 4:, :4] @ by_own[:, :, 2:]).sum(axis=0)[:, 0]
         chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(own), 1), 1.0)
-        # The side is known beforehand to SIDE_SHARE; its weight grows with the misfit as the pixels' own does.
+        # The side is known beforehand to SIDE_SHARE; its weight grows with the misfit as the
+        # pixels' own does.
         known = chi2 / SIDE_SHARE**2
         common[1, 1] += known
         aim[1] += known * math.log(side_px / shape.side_px)
@@ -287,7 +315,9 @@ def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: 
 def _each_sigma(
     dots: _Dots, shape: _Shape, places: FloatArray, noise_dn: float, noise: DotNoise
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """The PSF's sigma by each dot (n,), with the side of all, and which dots agree with the others (n,)."""
+    """The PSF's sigma by each dot (n,), with the side of all, and which dots agree with the
+    others (n,).
+    """
     own, by_x, by_y, by_sigma, _ = _slopes(shape, places, dots.half_px)
     flux, level = _amplitudes(own, dots.values)
     weight = _weights(own, flux, noise_dn, noise)
@@ -305,15 +335,19 @@ PLAN_SEED = 0
 FIRST_FRAMES = 8  # of dots where the figure of `orientation` says that the tracker looks
 FIRST_LIT_DOTS = 18  # in a frame: 48 dots, of 56 codes of three frames in eight
 OVERSAMPLING = 4  # for the effective PSF
-BLURRED, BLURRED_BY_PX = 1.3, 0.1  # times the bench file's sigma, and px: less is no reason to turn the focus
-# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a pixel's middle where the screen
-# is brightest, and later steps refuse what is over MAX_FILL.
+# times the bench file's sigma, and px: less is no reason to turn the focus
+BLURRED, BLURRED_BY_PX = 1.3, 0.1
+# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a
+# pixel's middle where the screen is brightest, and later steps refuse what is over MAX_FILL.
 DOT_FILL = 0.6
-MAX_ERROR_SHARE = 0.2  # of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
+# of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
+MAX_ERROR_SHARE = 0.2
 
 
 class SharpDots(NamedTuple):
-    """The brightest code that does not saturate the tracker, how sharp dots of it are, and their image."""
+    """The brightest code that does not saturate the tracker, how sharp dots of it are, and their
+    image.
+    """
 
     code: int
     sharpness: Sharpness
@@ -321,7 +355,9 @@ class SharpDots(NamedTuple):
 
 
 def focus(context: StepContext) -> StepOutcome:
-    """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
+    """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises
+    InputError.
+    """
     code, found, looked = sharp_dots(context)
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
     sigma, error = found.psf_sigma_px, found.psf_sigma_error_px
@@ -368,7 +404,9 @@ def focus(context: StepContext) -> StepOutcome:
 
 
 def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
-    """The effective PSF by the dots of one image; None where too few stand alone, and the width alone is known."""
+    """The effective PSF by the dots of one image; None where too few stand alone, and the width
+    alone is known.
+    """
     try:
         return fit_effective(dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING)
     except InputError:
@@ -376,7 +414,9 @@ def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
 
 
 def sharp_dots(context: StepContext) -> SharpDots:
-    """Lower the dots' code until they do not saturate the tracker, and measure them. Raises InputError."""
+    """Lower the dots' code until they do not saturate the tracker, and measure them. Raises
+    InputError.
+    """
     seen, code = context.seen_screen, context.white
     plan = first_dots(seen)
     dark = context.read(context.dark())
@@ -390,9 +430,11 @@ def sharp_dots(context: StepContext) -> SharpDots:
 
 
 def seen_sharpness(image: FloatArray, seen: SeenScreen, detector: DetectorSettings, images: int = 1) -> Sharpness:
-    """Measure the sharpness of dots of DOT_PX in the mean (h, w) of some images, above their dark frame.
+    """Measure the sharpness of dots of DOT_PX in the mean (h, w) of some images, above their dark
+    frame.
 
-    The squares are as large, and turned, as `seen` has the screen's pixels. Raises InputError as `sharpness` does.
+    The squares are as large, and turned, as `seen` has the screen's pixels. Raises InputError as
+    `sharpness` does.
     """
     noise = DotNoise(images * detector.gain_e_per_dn, detector.prnu)
     return sharpness(image, DOT_PX * seen.tracker_px_a_monitor_px, seen.turn_deg, noise)
@@ -404,6 +446,8 @@ def dot_code(context: StepContext) -> int:
 
 
 def first_dots(seen: SeenScreen) -> DotPlan:
-    """The dots of the first frames: where the figure says that the tracker looks. Raises InputError."""
+    """The dots of the first frames: where the figure says that the tracker looks. Raises
+    InputError.
+    """
     lit = min(lit_for(seen), FIRST_LIT_DOTS)
     return plan_seen_dots(seen, FIRST_FRAMES, lit, np.random.default_rng(PLAN_SEED))

@@ -43,14 +43,18 @@ from hilstar.instruments.calibrate.geometric.observed import Observed, measure_i
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
 
-FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
+# half the figure's side, relative to the smaller side of what both screen and tracker have
+FIGURE_REACH = 0.25
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
-SQUARES = (3, 2, 1)  # sides of the squares at the corner, to its right and below it, in those of the smallest
+# sides of the squares at the corner, to its right and below it, in those of the smallest
+SQUARES = (3, 2, 1)
 
 
 @dataclass(frozen=True, slots=True)
 class OrientationFigure:
-    """An asymmetric figure: squares of three sizes at a corner, to its right and below it, (3,) monitor px."""
+    """An asymmetric figure: squares of three sizes at a corner, to its right and below it, (3,)
+    monitor px.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -67,7 +71,9 @@ class OrientationFigure:
 
 
 def figure_for(geometry: BenchGeometry) -> OrientationFigure:
-    """The figure in the middle of what the bench file's ideal lens shows the tracker. Raises InputError without space."""
+    """The figure in the middle of what the bench file's ideal lens shows the tracker. Raises
+    InputError without space.
+    """
     monitor, tracker = geometry.monitor, geometry.tracker
     ratio = monitor.focal_length_px / tracker.focal_length_px
     reach = FIGURE_REACH * min(*monitor.resolution_px, *(ratio * size for size in tracker.resolution_px))
@@ -87,7 +93,8 @@ MIN_PIXELS = 3
 MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
 SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
 MAX_SCALE = 2.0
-MIN_LIGHT_STEP = 1.3  # between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+# between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+MIN_LIGHT_STEP = 1.3
 WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
 MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
 UPRIGHT = (1, 0, 0, 1)
@@ -110,10 +117,12 @@ NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer,
 
 @dataclass(frozen=True, slots=True)
 class SeenFigure:
-    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares.
+    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale,
+    remaining turn and squares.
 
-    The turn's error is half of what the figure's two sides disagree by, and that of the spots. `focal_length_px` of the monitor
-    and `q_cam_to_mon` (4,) are those that put the figure where it is seen.
+    The turn's error is half of what the figure's two sides disagree by, and that of the spots.
+    `focal_length_px` of the monitor and `q_cam_to_mon` (4,) are those that put the figure where it
+    is seen.
     """
 
     way: tuple[int, int, int, int]
@@ -132,11 +141,15 @@ class SeenFigure:
 
 
 class SquaresAlike(InputError):
-    """The figure's squares have about the same light: they saturate the tracker, or other light is among them."""
+    """The figure's squares have about the same light: they saturate the tracker, or other light
+    is among them.
+    """
 
 
 def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (3,) of the figure's squares in an image (h, w), the largest first. Raises InputError, SquaresAlike."""
+    """Places (3,) of the figure's squares in an image (h, w), the largest first. Raises
+    InputError, SquaresAlike.
+    """
     settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
     background = noisiest_background(image)
     found = find_stars(image, settings, background)
@@ -163,7 +176,8 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
     """Find the figure in a tracker's image (h, w) above its dark frame, by the bench file's lens.
 
-    Raises InputError where it is not there, or not as large as the focal lengths say, SquaresAlike where its squares are.
+    Raises InputError where it is not there, or not as large as the focal lengths say, SquaresAlike
+    where its squares are.
     """
     x_px, y_px = _squares_of(image)
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
@@ -186,7 +200,8 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
     by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
     turn_error = math.hypot(float(sides[0] - sides[1]) / 2, by_spots)
-    # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the figure is large.
+    # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the
+    # figure is large.
     focal_length_px = geometry.monitor.focal_length_px / scale
     camera = replace(geometry.monitor, focal_length_px=focal_length_px)
     shown_rays = np.column_stack([*camera.tangents(figure.x_px, figure.y_px), np.ones(3)])
@@ -227,7 +242,9 @@ class ScreenMounting:
 
 
 def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
-    """The mounting that turns an image seen in orientation `way` upright, with the fewest keys changed."""
+    """The mounting that turns an image seen in orientation `way` upright, with the fewest keys
+    changed.
+    """
     wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
     flips = (False, True)
     all_ways = [ScreenMounting(x, y, turn) for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))]
@@ -241,7 +258,9 @@ FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not fo
 
 
 def orientation(context: StepContext) -> StepOutcome:
-    """Find how the screen is mounted, set the bench file's keys, and check that the figure is upright. Raises InputError."""
+    """Find how the screen is mounted, set the bench file's keys, and check that the figure is
+    upright. Raises InputError.
+    """
     monitor = context.file.config.monitor
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
@@ -253,7 +272,8 @@ def orientation(context: StepContext) -> StepOutcome:
         changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)
     if changes:
         now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
-        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit takes either.
+        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit
+        # takes either.
         if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (now != UPRIGHT and not _is_oblique(measured)):
             made = "; ".join(change.line for change in changes)
             raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
@@ -308,7 +328,8 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
         low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
         axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
-        plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}  # readable over stars and on black
+        # readable over stars and on black
+        plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}
         for name, x, y in zip(SQUARE_NAMES, x_px[:3], y_px[:3], strict=False):
             side = "right" if x > image.shape[1] / 2 else "left"
             away = -14 if side == "right" else 14
@@ -320,7 +341,9 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
 
 
 def geometry(context: StepContext) -> StepOutcome:
-    """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises InputError."""
+    """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises
+    InputError.
+    """
     code = dot_code(context)
     make_directory(context.folder)
     dark = context.dark()
@@ -363,7 +386,9 @@ def geometry(context: StepContext) -> StepOutcome:
 
 
 def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark: Path) -> tuple[list[Path], Observed]:
-    """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises InputError."""
+    """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises
+    InputError.
+    """
     paths = [
         context.take(Pattern(f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)))
         for frame in range(plan.frames)
@@ -374,7 +399,9 @@ def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark:
 
 
 def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
-    """The tilts, and where dots are farther off than their noise the degree of the field: a larger one was not tried."""
+    """The tilts, and where dots are farther off than their noise the degree of the field: a
+    larger one was not tried.
+    """
     tilts = [
         FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
         for name in ("tilt_x_deg", "tilt_y_deg")

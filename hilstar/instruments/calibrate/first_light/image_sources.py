@@ -1,4 +1,6 @@
-"""Patterns on the monitor, and where the images of them come from: a command, a person, or the virtual bench."""
+"""Patterns on the monitor, and where the images of them come from: a command, a person, or the
+virtual bench.
+"""
 
 import dataclasses
 import datetime
@@ -54,7 +56,8 @@ CodeImage = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """Codes (h, w) or (h, w, 3) over the monitor's image, before it is turned as the screen is mounted, and a name.
+    """Codes (h, w) or (h, w, 3) over the monitor's image, before it is turned as the screen is
+    mounted, and a name.
 
     `later` has further frames, one per refresh, before the pattern repeats.
     """
@@ -98,11 +101,13 @@ class NoImage(InputError):
 
 
 class ImageSource:
-    """Shows patterns to the tracker and returns its images; by default without a display, a dark image or a photodiode.
+    """Shows patterns to the tracker and returns its images; by default without a display, a dark
+    image or a photodiode.
 
-    `identity` is a text that changes when the source does; `sets_exposure` says whether `look` may ask for another exposure
-    than the bench file's, `by_hand` whether a person saves each image. `monitor` is the display's before its window was on it,
-    None where this program has no display, and `forced` what is wrong with it and was shown by --force.
+    `identity` is a text that changes when the source does; `sets_exposure` says whether `look` may
+    ask for another exposure than the bench file's, `by_hand` whether a person saves each image.
+    `monitor` is the display's before its window was on it, None where this program has no display,
+    and `forced` what is wrong with it and was shown by --force.
     """
 
     identity: str
@@ -112,26 +117,36 @@ class ImageSource:
     forced: Sequence[str] = ()
 
     def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
-        """Compare the display's monitor with the one of the bench's files. Raises InputError, MachineError unless `force`."""
+        """Compare the display's monitor with the one of the bench's files. Raises InputError,
+        MachineError unless `force`.
+        """
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing, None where this program has no display. Raises MachineError."""
         return None
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
-        """Show a pattern on the screen as it is mounted; the tracker's image, `stem` with an ending. Raises NoImage."""
+        """Show a pattern on the screen as it is mounted; the tracker's image, `stem` with an
+        ending. Raises NoImage.
+        """
         raise NotImplementedError
 
     def pixels(self, path: Path, resolution_px: tuple[int, int]) -> FloatArray:
-        """The pixels (h, w) of an image that this source took, DN. Raises InputError for one that cannot be read."""
+        """The pixels (h, w) of an image that this source took, DN. Raises InputError for one
+        that cannot be read.
+        """
         return read_image(path, resolution_px)
 
     def unlit(self, stem: Path) -> Path | None:
-        """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
+        """The tracker's image with the monitor switched off, at the bench file's exposure; None
+        where there is none.
+        """
         return None
 
     def diode(self, file: BenchFile, seconds: float) -> "DiodeRecording | None":
-        """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
+        """Record the display's square by a photodiode; None where there is none. Raises
+        InputError, MachineError.
+        """
         return None
 
     def clock_ns(self) -> int:
@@ -147,7 +162,9 @@ class ImageSource:
 
 
 def complete_images(folder: Path) -> dict[str, Path]:
-    """The images in a directory by name without ending, except the newest, which may be incomplete."""
+    """The images in a directory by name without ending, except the newest, which may be
+    incomplete.
+    """
     found = [path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE]
     found.sort(key=lambda path: path.stat().st_mtime_ns)
     return {path.stem: path for path in found[:-1]}
@@ -172,7 +189,9 @@ class SerialDiode:
     baud: int
 
     def watch(self, display: "PatternDisplay", file: BenchFile, seconds: float) -> DiodeRecording:
-        """Show the square for `seconds` and record. Raises InputError without edges, MachineError, Stopped."""
+        """Show the square for `seconds` and record. Raises InputError without edges,
+        MachineError, Stopped.
+        """
         with ThreadPoolExecutor(1) as pool:
             listening: list[Future[Edges]] = []
 
@@ -205,7 +224,9 @@ def _go_on(window: "Window", stopped: bool) -> None:
 
 
 def _presenter(file: BenchFile, window: "Window", codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
-    """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its texture."""
+    """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its
+    texture.
+    """
     monitor, triples = file.config.monitor, None
     if codes.ndim == 3:
         packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
@@ -218,7 +239,9 @@ def _presenter(file: BenchFile, window: "Window", codes: CodeImage) -> tuple[Pre
 
 
 class PatternDisplay(Closing):
-    """The window on the bench's display, opened with the first pattern. Free it with `close`, or use it as a context."""
+    """The window on the bench's display, opened with the first pattern. Free it with `close`, or
+    use it as a context.
+    """
 
     def __init__(self) -> None:
         self._window: Window | None = None
@@ -227,7 +250,9 @@ class PatternDisplay(Closing):
         self.forced: list[str] = []
 
     def gate(self, file: BenchFile) -> Timing:
-        """Measure the display as `serve` does. Raises MachineError where it is not as the bench file has it."""
+        """Measure the display as `serve` does. Raises MachineError where it is not as the bench
+        file has it.
+        """
         self.close()
         try:
             window = self._window_for(file)
@@ -242,7 +267,8 @@ class PatternDisplay(Closing):
     def show_until(
         self, file: BenchFile, pattern: Pattern, done: Callable[[], bool], on_key: Callable[[str], object] = lambda key: None
     ) -> None:
-        """Show a pattern until `done()`, first called when the panel has settled; `on_key` gets the keys pressed.
+        """Show a pattern until `done()`, first called when the panel has settled; `on_key` gets the
+        keys pressed.
 
         Raises Stopped where the window is closed, MachineError where the display goes away.
         """
@@ -266,9 +292,11 @@ class PatternDisplay(Closing):
                 release()
 
     def blink(self, file: BenchFile, begin: Callable[[], Callable[[], bool]]) -> Edges:
-        """Show the photodiode's square on black; the square's changes. Raises Stopped, MachineError.
+        """Show the photodiode's square on black; the square's changes. Raises Stopped,
+        MachineError.
 
-        `begin` is called once the display has been timed, and returns a function that says when to stop.
+        `begin` is called once the display has been timed, and returns a function that says when to
+        stop.
         """
         window = self._window_for(file)
         period_s = 1.0 / file.config.monitor.refresh_hz
@@ -312,7 +340,9 @@ GRAB_TIMEOUT_S = 120.0
 
 
 class _ShownHere(ImageSource):
-    """An image source before this program's own display; `dark` is the tracker's image with the monitor switched off."""
+    """An image source before this program's own display; `dark` is the tracker's image with the
+    monitor switched off.
+    """
 
     _shows = False  # whether a command shows the patterns
 
@@ -350,10 +380,12 @@ class _ShownHere(ImageSource):
 
 
 class GrabCommand(_ShownHere):
-    """Images by a command. It writes the file {output}; {pattern} is a picture of what the screen has to show.
+    """Images by a command. It writes the file {output}; {pattern} is a picture of what the screen
+    has to show.
 
-    Without {pattern} the session shows the pattern itself; with {exposure_s} it may choose the exposure. `dark` is an image
-    with the monitor switched off. Raises InputError for a command without {output}.
+    Without {pattern} the session shows the pattern itself; with {exposure_s} it may choose the
+    exposure. `dark` is an image with the monitor switched off. Raises InputError for a command
+    without {output}.
     """
 
     def __init__(self, command: str, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
@@ -369,13 +401,16 @@ class GrabCommand(_ShownHere):
         super().__init__(dark, None if self._shows else diode)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
-        """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""
+        """Run the command while the pattern is shown. Raises NoImage with the last line of its
+        stderr where it fails.
+        """
         output = stem.with_name(stem.name + ".png")
         shown = stem.parent / PATTERN_FILE
         words = self._words
         for name, value in (("output", str(output)), ("pattern", str(shown)), ("exposure_s", f"{exposure_s:.9g}")):
             words = [word.replace(f"{{{name}}}", value) for word in words]
-        output.unlink(missing_ok=True)  # an interrupted attempt may have left one, and a command that writes nothing must fail
+        # an interrupted attempt may have left one, and a command that writes nothing must fail
+        output.unlink(missing_ok=True)
         if self._shows and pattern.later:
             raise InputError("a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here")
         if self._shows:
@@ -439,7 +474,9 @@ class ByHand(_ShownHere):
         return _saved(stem) or stem
 
     def look_or_key(self, file: BenchFile, pattern: Pattern, stem: Path, keys: Mapping[str, str]) -> Path | str:
-        """The image of the pattern, or the key that says how it looks; `keys` has their meanings."""
+        """The image of the pattern, or the key that says how it looks; `keys` has their
+        meanings.
+        """
         legend = "\n".join(f"    {key}  {meaning}" for key, meaning in keys.items())
         asked = f"now press on the display what the tracker sees, or save its image as {stem}.png (or .fits):\n{legend}"
         pressed: list[str] = []
@@ -484,7 +521,8 @@ MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
 class VirtualBench(ImageSource):
-    """A bench as a truth file describes it: lens, mounting, light, and the tracker's focus and noise.
+    """A bench as a truth file describes it: lens, mounting, light, and the tracker's focus and
+    noise.
 
     Free it with `close`. Raises InputError for a truth that cannot stand in for the bench.
     """
@@ -529,13 +567,17 @@ class VirtualBench(ImageSource):
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
 
     def _warmth(self, on_for_s: float) -> float:
-        """Light relative to that of a warm monitor, by the truth's [certify.virtual]; the first pattern switches it on."""
+        """Light relative to that of a warm monitor, by the truth's [certify.virtual]; the first
+        pattern switches it on.
+        """
         virtual = self.truth.config.certify.virtual
         cold = virtual.cold_percent / 100 * math.exp(-on_for_s / (60 * virtual.warm_up_min))
         return 1 - cold + virtual.drift_percent_per_h / 100 * on_for_s / 3600
 
     def clock_ns(self) -> int:
-        """Time since the monitor was switched on: each image takes the truth's `seconds_a_reading`."""
+        """Time since the monitor was switched on: each image takes the truth's
+        `seconds_a_reading`.
+        """
         return self._on_for_ns
 
     def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
@@ -556,13 +598,17 @@ class VirtualBench(ImageSource):
         return path
 
     def pixels(self, path: Path, resolution_px: tuple[int, int]) -> FloatArray:
-        """As of any source; the newest image need not be read from its file, which takes longer than to write it."""
+        """As of any source; the newest image need not be read from its file, which takes longer
+        than to write it.
+        """
         if self._newest is not None and self._newest[0] == path:
             return self._newest[1].astype(np.float64)
         return super().pixels(path, resolution_px)
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
-        """The light of frames shown in turn, on the detector (h, w); a pattern that is seen again is not drawn again."""
+        """The light of frames shown in turn, on the detector (h, w); a pattern that is seen
+        again is not drawn again.
+        """
         digest = hashlib.blake2b()
         for codes in frames:
             digest.update(codes.data)
@@ -577,7 +623,9 @@ class VirtualBench(ImageSource):
         return image
 
     def _primary_image(self, light: FloatArray, number: int) -> FloatArray:
-        """The light of a primary on the detector. A pattern with one level is drawn once and scaled for others."""
+        """The light of a primary on the detector. A pattern with one level is drawn once and
+        scaled for others.
+        """
         lit, brightest, primary = light > 0, float(light.max()), self._primaries_seen[number]
         if not brightest:
             return np.zeros_like(self._glow_e_per_s)
@@ -591,7 +639,8 @@ class VirtualBench(ImageSource):
         return self._units[key] * brightest
 
     def _lights(self, codes: CodeImage) -> FloatArray:
-        """Light above black of codes (h, w) or (h, w, 3), relative to white at the screen's brightest place.
+        """Light above black of codes (h, w) or (h, w, 3), relative to white at the screen's
+        brightest place.
 
         Shape (1, h, w), or (3, h, w) where the truth drives its primaries apart.
         """
@@ -616,7 +665,9 @@ class VirtualBench(ImageSource):
 
 
 def virtual_diode(file: BenchFile, truth: BenchFile, seconds: float, rng: np.random.Generator) -> DiodeRecording:
-    """Edges of a true panel's delay and scan-out, with the jitter of swaps and of the truth's `[certify.virtual]`."""
+    """Edges of a true panel's delay and scan-out, with the jitter of swaps and of the truth's
+    `[certify.virtual]`.
+    """
     frames = int(seconds * file.config.monitor.refresh_hz)
     period_ns = NS_PER_S / file.config.monitor.refresh_hz
     swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)

@@ -1,4 +1,6 @@
-"""The page of a session, first-light.html: a verdict, a card for each step, and what changed in the bench file."""
+"""The page of a session, first-light.html: a verdict, a card for each step, and what changed in
+the bench file.
+"""
 
 import difflib
 from collections.abc import Iterator
@@ -21,7 +23,9 @@ WORDS = {"done": "passed", "skipped": "not measured", "failed": "failed"}
 
 
 def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
-    """Write the page of a session, with its bench file as it was and as it is. Raises InputError where it cannot be written."""
+    """Write the page of a session, with its bench file as it was and as it is. Raises InputError
+    where it cannot be written.
+    """
     bench, records = Path(session.bench), {record.name: record for record in session.steps}
     old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
     difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))

@@ -42,7 +42,8 @@ from hilstar.tracker.rounding import (
 SHARE = 0.5  # relative to the smaller side of what both screen and tracker have
 MAX_SIDE_TRACKER_PX = 200.0
 APART_TRACKER_PX = 8.0  # distance of the sparsest lattice's dots: their wings do not add up
-CUT_UNKNOWN = 0.3  # of what is cut off at code 0: the noise of a detector is stated to about a fifth
+# of what is cut off at code 0: the noise of a detector is stated to about a fifth
+CUT_UNKNOWN = 0.3
 MIN_DOTS = 4  # along a side of the sparsest lattice
 MARGIN_SIGMAS, MARGIN_PX = 6.0, 3.0
 PHASES = 24
@@ -403,7 +404,9 @@ class Photometer:
         self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
 
     def read(self, planned: list[Patch]) -> Readings:
-        """Show and read the planned patches. Raises InputError where white saturates the tracker."""
+        """Show and read the planned patches. Raises InputError where white saturates the
+        tracker.
+        """
         peaks = self._peaks(planned, self._expose())
         chosen = {patch: self._range(peaks[patch]) for patch in planned if patch.code}
         blacks, sums = self._sums(planned, chosen)

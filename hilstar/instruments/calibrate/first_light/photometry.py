@@ -1,4 +1,6 @@
-"""The step of photometry: the tracker as a photometer, by dots on lattices that do not saturate it."""
+"""The step of photometry: the tracker as a photometer, by dots on lattices that do not saturate
+it.
+"""
 
 import math
 from pathlib import Path
@@ -86,7 +88,9 @@ def photometry(context: StepContext) -> StepOutcome:
 
 
 def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
-    """The plan with the most levels that has at most `patches` patches. Raises InputError where they are too few."""
+    """The plan with the most levels that has at most `patches` patches. Raises InputError where
+    they are too few.
+    """
     plans = [
         plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
         for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1)
@@ -97,7 +101,9 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
 
 
 def shares_of_white(file: BenchFile) -> FloatArray:
-    """Each primary's share (3,) of the electrons of white, by the spectra of a bench file. Raises InputError."""
+    """Each primary's share (3,) of the electrons of white, by the spectra of a bench file.
+    Raises InputError.
+    """
     primaries = bench_primaries(file.config.monitor, file.folder)
     if primaries is None:
         raise InputError("[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b")
@@ -146,14 +152,18 @@ def _response_figures(
 
 
 def rounds_alike(detector: DetectorSettings) -> bool:
-    """Whether an ADC takes light of under half a DN away: nothing but enough read noise spreads it over the steps."""
+    """Whether an ADC takes light of under half a DN away: nothing but enough read noise spreads
+    it over the steps.
+    """
     return detector.read_noise_e < DITHER_DN * detector.gain_e_per_dn
 
 
 def _judged(
     context: StepContext, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]
 ) -> StepOutcome:
-    """The step's outcome: done, with the response named in the bench file, unless it misses the limits of [verify]."""
+    """The step's outcome: done, with the response named in the bench file, unless it misses the
+    limits of [verify].
+    """
     limit_mag = context.file.config.verify.flux_mag
     monitor = context.file.config.monitor
     line = (
@@ -184,7 +194,9 @@ def _judged(
 
 
 def response_error_mag(assumed: Response, true: Response) -> FloatArray:
-    """How much fainter each code is than assumed (n,), magnitudes, from three decades below white to white."""
+    """How much fainter each code is than assumed (n,), magnitudes, from three decades below
+    white to white.
+    """
     seen = true.light[1:] >= DIM_LIGHT
     return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
 

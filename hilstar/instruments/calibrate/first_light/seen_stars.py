@@ -1,7 +1,9 @@
-"""Stars on the screen as the tracker sees them: fields with the most readable stars, and each one's place, light and noise.
+"""Stars on the screen as the tracker sees them: fields with the most readable stars, and each one's
+place, light and noise.
 
-A star is as wide as the PSF and the monitor's pixels make it, so window, margins and noise follow its sigma: the light in the
-window is corrected for what lies outside, and the noise of place and light is that of photons, background and PRNU.
+A star is as wide as the PSF and the monitor's pixels make it, so window, margins and noise follow
+its sigma: the light in the window is corrected for what lies outside, and the noise of place and
+light is that of photons, background and PRNU.
 """
 
 import dataclasses
@@ -31,16 +33,21 @@ from hilstar.server.bench.frame import Bench, Frame
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light
 
-RANDOM_ATTITUDES, POINTED_ATTITUDES, SEED = 40, 60, 3  # at random, and at bright stars: a narrow field has few others
-FIELDS, MAX_FIELDS, ENOUGH_STARS = 3, 8, 20  # fields shown: more than three until so many stars can be read
+# at random, and at bright stars: a narrow field has few others
+RANDOM_ATTITUDES, POINTED_ATTITUDES, SEED = 40, 60, 3
+# fields shown: more than three until so many stars can be read
+FIELDS, MAX_FIELDS, ENOUGH_STARS = 3, 8, 20
 MIN_STARS = 5
 MIN_REACH_PX = 3.0  # tracker px, as in `verify`
 MIN_EDGE_PX, MIN_RADIUS_PX, RADIUS_SIGMAS = 12.0, 4, 3.0
-ALONE_RADII, BESIDE_SHARE = 2.0, 1e-3  # stars within so many windows have together less than this share of a star's light
+# stars within so many windows have together less than this share of a star's light
+ALONE_RADII, BESIDE_SHARE = 2.0, 1e-3
 THRESHOLD_SIGMA = 8.0
-READ_MAG, SURE_MAG = 0.1, 0.01  # noise of a star that can be read, and of one whose light is judged by itself
+# noise of a star that can be read, and of one whose light is judged by itself
+READ_MAG, SURE_MAG = 0.1, 0.01
 SURE_STARS = 10  # the stars with the least noise that are judged where few are sure
-LOST_MARGIN = 3.0  # times the threshold: a star whose peak should be so high and is not there is lost
+# times the threshold: a star whose peak should be so high and is not there is lost
+LOST_MARGIN = 3.0
 MOST = 0.5  # a share of the variance this large is named as its cause
 FAR = 3.0  # times their errors: more scatter than this has another cause
 ONE_SIDED = 1.645  # sigmas of 95 %
@@ -48,7 +55,8 @@ ONE_SIDED = 1.645  # sigmas of 95 %
 
 @dataclass(frozen=True)
 class StarSpot:
-    """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector adds.
+    """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector
+    adds.
 
     The image is the mean of `frames`.
     """
@@ -60,11 +68,14 @@ class StarSpot:
 
     @classmethod
     def of(cls, context: StepContext) -> "StarSpot":
-        """The spot of the bench file's sprite, with the PSF of the step `focus`. Raises InputError."""
+        """The spot of the bench file's sprite, with the PSF of the step `focus`. Raises
+        InputError.
+        """
         geometry = context.geometry()
         ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         sprite = display_psf(context.file.config, context.file.folder, geometry.monitor).width_px
-        # A sprite's shares are those of whole pixels, and each pixel is a square of light: a twelfth of its area each.
+        # A sprite's shares are those of whole pixels, and each pixel is a square of light: a
+        # twelfth of its area each.
         drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
         own = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
         x, y = (math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True))
@@ -111,7 +122,9 @@ class StarSpot:
         return np.outer(y, x), offset
 
     def light_noise_mag(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of `noise_dn` in a pixel."""
+        """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of
+        `noise_dn` in a pixel.
+        """
         shares, _ = self._shares
         light = np.maximum(dn, 1e-9)
         photons = light * self.window_share / (self.gain_e_per_dn * self.frames)
@@ -123,8 +136,8 @@ class StarSpot:
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
         """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
 
-        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's, in the mean of the
-        frames.
+        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's,
+        in the mean of the frames.
         """
         shares, _ = self._shares
         dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
@@ -134,7 +147,9 @@ class StarSpot:
         return shares.size * rounded
 
     def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """The noise (n,) of the places of such stars along one axis, px: that of the window's first moment."""
+        """The noise (n,) of the places of such stars along one axis, px: that of the window's
+        first moment.
+        """
         shares, offset = self._shares
         sigma2 = self.settings.window_sigma_px**2
         window = np.exp(-0.5 * (offset**2 + offset[:, None] ** 2) / sigma2)
@@ -148,7 +163,9 @@ class StarSpot:
 
 
 class Beyond(NamedTuple):
-    """What residuals have beyond their noise: a standard deviation, and its bounds of 95 % below and above."""
+    """What residuals have beyond their noise: a standard deviation, and its bounds of 95 % below
+    and above.
+    """
 
     sigma: float
     low: float
@@ -156,7 +173,9 @@ class Beyond(NamedTuple):
 
     @classmethod
     def of(cls, residual: FloatArray, noise: FloatArray) -> "Beyond":
-        """Of residuals (n,) and the noise (n,) of each: the weighted mean of what their squares have more."""
+        """Of residuals (n,) and the noise (n,) of each: the weighted mean of what their squares
+        have more.
+        """
         weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
         more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
         at_least = max(more, 0.0)
@@ -170,7 +189,8 @@ class Beyond(NamedTuple):
 class ExpectedStars:
     """Stars drawn whole and isolated: places (n, 2), tracker px, and light (n,), e-/s.
 
-    `screen` (n, 2) is the place on the screen, -1 to 1 along each axis; `codes_mag` (n,) how much too faint the codes are.
+    `screen` (n, 2) is the place on the screen, -1 to 1 along each axis; `codes_mag` (n,) how much
+    too faint the codes are.
     """
 
     hip: npt.NDArray[np.int32]
@@ -182,11 +202,13 @@ class ExpectedStars:
 
 @dataclass(frozen=True, slots=True)
 class StarsSeen:
-    """Isolated stars that the tracker sees: places by the sky (n, 2), tracker px, and the residuals of their images (n, 2).
+    """Isolated stars that the tracker sees: places by the sky (n, 2), tracker px, and the residuals
+    of their images (n, 2).
 
-    `place_noise_px` (n,) is the noise of a residual along one axis. `dn` is the whole light of each (n,), `e_per_s` the light
-    asked for, `noise_mag` its error, infinite where the tracker saturated. `rounding_mag` (n, STEP_PHASES) is the part of it
-    that the ADC's rounding does to all stars together. `screen` (n, 2) is the place on the screen, -1 to 1;
+    `place_noise_px` (n,) is the noise of a residual along one axis. `dn` is the whole light of each
+    (n,), `e_per_s` the light asked for, `noise_mag` its error, infinite where the tracker
+    saturated. `rounding_mag` (n, STEP_PHASES) is the part of it that the ADC's rounding does to all
+    stars together. `screen` (n, 2) is the place on the screen, -1 to 1;
     `codes_mag` (n,) how much too faint the codes are. `frames` images of each field were averaged.
     """
 
@@ -206,7 +228,9 @@ class StarsSeen:
 
     @property
     def sure(self) -> npt.NDArray[np.bool_]:
-        """A mask of the stars whose light is known well enough (n,): those under SURE_MAG, or the few with the least noise."""
+        """A mask of the stars whose light is known well enough (n,): those under SURE_MAG, or
+        the few with the least noise.
+        """
         few = np.sort(self.noise_mag)[min(SURE_STARS, len(self.noise_mag)) - 1]
         return np.asarray(self.noise_mag <= float(np.clip(few, SURE_MAG, READ_MAG)))
 
@@ -216,7 +240,9 @@ class StarsSeen:
         return Beyond.of(self.residual_px.ravel(), np.repeat(self.place_noise_px, 2))
 
     def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> "Scatter":
-        """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and its errors."""
+        """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and
+        its errors.
+        """
         left = off_mag - self.codes_mag[used]
         left = left - np.median(left)
         error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
@@ -233,7 +259,8 @@ class StarsSeen:
 class Scatter:
     """The rms scatter of stars' light and its expected error, without codes and common zero point.
 
-    `by_place` and `by_light` are the shares of the variance that follow the place on the screen and the light asked for.
+    `by_place` and `by_light` are the shares of the variance that follow the place on the screen and
+    the light asked for.
     """
 
     rms_mag: float
@@ -259,7 +286,9 @@ class Scatter:
 
 
 def _explained(off: FloatArray, *shapes: FloatArray) -> float:
-    """The share of the variance of `off` (n,) that a linear fit of `shapes` (n,) explains, corrected for chance."""
+    """The share of the variance of `off` (n,) that a linear fit of `shapes` (n,) explains,
+    corrected for chance.
+    """
     design = np.stack([np.ones_like(off), *shapes], axis=1)
     free = len(off) - design.shape[1]
     total = float(((off - off.mean()) ** 2).sum())
@@ -281,7 +310,8 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
         for q_icrs_to_cam in _fields(bench, context, spot, math.sqrt(2) * noisiest_background(dark).noise):
             frame = bench.frame(q_icrs_to_cam)
             levels: tuple[Levels, ...] = (frame.levels,)
-            exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)  # with `temporal` the frames of an exposure
+            # with `temporal` the frames of an exposure
+            exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
             if len(exposed) > 1:
                 levels = tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
             codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
@@ -324,7 +354,9 @@ def _mean_dark(context: StepContext, frames: int) -> tuple[FloatArray, tuple[Pat
 
 
 def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float) -> list[FloatArray]:
-    """Attitudes (4,) of the fields with the most stars that can be read, of random ones and of those at bright stars."""
+    """Attitudes (4,) of the fields with the most stars that can be read, of random ones and of
+    those at bright stars.
+    """
     stars, rng = bench.stars, np.random.default_rng(SEED)
     per_e = context.exposure_s / spot.gain_e_per_dn
     dn = stars.electrons_per_s * per_e
@@ -357,7 +389,9 @@ def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float)
 
 
 def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], spot: StarSpot) -> ExpectedStars:
-    """The isolated stars of a frame that are drawn whole, with their expected places in the tracker's image."""
+    """The isolated stars of a frame that are drawn whole, with their expected places in the
+    tracker's image.
+    """
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
     truth, vectors = frame.rows, bench.stars.directions(frame.star)
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
@@ -393,7 +427,9 @@ def _codes_mag(
     screen_px: FloatArray,
     spot: StarSpot,
 ) -> FloatArray:
-    """How much fainter the codes are than the light asked for (n,), magnitudes, within the tracker's window."""
+    """How much fainter the codes are than the light asked for (n,), magnitudes, within the
+    tracker's window.
+    """
     shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)
     geometry = context.geometry()
     reach = math.ceil((spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px)
@@ -402,7 +438,8 @@ def _codes_mag(
         part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
         wanted = float(frame.linear[part].sum(dtype=np.float64))
         off.append(magnitude(float(shown[part].sum()) / wanted) if wanted > 0 else 0.0)
-    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))  # such a star is not shown, and will not be found
+    # such a star is not shown, and will not be found
+    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))
 
 
 def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot) -> StarsSeen:

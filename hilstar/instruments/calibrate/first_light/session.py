@@ -1,4 +1,6 @@
-"""The session: its steps in order, each done once, and again when what it depends on has changed."""
+"""The session: its steps in order, each done once, and again when what it depends on has
+changed.
+"""
 
 import datetime
 import hashlib
@@ -127,10 +129,12 @@ LOCK_FILE = ".lock"
 
 
 class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and what it wants back.
+    """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and
+    what it wants back.
 
-    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set, `needs` the steps before it.
-    Those of `unless_failed` may be skipped: what the bench file says stands in for them.
+    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set,
+    `needs` the steps before it. Those of `unless_failed` may be skipped: what the bench file says
+    stands in for them.
     """
 
     measures: str
@@ -157,7 +161,9 @@ RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
 
 
 class Progress:
-    """Tells every PROGRESS_S what a step is at, from a thread of its own: a fit takes as long as an image."""
+    """Tells every PROGRESS_S what a step is at, from a thread of its own: a fit takes as long as
+    an image.
+    """
 
     def __init__(self, tell: Callable[[str], object]) -> None:
         self._tell, self._stage, self._images = tell, "", 0
@@ -191,10 +197,12 @@ class Progress:
 
 
 class FirstLightSession:
-    """A session in a directory, with at most `patches` readings of the response; `watch` is called with each pattern.
+    """A session in a directory, with at most `patches` readings of the response; `watch` is called
+    with each pattern.
 
-    White is watched for `watched_s` at most, 0 for not at all; `frames` images of each field of stars are averaged, 0: as many
-    as it takes. `progress` is called with a line every few seconds while a step runs, from a thread of its own.
+    White is watched for `watched_s` at most, 0 for not at all; `frames` images of each field of
+    stars are averaged, 0: as many as it takes. `progress` is called with a line every few seconds
+    while a step runs, from a thread of its own.
     Raises InputError for a directory with another bench's session.
     """
 
@@ -220,7 +228,9 @@ class FirstLightSession:
         self.unfinished = {} if found is None else dict(found.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
-        """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises Stopped at a closed display."""
+        """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises
+        Stopped at a closed display.
+        """
         clear_parts(self.folder)
         before = self.folder / BEFORE_FILE
         if not before.exists():
@@ -236,7 +246,9 @@ class FirstLightSession:
         return max(record.exit_code for record in self.records.values())
 
     def _is_done(self, number: int) -> bool:
-        """Whether a step need not run: it is done, or skipped for good, and nothing it depends on has changed."""
+        """Whether a step need not run: it is done, or skipped for good, and nothing it depends
+        on has changed.
+        """
         step = STEPS[number]
         record = self.records.get(step.name)
         if record is None or record.verdict == "failed" or step.name in self.unfinished or self._unmet(step) is not None:
@@ -295,7 +307,8 @@ class FirstLightSession:
         except Stopped:
             raise
         except HilstarError as error:
-            # Bad data for one step is not a wrong command: the session continues and ends with exit code 1.
+            # Bad data for one step is not a wrong command: the session continues and ends with exit
+            # code 1.
             code = 1 if isinstance(error, InputError) else error.exit_code
             if not isinstance(error, NoImage | MachineError):
                 del self.unfinished[step.name]
@@ -337,7 +350,9 @@ class FirstLightSession:
         self._watch(pattern)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
-        """The SHA-256 of what a step depends on: its tables without later steps' keys, files they name, the source."""
+        """The SHA-256 of what a step depends on: its tables without later steps' keys, files
+        they name, the source.
+        """
         step = STEPS[number]
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
@@ -367,7 +382,9 @@ class FirstLightSession:
         )
 
     def beat(self) -> BeatSummary:
-        """The beat of the tracker's exposures with the display, at its measured rate and modes where they are known."""
+        """The beat of the tracker's exposures with the display, at its measured rate and modes
+        where they are known.
+        """
         record = self.records.get("display")
         figures = {} if record is None else record.figures
         refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
@@ -378,7 +395,8 @@ def _finite(value: Figure) -> Figure:
     """The figure, or "not known" where JSON has no such number."""
     if not isinstance(value, float):
         return value
-    return float(value) if math.isfinite(value) else "not known"  # msgspec does not encode NumPy's floats
+    # msgspec does not encode NumPy's floats
+    return float(value) if math.isfinite(value) else "not known"
 
 
 def _texts(value: Any) -> Iterator[str]:

@@ -1,4 +1,6 @@
-"""The steps with stars on the screen: the scale of the light, and the comparison with sky and twin."""
+"""The steps with stars on the screen: the scale of the light, and the comparison with sky and
+twin.
+"""
 
 import dataclasses
 import math
@@ -25,15 +27,19 @@ from hilstar.server.bench.config import Verify
 
 VERIFY_FIELDS, VERIFY_SEED = 3, 0
 LOST_SHARE = 0.1
-LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")  # keys of [verify], also before a truth
-P95_OF_TWO, P95_OF_ONE = 2.4477, 1.9600  # sigmas that 95 % of distances in two axes, and in one, are within
+# keys of [verify], also before a truth
+LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")
+# sigmas that 95 % of distances in two axes, and in one, are within
+P95_OF_TWO, P95_OF_ONE = 2.4477, 1.9600
 MAX_FRAMES = 25  # of a field that are taken without being asked for
 MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --frames takes
 GRID = 21  # places along each side of the screen at which a truth is compared
 
 
 def verify(context: StepContext) -> StepOutcome:
-    """Show stars with the calibrated bench, compare them with the sky, and run the twin. Raises InputError."""
+    """Show stars with the calibrated bench, compare them with the sky, and run the twin. Raises
+    InputError.
+    """
     seen = _enough_frames(context)
     off_px = np.hypot(*seen.residual_px.T)
     rms_px = float(np.sqrt((off_px**2).mean()))
@@ -93,7 +99,9 @@ def verify(context: StepContext) -> StepOutcome:
 
 
 def noise_words(seen: StarsSeen) -> str:
-    """How much of the stars' distances is noise: all of it where they are no farther off than their noise makes them."""
+    """How much of the stars' distances is noise: all of it where they are no farther off than
+    their noise makes them.
+    """
     rms_px = float(np.sqrt((np.hypot(*seen.residual_px.T) ** 2).mean()))
     noise_px = math.sqrt(2) * float(np.sqrt((seen.place_noise_px**2).mean()))
     if noise_px >= rms_px:
@@ -102,7 +110,9 @@ def noise_words(seen: StarsSeen) -> str:
 
 
 def _enough_frames(context: StepContext) -> StarsSeen:
-    """The stars of as many frames as it takes to tell their places from noise, or as many as were asked for."""
+    """The stars of as many frames as it takes to tell their places from noise, or as many as
+    were asked for.
+    """
     seen = see_stars(context, context.frames or 1)
     wanted = frames_for(seen, context.file.config.verify.centroid_px)
     if context.frames or context.source.by_hand or not 1 < wanted <= MAX_FRAMES:
@@ -111,7 +121,9 @@ def _enough_frames(context: StepContext) -> StarsSeen:
 
 
 def frames_for(seen: StarsSeen, limit_px: float) -> int:
-    """How many frames would tell whether the stars' places are within the limit at 95 %; those seen where they tell it."""
+    """How many frames would tell whether the stars' places are within the limit at 95 %; those
+    seen where they tell it.
+    """
     beyond, limit = seen.beyond_px, limit_px / P95_OF_TWO
     if beyond.high <= limit or beyond.low > limit:
         return seen.frames
@@ -121,7 +133,9 @@ def frames_for(seen: StarsSeen, limit_px: float) -> int:
 
 
 def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
-    """What speaks against the stars' places: geometry where they are off beyond their noise, or noise that hides it."""
+    """What speaks against the stars' places: geometry where they are off beyond their noise, or
+    noise that hides it.
+    """
     beyond = seen.beyond_px
     at_least, at_most = P95_OF_TWO * beyond.low, P95_OF_TWO * beyond.high
     if at_least > limit_px:
@@ -137,7 +151,9 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
 
 
 def _twin(context: StepContext) -> TwinVerdict:
-    """The twin's verdict; its black level is judged no closer than the session knows the light of white, by which it glows."""
+    """The twin's verdict; its black level is judged no closer than the session knows the light
+    of white, by which it glows.
+    """
     found = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
     glow = found.measured.glow
     known = float(context.known.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
@@ -146,7 +162,9 @@ def _twin(context: StepContext) -> TwinVerdict:
 
 
 def _twin_file(context: StepContext) -> BenchFile:
-    """The bench file for the twin; in a virtual session with the truth's calibration and geometry as true."""
+    """The bench file for the twin; in a virtual session with the truth's calibration and
+    geometry as true.
+    """
     truth, file = context.truth, context.file
     if truth is None:
         return file
@@ -168,7 +186,9 @@ def _twin_file(context: StepContext) -> BenchFile:
 
 
 def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tuple[dict[str, Figure], str]:
-    """The errors of the stars' light without their common zero point, and what is wrong where they scatter too far."""
+    """The errors of the stars' light without their common zero point, and what is wrong where
+    they scatter too far.
+    """
     gain, exposure_s = context.file.config.tracker.detector.gain_e_per_dn, context.exposure_s
     off = np.asarray(magnitude(seen.dn * gain / (seen.e_per_s * exposure_s)))[seen.sure]
     zero_point = float(np.median(off))
@@ -193,7 +213,9 @@ def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tupl
 
 
 def _star_reasons(context: StepContext, figures: dict[str, Figure], *, is_scattered: bool) -> list[str]:
-    """The limits of [verify] that the stars miss, with advice; not their light again where its scatter has been told."""
+    """The limits of [verify] that the stars miss, with advice; not their light again where its
+    scatter has been told.
+    """
     limits, found = context.file.config.verify, []
     if float(figures["lost"]) > LOST_SHARE * (float(figures["lost"]) + float(figures["stars"])):
         found.append(f"{figures['lost']} bright stars are not there")
@@ -229,7 +251,8 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
 
 READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
 AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
-# Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag rms from the truth.
+# Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag
+# rms from the truth.
 SYSTEMATIC_MAG = 0.002
 
 
@@ -314,7 +337,8 @@ def _white_e_per_s(file: BenchFile) -> float:
 
 
 def trend(e_per_s: FloatArray, off_mag: FloatArray, weight: FloatArray | float = 1.0) -> tuple[float, float]:
-    """The change of `off_mag` (n,) from the faintest to the brightest star, magnitudes, and its error.
+    """The change of `off_mag` (n,) from the faintest to the brightest star, magnitudes, and its
+    error.
 
     `weight` (n,) is in proportion to one over each star's sigma.
     """
@@ -343,7 +367,9 @@ def draw_light(
     finding: str,
     from_middle: FloatArray | None = None,
 ) -> None:
-    """Draw how much too faint stars are (n,) over the light asked for (n,), and over `from_middle` (n,), half sides."""
+    """Draw how much too faint stars are (n,) over the light asked for (n,), and over
+    `from_middle` (n,), half sides.
+    """
     panels = [("light asked for [e-/s]", e_per_s)]
     panels += [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
     with chart(path, finding, panels=len(panels), share_x=False) as drawn:

@@ -1,4 +1,6 @@
-"""The steps of warm-up and uniformity: light of dots against time, and against place on the screen."""
+"""The steps of warm-up and uniformity: light of dots against time, and against place on the
+screen.
+"""
 
 import datetime
 import math
@@ -35,13 +37,16 @@ from hilstar.server.bench.build import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
-# Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no two of the four lattices
-# share a pixel: else the dark frame's noise, common to all, would make a pattern that looks like the screen's.
+# Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no
+# two of the four lattices share a pixel: else the dark frame's noise, common to all, would make a
+# pattern that looks like the screen's.
 REACH_SIGMAS, REACH = 4.5, 0.25
 MAX_DOTS = 64  # in a lattice, along the screen's longer side
-SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # the four lattices' offsets, in half periods: each dot meets other pixels
+# the four lattices' offsets, in half periods: each dot meets other pixels
+SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))
 MIN_DOTS = 40
-ROWS = (2, 3, 5, 7, 9, 13, 18, 26)  # rows of the grids that are tried; the columns make their fields square
+# rows of the grids that are tried; the columns make their fields square
+ROWS = (2, 3, 5, 7, 9, 13, 18, 26)
 DOTS_A_FIELD = 6
 FOLDS, SEED = 5, 0
 SURE = 2.0  # standard errors by which a finer grid has to be better on held-out dots
@@ -51,12 +56,15 @@ WORTH_MAG = 0.002  # rms over the field: less is within the error of a star's li
 FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, noise does not explain how dots differ
 UNEXPLAINED = 1.5  # times the dots' noise
 FILE = "light.toml"
-LIT_SIGMAS, RING_PX = 5.0, 3  # a dot in the tracker's image, and the ring about it that tells the glow
+# a dot in the tracker's image, and the ring about it that tells the glow
+LIT_SIGMAS, RING_PX = 5.0, 3
 
 
 @dataclass(frozen=True, slots=True)
 class DotLight:
-    """Dots seen whole: centres (n,), monitor px, and light (n,), DN; `noise_mag` is the error of one."""
+    """Dots seen whole: centres (n,), monitor px, and light (n,), DN; `noise_mag` is the error of
+    one.
+    """
 
     x: IntArray
     y: IntArray
@@ -66,10 +74,12 @@ class DotLight:
 
 @dataclass(frozen=True, slots=True)
 class UniformityMap:
-    """Light against place: a grid (rows, columns), one field where light is even, and its value at each dot (n,), median 1.
+    """Light against place: a grid (rows, columns), one field where light is even, and its value at
+    each dot (n,), median 1.
 
     `left_mag` is the rms error on held-out dots, and `left_error_mag2` the standard error of its
-    square; `used` marks the dots that are no outliers. `fit_mag` is the standard error of the fit at a
+    square; `used` marks the dots that are no outliers. `fit_mag` is the standard error of the fit
+    at a
     dot; `missed_mag` the rms of what a finer map may show and this one does not.
     """
 
@@ -103,7 +113,9 @@ class UniformityMap:
 
 
 def uniformity(context: StepContext) -> StepOutcome:
-    """Measure light against place, and write a calibration with the map where the bench's is wrong. Raises InputError."""
+    """Measure light against place, and write a calibration with the map where the bench's is
+    wrong. Raises InputError.
+    """
     dots, images = see_dots(context)
     size_px, assumed = context.resolution_px, calibration_of(context)
     known = assumed.uniformity_map(size_px)
@@ -139,14 +151,17 @@ def uniformity(context: StepContext) -> StepOutcome:
     darkest = 100 * float(figures["darkest_of_brightest"])
     error = darkest * math.sqrt(2) * float(figures["map_error_mag"]) / MAG_PER_RELATIVE
     number = StepNumber(darkest, error, "%", "light at the darkest place of the screen, of that at the brightest")
-    # A finer map than the last was not tried: where dots still differ by more than their noise, it may be needed.
+    # A finer map than the last was not tried: where dots still differ by more than their noise, it
+    # may be needed.
     ends = FittedFigure("the map's rows", found.grid.shape[0], 0.0, ROWS[-1])
     fitted = (ends,) if found.left_mag > UNEXPLAINED * dots.noise_mag else ()
     return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes, number, fitted)
 
 
 def warm_up(context: StepContext) -> StepOutcome:
-    """Watch the light of dots until it is stable. Raises InputError for dots that saturate the tracker."""
+    """Watch the light of dots until it is stable. Raises InputError for dots that saturate the
+    tracker.
+    """
     if not context.watched_s:
         how = "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
         return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
@@ -193,7 +208,8 @@ def warm_up(context: StepContext) -> StepOutcome:
         slope = change / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
         stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
-        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # by its exponential alone
+        # by its exponential alone
+        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)
     changes = context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}")) if found.is_stable else ()
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(
@@ -208,7 +224,9 @@ def warm_up(context: StepContext) -> StepOutcome:
 
 
 class DotSpacing(NamedTuple):
-    """The sigma of a dot in the tracker's image, tracker px; period and reach of a lattice of dots, monitor px."""
+    """The sigma of a dot in the tracker's image, tracker px; period and reach of a lattice of
+    dots, monitor px.
+    """
 
     sigma_px: float
     period: int
@@ -268,8 +286,10 @@ def _unsaturated(
 ) -> tuple[int, list[DarkSubtracted]]:
     """The images of lattices, each from its first dot (x, y) on, and their code.
 
-    It is the brightest of the codes from the focus's down at which no dot saturates the tracker: the
-    focus saw other dots, and light differs from place to place. Raises InputError where none is left.
+    It is the brightest of the codes from the focus's down at which no dot saturates the tracker:
+    the
+    focus saw other dots, and light differs from place to place. Raises InputError where none is
+    left.
     """
     code = dot_code(context)
     while True:
@@ -298,7 +318,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     dark_path = context.dark()
     dark = context.read(dark_path)
     bad = dark > HOT_FILL * context.full_dn
-    bad[[0, -1]], bad[:, [0, -1]] = True, True  # a dot that reaches the detector's edge has lost light
+    # a dot that reaches the detector's edge has lost light
+    bad[[0, -1]], bad[:, [0, -1]] = True, True
     lattices = [[period // 2 + period // 2 * half for half in shift] for shift in SHIFTS]
     _, looks = _unsaturated(context, dark, "lattice", lattices, period)
     parts, noise_dn = [], 0.0
@@ -316,7 +337,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
-    # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's pixels.
+    # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's
+    # pixels.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
     noise = math.sqrt((dn / detector.gain_e_per_dn + pixels * noise_dn**2) / dn**2 + shared)
     return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
@@ -344,7 +366,8 @@ def _sums(
 ) -> DotSums:
     """The dots without a bad pixel in reach, and the sum of the image (h, w) in reach of each.
 
-    `looked_at` (2, h * w) is where each pixel looks on the monitor of `size`, px, whose dots are every `period` from `firsts`.
+    `looked_at` (2, h * w) is where each pixel looks on the monitor of `size`, px, whose dots are
+    every `period` from `firsts`.
     """
     counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
     place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / period
@@ -361,7 +384,9 @@ def _sums(
 
 
 def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:
-    """The simplest map of light (n,) at the dots: the coarsest grid that no finer one beats significantly."""
+    """The simplest map of light (n,) at the dots: the coarsest grid that no finer one beats
+    significantly.
+    """
     width, height = resolution_px
     shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
     shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[:1]
@@ -397,7 +422,9 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
 
 
 def _not_negative(found: float, error: float) -> float:
-    """The mean of a square that was found as `found` with a normal `error`, and cannot be negative."""
+    """The mean of a square that was found as `found` with a normal `error`, and cannot be
+    negative.
+    """
     if error <= 0:
         return max(found, 0.0)
     place = found / error
@@ -421,7 +448,9 @@ class _Freedoms(NamedTuple):
 
 
 def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
-    """The weight of each field at each dot (n, fields), sparse, interpolated as in a calibration's map."""
+    """The weight of each field at each dot (n, fields), sparse, interpolated as in a
+    calibration's map.
+    """
     from scipy.sparse import csr_array
 
     across = _two(weights_of_grid(resolution_px[0], shape[1])[dots.x])
@@ -433,17 +462,22 @@ def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, in
 
 
 def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
-    """The one or two non-zero fields of each row of weights (n, fields): their numbers and weights, (n,) each."""
+    """The one or two non-zero fields of each row of weights (n, fields): their numbers and
+    weights, (n,) each.
+    """
     row, last = np.arange(len(weights)), weights.shape[1] - 1
     left = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
     return [(field, weights[row, field]) for field in (left, left + 1)[: last + 1]]
 
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
-    """The fields (rows * columns,) by least squares; a field without dots follows its neighbours."""
+    """The fields (rows * columns,) by least squares; a field without dots follows its
+    neighbours.
+    """
     normal = (design.T @ design).toarray() + _smoothness(shape)
     found = np.linalg.solve(normal, design.T @ light)
-    return np.asarray(np.maximum(found, light.min() / 2))  # a field that no dot reaches has light, too
+    # a field that no dot reaches has light, too
+    return np.asarray(np.maximum(found, light.min() / 2))
 
 
 def _smoothness(shape: tuple[int, int]) -> FloatArray:
@@ -476,7 +510,9 @@ def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Bool
 
 
 def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: str) -> None:
-    """Draw how much fainter each used dot is than the brightest place, and than the map, over the screen."""
+    """Draw how much fainter each used dot is than the brightest place, and than the map, over
+    the screen.
+    """
     x, y, light, mapped = (each[found.used] for each in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots))
     panels = {
         "fainter than the brightest place [mag]": np.asarray(magnitude(light / mapped.max())),

@@ -1,1 +1,3 @@
-"""Geometric calibration: the lens between monitor and tracker, from dots on the monitor and their centroids."""
+"""Geometric calibration: the lens between monitor and tracker, from dots on the monitor and
+their centroids.
+"""

@@ -1,4 +1,6 @@
-"""A geometric calibration from centroids to a file: matching, fit, checks, summary, notes and chart."""
+"""A geometric calibration from centroids to a file: matching, fit, checks, summary, notes and
+chart.
+"""
 
 import datetime
 import math
@@ -34,22 +36,27 @@ from hilstar.server.bench.cameras import before_detector, bench_camera, ideal_mo
 
 SEED = 1  # for the random samples of dots: one calibration gives one file
 KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
-# In a part of the screen, of so many dots that should be seen the share that is: two or three may be lost to neighbours.
+# In a part of the screen, of so many dots that should be seen the share that is: two or three may
+# be lost to neighbours.
 MIN_CELL_DOTS, MIN_CELL_SHARE = 4, 0.33
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
-SCREEN_PLACES = 17  # along each side of the screen, by which it is known whether the tracker sees all of it
+# along each side of the screen, by which it is known whether the tracker sees all of it
+SCREEN_PLACES = 17
 REACH_PX = 0.5  # tracker px: a centroid this close to a dot's fitted place is that dot
 REACH_SIGMAS = 8.0
 MATCH_ROUNDS = 2
 DEFAULT_NOISE_PX = 0.05
-# A held-out error this many times that of the centroids' noise alone is no lens: a dot's mean is off by noise / sqrt(frames).
+# A held-out error this many times that of the centroids' noise alone is no lens: a dot's mean is
+# off by noise / sqrt(frames).
 MAX_MISFIT = 4.0
 MISFIT_FLOOR_ARCSEC = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and the centroids' fate."""
+    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and
+    the centroids' fate.
+    """
 
     problem: fits.Problem
     data: fits.MatchedDots
@@ -101,7 +108,9 @@ class Calibrated:
 def calibrate_files(
     file: BenchFile, observed: Sequence[Path], plan: Path, dark: Path | None, *, tracker_is_ideal: bool
 ) -> Calibrated:
-    """Fit the geometry of a bench file to a table of centroids, or to the tracker's images. Raises InputError."""
+    """Fit the geometry of a bench file to a table of centroids, or to the tracker's images.
+    Raises InputError.
+    """
     config = file.config
     dots = read_plan(plan)
     width, height = config.monitor.resolution_px
@@ -130,26 +139,34 @@ def nominal_of(file: BenchFile) -> fits.Nominal:
 
 
 def seen_screen_of(file: BenchFile) -> SeenScreen:
-    """What the tracker sees of the screen by a bench file: surely by its geometry file, else about. Raises InputError."""
+    """What the tracker sees of the screen by a bench file: surely by its geometry file, else
+    about. Raises InputError.
+    """
     tracker = tracker_camera(file.config.tracker, file.folder)
     monitor, is_sure = bench_camera(file.config, file.folder), file.config.collimator.geometry is not None
     return SeenScreen(monitor, tracker, is_sure, psf_sigma_of(file))
 
 
 def dot_sigma_px(file: BenchFile) -> float:
-    """The sigma of a dot in the tracker's image by the bench file, tracker px. Raises InputError."""
+    """The sigma of a dot in the tracker's image by the bench file, tracker px. Raises
+    InputError.
+    """
     nominal = nominal_of(file)
     return SeenScreen(nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)).dot_sigma_px
 
 
 def psf_sigma_of(file: BenchFile) -> float:
-    """How wide the tracker sees a point of the screen by the bench file, its sigma in tracker px. Raises InputError."""
+    """How wide the tracker sees a point of the screen by the bench file, its sigma in tracker
+    px. Raises InputError.
+    """
     psf = before_detector(file.config, file.folder, ideal_monitor(file.config))
     return float(np.mean(psf.width_px))
 
 
 def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen:
-    """Which part of the screen the tracker sees, by a few dots: enough to put the others there. Raises InputError."""
+    """Which part of the screen the tracker sees, by a few dots: enough to put the others there.
+    Raises InputError.
+    """
     nominal = nominal_of(file)
     look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
     problem, data = matched(plan, nominal, seen, look)
@@ -171,9 +188,10 @@ def calibrate_geometry(
 ) -> Calibrated:
     """Fit a bench's geometry to what the tracker saw of the dots.
 
-    With `tracker_known` the tracker's own lens is held as it is; else it is fitted too, which takes two poses or more.
-    Raises InputError, with the cure, for an image that is mirrored or turned, for codes or frames that match nothing, for too
-    few dots, and for a fit that its data contradict.
+    With `tracker_known` the tracker's own lens is held as it is; else it is fitted too, which takes
+    two poses or more. Raises InputError, with the cure, for an image that is mirrored or turned,
+    for codes or frames that match nothing, for too few dots, and for a fit that its data
+    contradict.
     """
     poses = int(seen.pose.max()) + 1
     if not tracker_known and poses == 1:
@@ -203,7 +221,9 @@ def calibrate_geometry(
 
 
 def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
-    """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
+    """The fit with its lens limited to the tracker's field, where part of the screen lies
+    outside of it.
+    """
     geometry, monitor = fit.geometry, fit.geometry.monitor
     # By places over the whole screen, not by the dots: those stand where the tracker sees it.
     sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
@@ -216,7 +236,8 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     for pose in range(len(geometry.q_poses)):
         rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
         reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
-    # A pinhole is bounded, too: a tilt that it could not see within the field is 23 arcsec off at the screen's far end.
+    # A pinhole is bounded, too: a tilt that it could not see within the field is 23 arcsec off at
+    # the screen's far end.
     lens = replace(monitor.lens or Lens(), max_tangent=KNOWN_MARGIN * reach)
     return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
 
@@ -224,7 +245,8 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
 def matched(
     plan: DotPlan, nominal: fits.Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
 ) -> tuple[fits.Problem, fits.MatchedDots]:
-    """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to fit, and its data.
+    """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to
+    fit, and its data.
 
     Raises InputError where the image moved between frames.
     """
@@ -245,7 +267,9 @@ def matched(
 
 
 def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0) -> list[BoolArray]:
-    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than `edge_px` from its edge."""
+    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than
+    `edge_px` from its edge.
+    """
     geometry = fit.geometry
     directions = geometry.monitor.rays(x_px, y_px)
     width, height = geometry.tracker.resolution_px
@@ -291,7 +315,9 @@ class FittedParameter(NamedTuple):
 
 
 def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
-    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its own lens."""
+    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its
+    own lens.
+    """
     chosen, error = found.chosen, found.uncertainty
     return {
         "model": chosen.name,
@@ -352,7 +378,9 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
 
 
 def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity: MonitorIdentity | None = None) -> list[str]:
-    """Write the geometry file with its errors and its monitor, and its chart if `plot`; their names. Raises InputError."""
+    """Write the geometry file with its errors and its monitor, and its chart if `plot`; their
+    names. Raises InputError.
+    """
     geometry, chosen, uncertainty = found.fit.geometry, found.chosen, found.uncertainty
     error = ErrorTable(
         model=chosen.name,

@@ -1,7 +1,9 @@
-"""Frames of dots, each of which blinks its own code: a dot in the tracker's image identifies itself.
+"""Frames of dots, each of which blinks its own code: a dot in the tracker's image identifies
+itself.
 
-Every dot is lit in the same number of frames, which shows lost and false centroids. Two codes differ in as many frames as the
-number of dots allows. Dots stand where the tracker sees the screen: a tracker before a large screen may see 2 % of it.
+Every dot is lit in the same number of frames, which shows lost and false centroids. Two codes
+differ in as many frames as the number of dots allows. Dots stand where the tracker sees the screen:
+a tracker before a large screen may see 2 % of it.
 """
 
 import logging
@@ -28,23 +30,32 @@ DOT_PX = 3  # side of a dot, monitor px
 EDGE_PX = 6  # from a dot's centre to the edge of the screen
 TRIES = 400  # random codes for each dot, at each distance
 PLAN_COLUMNS = ("frame", "dot", "x_px", "y_px")
-GOLDEN = 1.32471795724474602596  # the plastic number: its powers spread points evenly over a square (Roberts 2018)
+# the plastic number: its powers spread points evenly over a square (Roberts 2018)
+GOLDEN = 1.32471795724474602596
 PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
-# Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for their wings. They stand by
-# chance, so that half of them have a neighbour at half of it: 9 sigmas, for two windows of 4 and a little light beyond.
+# Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for
+# their wings. They stand by chance, so that half of them have a neighbour at half of it: 9 sigmas,
+# for two windows of 4 and a little light beyond.
 MIN_APART_PX, APART_SIDES, WINGS_PX, WINGS_SIGMAS = 40.0, 2.5, 20.0, 18.0
 MIN_DOTS = 12  # that the fit of a geometry needs
 MIN_LIT_DOTS, MAX_LIT_DOTS = 8, 60  # in a frame: three frames in eight light 21 dots or more
-# A geometry that was not measured: the bench file's lens may look past the screen's middle by so much of the tracker's field.
+# A geometry that was not measured: the bench file's lens may look past the screen's middle by so
+# much of the tracker's field.
 UNSURE_SHARE = 0.15
-GRID = 65  # places along each side of the screen and of the tracker, by which the part that is seen is found
-TRIED = 40  # places of the even sequence that are tried for each dot: the part seen may be a thin strip of its box
-BORDER_DIRECTIONS = 8  # in which the outermost place that is seen has a dot, so that no corner is extrapolated
+# places along each side of the screen and of the tracker, by which the part that is seen is found
+GRID = 65
+# places of the even sequence that are tried for each dot: the part seen may be a thin strip of its
+# box
+TRIED = 40
+# in which the outermost place that is seen has a dot, so that no corner is extrapolated
+BORDER_DIRECTIONS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class DotPlan:
-    """Dots on the monitor: places (n,), whole px, and the frames in which each is lit (n, frames)."""
+    """Dots on the monitor: places (n,), whole px, and the frames in which each is lit (n,
+    frames).
+    """
 
     x_px: FloatArray
     y_px: FloatArray
@@ -65,7 +76,9 @@ class DotPlan:
 
 
 def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
-    """Plan dots over the whole screen, about `dots_per_frame` lit in each frame. Raises InputError where that is impossible."""
+    """Plan dots over the whole screen, about `dots_per_frame` lit in each frame. Raises
+    InputError where that is impossible.
+    """
     count = dots_of_frames(frames, dots_per_frame)
     lit = _codes(count, frames, rng)
     x_px, y_px = _places(resolution_px, count)
@@ -73,7 +86,9 @@ def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, 
 
 
 def dots_of_frames(frames: int, dots_per_frame: int) -> int:
-    """How many dots there are where so many are lit in each of the frames. Raises InputError for too few frames."""
+    """How many dots there are where so many are lit in each of the frames. Raises InputError for
+    too few frames.
+    """
     if frames < MIN_FRAMES:
         raise InputError(f"--frames {frames}: the dots' codes need {MIN_FRAMES} frames or more")
     return round(dots_per_frame * frames / _weight(frames))
@@ -84,7 +99,9 @@ def _weight(frames: int) -> int:
 
 
 def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
-    """Codes (count, frames) of one weight, as far apart as random search finds them. Raises InputError for too many."""
+    """Codes (count, frames) of one weight, as far apart as random search finds them. Raises
+    InputError for too many.
+    """
     weight = _weight(frames)
     tried = (_codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2))
     lit = next((codes for codes in tried if codes is not None), None)
@@ -99,8 +116,9 @@ def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
 class SeenScreen:
     """The part of a screen that a tracker sees: `monitor` and `tracker` map cam to their pixels.
 
-    `is_sure` says that this is known: by a fit, or by the figure of the step `orientation`. Else a wider part is taken.
-    `psf_sigma_px` is how wide the tracker sees a point: the window of a dot near the detector's edge would leave the image.
+    `is_sure` says that this is known: by a fit, or by the figure of the step `orientation`. Else a
+    wider part is taken. `psf_sigma_px` is how wide the tracker sees a point: the window of a dot
+    near the detector's edge would leave the image.
     """
 
     monitor: Camera
@@ -120,7 +138,9 @@ class SeenScreen:
 
     @property
     def turn_deg(self) -> float:
-        """By how much a monitor pixel is turned in the tracker's image, in the middle of what is seen. Raises InputError."""
+        """By how much a monitor pixel is turned in the tracker's image, in the middle of what is
+        seen. Raises InputError.
+        """
         low, high = self.box()
         x_px, y_px = (low + high) / 2
         rays = self.monitor.rays(np.array([x_px, x_px + 1]), np.array([y_px, y_px]))
@@ -128,7 +148,9 @@ class SeenScreen:
         return math.degrees(math.atan2(v[1] - v[0], u[1] - u[0]))
 
     def shows(self, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
-        """Whether a whole dot at monitor pixels (n,) is on the screen and in the tracker's field (n,)."""
+        """Whether a whole dot at monitor pixels (n,) is on the screen and in the tracker's field
+        (n,).
+        """
         width, height = self.monitor.resolution_px
         on_screen = (x_px >= EDGE_PX) & (x_px <= width - 1 - EDGE_PX) & (y_px >= EDGE_PX) & (y_px <= height - 1 - EDGE_PX)
         rays = self.monitor.rays(x_px, y_px)
@@ -136,7 +158,8 @@ class SeenScreen:
         wide, high = self.tracker.resolution_px
         margin_px = -UNSURE_SHARE * max(wide, high)
         if self.is_sure:
-            # A dot whose window leaves the image has a biased centroid, and is dropped by who measures it.
+            # A dot whose window leaves the image has a biased centroid, and is dropped by who
+            # measures it.
             half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
             margin_px = max(half_dot_px + EDGE_PX, dot_centroids(self.dot_sigma_px).radius_px + 1)
         with np.errstate(invalid="ignore"):
@@ -144,7 +167,9 @@ class SeenScreen:
         return np.asarray(on_screen & in_field)
 
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """The lower and upper corner (2,) of the part of the screen that is seen, monitor px. Raises InputError for none."""
+        """The lower and upper corner (2,) of the part of the screen that is seen, monitor px.
+        Raises InputError for none.
+        """
         width, height = self.monitor.resolution_px
         wide, high = self.tracker.resolution_px
         reach = UNSURE_SHARE * max(wide, high)
@@ -164,7 +189,9 @@ class SeenScreen:
 
 
 def lit_for(seen: SeenScreen) -> int:
-    """How many dots of a frame the tracker can tell apart on the part of the screen that it sees, through its PSF."""
+    """How many dots of a frame the tracker can tell apart on the part of the screen that it
+    sees, through its PSF.
+    """
     ratio = seen.tracker_px_a_monitor_px
     apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px))
     low, high = seen.box()
@@ -174,7 +201,9 @@ def lit_for(seen: SeenScreen) -> int:
 
 
 def plan_seen_dots(seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
-    """Plan dots over the part of the screen that the tracker sees. Raises InputError where that is impossible."""
+    """Plan dots over the part of the screen that the tracker sees. Raises InputError where that
+    is impossible.
+    """
     count = dots_of_frames(frames, dots_per_frame)
     if count < MIN_DOTS:
         raise InputError(
@@ -187,7 +216,9 @@ def plan_seen_dots(seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.r
 
 
 def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
-    """Whole pixels (n,) spread evenly over what is seen, the outermost first; at most `count`. Raises InputError for few."""
+    """Whole pixels (n,) spread evenly over what is seen, the outermost first; at most `count`.
+    Raises InputError for few.
+    """
     low, high = seen.box()
     k = np.arange(TRIED * count)
     unit = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
@@ -241,7 +272,9 @@ def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.ra
 
 
 def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, FloatArray]:
-    """Whole pixels spread evenly over the screen, its corners first, so that no corner is extrapolated."""
+    """Whole pixels spread evenly over the screen, its corners first, so that no corner is
+    extrapolated.
+    """
     k = np.arange(max(count - 4, 0))
     spread = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
@@ -254,7 +287,9 @@ def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, Flo
 
 
 def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int) -> npt.NDArray[np.uint16]:
-    """Code values (h, w) of a frame: each lit dot is a square of DOT_PX of `white` about its place."""
+    """Code values (h, w) of a frame: each lit dot is a square of DOT_PX of `white` about its
+    place.
+    """
     width, height = resolution_px
     image = np.zeros((height, width), dtype=np.uint16)
     for x, y in zip(plan.x_px[plan.lit[:, frame]].astype(int), plan.y_px[plan.lit[:, frame]].astype(int), strict=True):
@@ -300,9 +335,11 @@ log = logging.getLogger(__name__)
 
 
 def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowed: bool) -> int:
-    """Show each frame until space is pressed, or for `seconds`; q quits. Returns how many were shown.
+    """Show each frame until space is pressed, or for `seconds`; q quits. Returns how many were
+    shown.
 
-    Raises MachineError without a display or where that goes away, InputError for one that is not there.
+    Raises MachineError without a display or where that goes away, InputError for one that is not
+    there.
     """
     # Here, for `calibrate dots` without --show draws nothing and starts without OpenGL.
     from hilstar.display.render.backend import ScreenView

@@ -1,4 +1,6 @@
-"""A bench's geometry fitted to centroids of dots: parameters, robust least squares, choice of a model, uncertainty."""
+"""A bench's geometry fitted to centroids of dots: parameters, robust least squares, choice of a
+model, uncertainty.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -29,7 +31,8 @@ STEPS = {
     "p1": 0.1,
     "p2": 0.1,
 }
-# A turn about the boresight leaves a radial distortion as it is: what no pose tells apart is taken as the collimator's.
+# A turn about the boresight leaves a radial distortion as it is: what no pose tells apart is taken
+# as the collimator's.
 TRACKER_STEPS = {"tracker_k1": 0.1, "tracker_k2": 1.0, "tracker_p1": 0.1, "tracker_p2": 0.1}
 TRACKER_ROUND = ("tracker_k1", "tracker_k2")
 POSE_STEP_RAD = 0.01
@@ -40,7 +43,9 @@ BROWN_CONRADY = tuple(STEPS)
 
 @dataclass(frozen=True, slots=True)
 class Nominal:
-    """The bench file's geometry: the ideal camera of the monitor, its rotation, and the tracker's own camera."""
+    """The bench file's geometry: the ideal camera of the monitor, its rotation, and the
+    tracker's own camera.
+    """
 
     monitor: Camera
     q_cam_to_mon: FloatArray
@@ -49,7 +54,9 @@ class Nominal:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """The free parameters and the number of tracker poses; each pose beyond the first has its own rotation."""
+    """The free parameters and the number of tracker poses; each pose beyond the first has its
+    own rotation.
+    """
 
     names: tuple[str, ...]
     tracker_names: tuple[str, ...] = ()
@@ -63,7 +70,9 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """The cameras of one set of parameters; `q_poses` (poses, 4) turns cam, the first pose's axes, into each pose's."""
+    """The cameras of one set of parameters; `q_poses` (poses, 4) turns cam, the first pose's
+    axes, into each pose's.
+    """
 
     monitor: Camera
     q_cam_to_mon: FloatArray
@@ -72,10 +81,13 @@ class Geometry:
 
 
 def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: FloatArray) -> Geometry:
-    """The cameras of parameters (size,); the poses' rotations are applied after `q_poses` (poses, 4)."""
+    """The cameras of parameters (size,); the poses' rotations are applied after `q_poses`
+    (poses, 4).
+    """
     values = dict.fromkeys(STEPS, 0.0)
     values |= {name: STEPS[name] * float(number) for name, number in zip(model.names, numbers, strict=False)}
-    # The principal point moves with a turn, so that the image's middle stays: else the loss has one long valley in the two.
+    # The principal point moves with a turn, so that the image's middle stays: else the loss has one
+    # long valley in the two.
     follow = np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
     turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
     q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
@@ -109,8 +121,8 @@ def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
 PRIOR = 0.3  # weight on a parameter's number: so weak that it decides only what the data leave open
-# Weight on the tracker's radial terms, which the collimator's can replace. Free, they follow what neither lens can follow.
-# How well they are known is a matter of PRIOR all the same.
+# Weight on the tracker's radial terms, which the collimator's can replace. Free, they follow what
+# neither lens can follow. How well they are known is a matter of PRIOR all the same.
 ROUND_PRIOR = 30.0
 FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
 FAR_SIGMA = 1e6  # residual of a centroid that a trial puts behind the lens
@@ -137,7 +149,9 @@ class MatchedDots:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The data of a fit: the plan's dots, the bench file's geometry, and a centroid's error in tracker px."""
+    """The data of a fit: the plan's dots, the bench file's geometry, and a centroid's error in
+    tracker px.
+    """
 
     plan: DotPlan
     nominal: Nominal
@@ -152,7 +166,9 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A fitted model: its parameters, followed by the residual field's coefficients in x and in y, and its geometry."""
+    """A fitted model: its parameters, followed by the residual field's coefficients in x and in
+    y, and its geometry.
+    """
 
     model: Model
     field_degree: int
@@ -164,8 +180,8 @@ class Fit:
 class _Loss:
     """The function that is minimised: Huber's loss of the residuals plus a weak prior.
 
-    It is over the model's parameters and the residual field's coefficients together: a lens fitted alone would follow what
-    only the field can follow.
+    It is over the model's parameters and the residual field's coefficients together: a lens fitted
+    alone would follow what only the field can follow.
     """
 
     problem: Problem
@@ -193,7 +209,8 @@ class _Loss:
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
         """Derivatives of the residuals by each number (2 n, numbers).
 
-        For the lens they are finite differences without the field, which hardly changes along a step; the field is linear.
+        For the lens they are finite differences without the field, which hardly changes along a
+        step; the field is linear.
         """
         lens, own = numbers[: self.model.size], len(self.model.names) + len(self.model.tracker_names)
         poses = (len(lens) - own) // 3
@@ -204,7 +221,8 @@ class _Loss:
             geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n) for n in (0 * lens, *steps)
         )
         seen = self.data.seen
-        directions = directions_in_cam(bare, seen.pose, seen.x_px, seen.y_px)  # the same for all terms of the monitor's camera
+        # the same for all terms of the monitor's camera
+        directions = directions_in_cam(bare, seen.pose, seen.x_px, seen.y_px)
         base = self._off(bare, directions) if self.field_degree else off
         offs = [self._off(g, directions if n < len(self.model.names) else None) for n, g in enumerate(varied)]
         slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
@@ -231,7 +249,9 @@ class _Loss:
 
 
 def fit(problem: Problem, model: Model, field_degree: int, data: MatchedDots, start: FloatArray | None = None) -> Fit:
-    """Fit a model with a residual field of a total degree (0 for none) to `data`, starting at `start`."""
+    """Fit a model with a residual field of a total degree (0 for none) to `data`, starting at
+    `start`.
+    """
     loss = _Loss(problem, model, field_degree, data)
     if start is None and field_degree:
         lens = fit(problem, model, 0, data).numbers
@@ -269,7 +289,8 @@ def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
 def residuals_px(
     problem: Problem, geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Distance of each centroid from its dot along x and y (n,), on the monitor, scaled to tracker px.
+    """Distance of each centroid from its dot along x and y (n,), on the monitor, scaled to tracker
+    px.
 
     `directions` (n, 3) are the centroids' `directions_in_cam` where they are known.
     """
@@ -294,7 +315,8 @@ def _places_px(geometry: Geometry, data: MatchedDots, directions: FloatArray | N
 
 
 def noise_of_repeats(data: MatchedDots) -> float | None:
-    """The error of one centroid along one axis, px, from the scatter of dots seen in several frames; None where none is.
+    """The error of one centroid along one axis, px, from the scatter of dots seen in several
+    frames; None where none is.
 
     It needs no model. It uses the median absolute deviation, so a few false matches do not count.
     """
@@ -313,8 +335,9 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
 
 FOLDS = 5
 FIELD_DEGREES = (3, 4, 5, 6, 7)
-# A larger model is taken where it brings the held-out error below this share of the smaller one's, and beyond chance by so
-# many sigmas: of eight models of 50 dots, one is 2 % better than another by chance.
+# A larger model is taken where it brings the held-out error below this share of the smaller one's,
+# and beyond chance by so many sigmas: of eight models of 50 dots, one is 2 % better than another by
+# chance.
 GAIN, GAIN_SIGMAS = 0.98, 2.5
 CENTROIDS_PER_NUMBER = 3.0
 
@@ -323,7 +346,8 @@ CENTROIDS_PER_NUMBER = 3.0
 class Candidate:
     """A model, its name, and its error on dots that were held out of its fit.
 
-    `off_arcsec` (dots, 2) is the mean error of each dot in `dot` (dots,); it includes the centroids' noise.
+    `off_arcsec` (dots, 2) is the mean error of each dot in `dot` (dots,); it includes the
+    centroids' noise.
     """
 
     name: str
@@ -344,7 +368,9 @@ class Candidate:
 
 
 def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ...]) -> list[Candidate]:
-    """Every model that the number of centroids allows, simplest first, each with its error on held-out dots."""
+    """Every model that the number of centroids allows, simplest first, each with its error on
+    held-out dots.
+    """
     poses = len(problem.q_poses)
     wanted = [("pinhole", PINHOLE, 0), ("pinhole + k1", RADIAL, 0), ("Brown-Conrady + tilt", BROWN_CONRADY, 0)]
     wanted += [(f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES]
@@ -352,7 +378,8 @@ def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ..
     for name, names, degree in wanted:
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
         numbers = model.size + (degree + 1) * (degree + 2)
-        # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers followed 42 dots' own errors.
+        # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers
+        # followed 42 dots' own errors.
         if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers:
             found.append(held_out(problem, name, model, degree, data))
         if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
@@ -388,7 +415,9 @@ def best_of(found: list[Candidate]) -> Candidate:
 
 
 def _is_beyond_chance(smaller: Candidate, larger: Candidate) -> bool:
-    """Whether the larger model's gain on the held-out dots is more than the dots' scatter makes by chance."""
+    """Whether the larger model's gain on the held-out dots is more than the dots' scatter makes
+    by chance.
+    """
     squares = [(each.off_arcsec**2).sum(axis=1) for each in (smaller, larger)]
     with np.errstate(invalid="ignore"):  # a dot that both put behind the lens
         gain = np.nan_to_num(squares[0] - squares[1], nan=0.0)
@@ -406,14 +435,17 @@ MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no inte
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """One sigma of each parameter, and of a star's place over the screen, edges included: `map_arcsec` (rows, columns).
+    """One sigma of each parameter, and of a star's place over the screen, edges included:
+    `map_arcsec` (rows, columns).
 
-    `field_arcsec` (n,) is that of places that the tracker sees, edges included: it may see 2 % of the screen. `modes_arcsec`
-    (modes, 2 places) times its transpose is the covariance of places along x and y, row by row of the map.
-    The map is NaN where the tracker saw no dots. From the covariance of the whole lens, also where a simpler one was chosen,
-    and from what the whole lens would move each place by: a simple lens is chosen where the dots' noise hides its lack of fit.
-    Scaled up where residuals, or their means over a dot's frames, exceed the centroids' noise. Errors that no parameter can
-    follow show in the error of held-out dots alone.
+    `field_arcsec` (n,) is that of places that the tracker sees, edges included: it may see 2 % of
+    the screen. `modes_arcsec` (modes, 2 places) times its transpose is the covariance of places
+    along x and y, row by row of the map.
+    The map is NaN where the tracker saw no dots. From the covariance of the whole lens, also where
+    a simpler one was chosen, and from what the whole lens would move each place by: a simple lens
+    is chosen where the dots' noise hides its lack of fit. Scaled up where residuals, or their means
+    over a dot's frames, exceed the centroids' noise. Errors that no parameter can follow show in
+    the error of held-out dots alone.
     """
 
     sigma: dict[str, float]
@@ -433,7 +465,9 @@ class Uncertainty:
 
 
 def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty:
-    """The uncertainty of a fit to `data`, by the covariance of the whole lens and by what that would move."""
+    """The uncertainty of a fit to `data`, by the covariance of the whole lens and by what that
+    would move.
+    """
     monitor = fit.geometry.monitor
     fit, is_simpler = _with_whole_lens(fit), fit.model.names != BROWN_CONRADY
     off = residuals_sigma(problem, fit.geometry, data)
@@ -443,10 +477,12 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     size = fit.model.size
     field_numbers = rows.shape[1] - size
     prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
-    root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])  # times its transpose: the covariance
+    # times its transpose: the covariance
+    root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])
     scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)), _scatter_of_dots(data, off, rows.shape[1]))
     if is_simpler:
-        # One step of Gauss and Newton from the simple lens to the whole one, as one more error beside the covariance's.
+        # One step of Gauss and Newton from the simple lens to the whole one, as one more error
+        # beside the covariance's.
         downhill = rows.T @ (weight * off) + prior**2 * fit.numbers
         root = np.column_stack([root, root @ (root.T @ downhill) / scale])
     steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
@@ -460,7 +496,8 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     in_field = np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
     seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
     row, column = distance_transform_edt((~seen).astype(np.int64), return_distances=False, return_indices=True)
-    slopes = slopes[:, (row * seen.shape[1] + column).ravel()]  # a place that was not seen has those of its neighbour
+    # a place that was not seen has those of its neighbour
+    slopes = slopes[:, (row * seen.shape[1] + column).ravel()]
     variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
     _, size_of, modes = np.linalg.svd(slopes.reshape(2 * seen.size, -1).T, full_matrices=False)
     modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
@@ -486,7 +523,8 @@ def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
 def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
     """The scatter of dots' mean residuals in sigmas of their noise, of a fit of so many numbers.
 
-    A dot is at one place in all its frames: what a detector's pixels do to it there is no average of the frames.
+    A dot is at one place in all its frames: what a detector's pixels do to it there is no average
+    of the frames.
     """
     dots, place, count = np.unique(data.dot, return_inverse=True, return_counts=True)
     means = [np.bincount(place, part) / np.sqrt(count) for part in np.split(off, 2)]
@@ -520,7 +558,9 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
 
 
 def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> FloatArray:
-    """Derivatives of the residuals by each parameter and each coefficient of the field (2 n, numbers)."""
+    """Derivatives of the residuals by each parameter and each coefficient of the field (2 n,
+    numbers).
+    """
     base = residuals_sigma(problem, fit.geometry, data)
     varied = [residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)]
     slopes = np.stack([(each - base) / DIFFERENCE for each in varied], axis=1)
@@ -533,7 +573,9 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
 
 
 def _slopes_of_places(problem: Problem, fit: Fit, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the places of the directions now at (x, y) by each number, monitor px (n, numbers), along x and y."""
+    """Derivatives of the places of the directions now at (x, y) by each number, monitor px (n,
+    numbers), along x and y.
+    """
     monitor = fit.geometry.monitor
     directions = monitor.rays(x_px, y_px)
     moved = []

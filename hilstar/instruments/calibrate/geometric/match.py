@@ -1,8 +1,10 @@
-"""Matches centroids to dots by the codes that the dots blink, without a guess of where they should be.
+"""Matches centroids to dots by the codes that the dots blink, without a guess of where they should
+be.
 
-A dot stands still, so centroids of different frames at one place are one dot, and the frames it was seen in are its code. Codes
-that match one dot clearly give a first map; by that map every centroid is matched to the nearest lit dot. An image that is
-mirrored, turned, or moved between frames is refused, with the cure.
+A dot stands still, so centroids of different frames at one place are one dot, and the frames it was
+seen in are its code. Codes that match one dot clearly give a first map; by that map every centroid
+is matched to the nearest lit dot. An image that is mirrored, turned, or moved between frames is
+refused, with the cure.
 """
 
 from collections.abc import Callable
@@ -28,7 +30,8 @@ LINK_SHARE = 0.2  # relative to the distance between dots, if that is less
 CODE_LEAD = 2  # by how many frames the next code must be farther than the best
 MAX_CODE_ERRORS = 3
 TRIALS = 600  # samples of four dots each
-# Four places along each side of the dots' part, from a fifth to four fifths of it: (2, 4) weights of its two ends.
+# Four places along each side of the dots' part, from a fifth to four fifths of it: (2, 4) weights
+# of its two ends.
 MIDDLE = np.stack([np.linspace(0.8, 0.2, 4), np.linspace(0.2, 0.8, 4)])
 INLIER_SHARE = 0.03  # relative to the extent of the dots: a lens may bend a homography by this
 MIN_DECODED = 6
@@ -36,7 +39,9 @@ MIN_DECODED = 6
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Dots of one pose that were recognised by their codes: the dot, and the mean of its centroids, (n,) each."""
+    """Dots of one pose that were recognised by their codes: the dot, and the mean of its
+    centroids, (n,) each.
+    """
 
     dot: IntArray
     x_px: FloatArray
@@ -44,7 +49,9 @@ class Decoded:
 
 
 def decode(plan: DotPlan, seen: Observed) -> Decoded:
-    """The dots of one pose whose code is close to one dot's and clearly farther from every other's; each dot once."""
+    """The dots of one pose whose code is close to one dot's and clearly farther from every
+    other's; each dot once.
+    """
     # Centroids close to each other are one dot's, and share a group.
     places = np.column_stack([seen.x_px, seen.y_px])
     area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
@@ -74,7 +81,9 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """The projective maps (..., 3, 3) from (u, v) to (x, y), (..., n) each (Hartley and Zisserman 2004, 4.1, normalised)."""
+    """The projective maps (..., 3, 3) from (u, v) to (x, y), (..., n) each (Hartley and
+    Zisserman 2004, 4.1, normalised).
+    """
     into, out = _normal(u, v), _normal(x, y)
     zero, one = np.zeros_like(u), np.ones_like(u)
     a, b, _ = np.moveaxis(into @ np.stack([u, v, one], axis=-2), -2, 0)
@@ -92,7 +101,9 @@ def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> Fl
 
 
 def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
-    """A similarity (..., 3, 3) that centres points (..., n) on the origin with a mean square distance of 2."""
+    """A similarity (..., 3, 3) that centres points (..., n) on the origin with a mean square
+    distance of 2.
+    """
     scale = np.sqrt(2.0) / np.maximum(np.sqrt(x.var(axis=-1) + y.var(axis=-1)), 1e-300)
     zero, one = np.zeros_like(scale), np.ones_like(scale)
     rows = [[scale, zero, -scale * x.mean(axis=-1)], [zero, scale, -scale * y.mean(axis=-1)], [zero, zero, one]]
@@ -107,10 +118,12 @@ def mapped(matrix: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray
 
 
 FIRST_REACH = 0.03  # relative to the extent of the dots; the first map knows no lens
-MAX_TURN_DEG = 60.0  # a turn that the fit finds by itself: beyond 45 deg another way round is nearer, within noise
+# a turn that the fit finds by itself: beyond 45 deg another way round is nearer, within noise
+MAX_TURN_DEG = 60.0
 MIN_MOTION_PX = 0.05  # tracker px
 POLISH_ROUNDS = 10
-MAX_CHANCE = 12.0  # sigmas of a frame's mean: the largest of some 30 differences of medians, with room
+# sigmas of a frame's mean: the largest of some 30 differences of medians, with room
+MAX_CHANCE = 12.0
 MOTION_NOISE = 3.0  # times a centroid's noise: less does not matter, since every frame has many
 ORIENTATIONS = {
     (1, 0, 0, 1): None,
@@ -132,14 +145,18 @@ ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
 
 @dataclass(frozen=True, slots=True)
 class FirstLook:
-    """The result of the codes alone: each pose's map from tracker tangents to monitor px, and its rotation (poses, 4)."""
+    """The result of the codes alone: each pose's map from tracker tangents to monitor px, and
+    its rotation (poses, 4).
+    """
 
     maps: tuple[FloatArray, ...]
     q_poses: FloatArray
 
 
 def first_look(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstLook:
-    """The maps of all poses. Raises InputError for codes that match nothing, and for an image that is mirrored or turned."""
+    """The maps of all poses. Raises InputError for codes that match nothing, and for an image
+    that is mirrored or turned.
+    """
     maps = []
     for pose in range(int(seen.pose.max()) + 1):
         part = seen.at(np.flatnonzero(seen.pose == pose))
@@ -162,14 +179,18 @@ def _middle_places(plan: DotPlan) -> tuple[FloatArray, FloatArray]:
 
 
 def _rays_of(matrix: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """Unit directions (n, 3) in the tracker's axes of monitor pixels (n,), by a first map (3, 3)."""
+    """Unit directions (n, 3) in the tracker's axes of monitor pixels (n,), by a first map (3,
+    3).
+    """
     u, v = mapped(np.asarray(np.linalg.inv(matrix), dtype=np.float64), x_px, y_px)
     rays = np.column_stack([u, v, np.ones_like(u)])
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
-    """The bench file's geometry with the rotation of the first map: where a fit starts, whatever the screen is turned by."""
+    """The bench file's geometry with the rotation of the first map: where a fit starts, whatever
+    the screen is turned by.
+    """
     x_px, y_px = _middle_places(plan)
     monitor = nominal.monitor
     seen = np.column_stack((*monitor.tangents(x_px, y_px), np.ones_like(x_px)))
@@ -180,7 +201,8 @@ def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
 
 
 def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FloatArray | None:
-    """The projective map (3, 3) from tracker tangents to monitor px that most decoded dots fit; None where few fit any.
+    """The projective map (3, 3) from tracker tangents to monitor px that most decoded dots fit;
+    None where few fit any.
 
     RANSAC with samples of four (Fischler and Bolles 1981).
     """
@@ -215,7 +237,9 @@ def _why_no_map(plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng:
 
 
 def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
-    """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against what the bench file says."""
+    """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against
+    what the bench file says.
+    """
     u, v = np.array([0.0, 1e-4, 0.0]), np.array([0.0, 0.0, 1e-4])
     rays = np.column_stack([u, v, np.ones_like(u)]) @ nominal.monitor.cam_to_image.T
     seen, told = np.stack(mapped(matrix, u, v)), np.stack(nominal.monitor.project(rays))
@@ -231,7 +255,9 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
 
 
 def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> MatchedDots:
-    """Match each centroid to the lit dot nearest to it by the first maps, within what a lens may bend."""
+    """Match each centroid to the lit dot nearest to it by the first maps, within what a lens may
+    bend.
+    """
     x_px, y_px = np.full(len(seen), np.nan), np.full(len(seen), np.nan)
     u, v = nominal.tracker.tangents(seen.x_px, seen.y_px)
     for pose, matrix in enumerate(look.maps):
@@ -241,7 +267,9 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
 
 
 def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> MatchedDots:
-    """Match each centroid to the lit dot nearest to it by a fitted geometry, within `reach_px` on the monitor."""
+    """Match each centroid to the lit dot nearest to it by a fitted geometry, within `reach_px`
+    on the monitor.
+    """
     directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
     x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
     return _nearest(plan, seen, x_px, y_px, reach_px)
@@ -271,7 +299,8 @@ def refuse_motion(data: MatchedDots) -> None:
         here = data.at(np.flatnonzero(data.seen.pose == pose))
         for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
             frames, shift, noise = frame_shifts(here, places)
-            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))  # the median of few dots scatters by itself
+            # the median of few dots scatters by itself
+            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))
             if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
@@ -281,7 +310,9 @@ def refuse_motion(data: MatchedDots) -> None:
 
 
 class FrameShifts(NamedTuple):
-    """Frames (n,), how far the image of each stands from the others' (n,), and the noise of what is left; tracker px."""
+    """Frames (n,), how far the image of each stands from the others' (n,), and the noise of what
+    is left; tracker px.
+    """
 
     frames: IntArray
     shift: FloatArray

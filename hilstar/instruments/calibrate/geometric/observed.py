@@ -27,10 +27,11 @@ ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, s
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """Centroids in the tracker's image: frame, pose (0 by default) and place in tracker px, (n,) each.
+    """Centroids in the tracker's image: frame, pose (0 by default) and place in tracker px, (n,)
+    each.
 
-    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then. Nearer than `edge_px` to the
-    detector's edge no dot is measured: its window leaves the image.
+    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then.
+    Nearer than `edge_px` to the detector's edge no dot is measured: its window leaves the image.
     """
 
     frame: IntArray
@@ -77,10 +78,12 @@ def read_observed(path: Path) -> Observed:
 
 FITS_ENDINGS = (".fits", ".fit", ".fts")
 MAX_IMAGE_BYTES = 500_000_000
-SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
+# share of pixels at the image's largest possible value: a few hot pixels do not matter
+SATURATED_SHARE = 1e-5
 FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
 THRESHOLD_SIGMA = 8.0
-# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter by 0.4 px in one of 1.5 px.
+# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter
+# by 0.4 px in one of 1.5 px.
 MIN_WINDOW_SIGMA_PX = 1.5
 IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
@@ -92,8 +95,9 @@ def measure_images(
 ) -> Observed:
     """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
 
-    The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0. Raises InputError for an
-    image that cannot be read, has another size than the tracker's, or is saturated.
+    The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
+    Raises InputError for an image that cannot be read, has another size than the tracker's, or is
+    saturated.
     """
     paths_of = numbered(paths)
     under = None if dark is None else read_image(dark, resolution_px)
@@ -114,7 +118,9 @@ def dot_centroids(dot_sigma_px: float) -> CentroidSettings:
 
 
 def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
-    """Images by frame and pose, as `measure_images` takes them from their names. Raises InputError."""
+    """Images by frame and pose, as `measure_images` takes them from their names. Raises
+    InputError.
+    """
     found: dict[tuple[int, int], Path] = {}
     for path in paths:  # all names before the first image, which takes a second
         number, pose_number = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
@@ -142,14 +148,18 @@ def _centroids(
 
 
 def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE) -> FloatArray:
-    """A grey image (h, w) as float64, first row at the top, of this (width, height) if any. Raises InputError."""
+    """A grey image (h, w) as float64, first row at the top, of this (width, height) if any.
+    Raises InputError.
+    """
     return read_exposed(path, resolution_px, advice)[0]
 
 
 def read_exposed(
     path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE
 ) -> tuple[FloatArray, float | None]:
-    """A grey image as `read_image` gives it, and its exposure, s, where a FITS header says it. Raises InputError."""
+    """A grey image as `read_image` gives it, and its exposure, s, where a FITS header says it.
+    Raises InputError.
+    """
     data = read_bytes(path, advice, MAX_IMAGE_BYTES)
     exposure_s = None
     # A grabbing script may write FITS under any name.

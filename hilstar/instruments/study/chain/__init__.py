@@ -1,1 +1,3 @@
-"""The whole chain: each combination of its choices, the error that a tracker measures against the time of a frame."""
+"""The whole chain: each combination of its choices, the error that a tracker measures against
+the time of a frame.
+"""

@@ -1,9 +1,11 @@
-"""The scenes and choices of the study of the chain: five scenes, their motion and packets, the panel, and the combinations.
+"""The scenes and choices of the study of the chain: five scenes, their motion and packets, the
+panel, and the combinations.
 
-At rest all predictions are equal, and so are points and paths: one of each is measured. Where the camera turns, a crude
-prediction or smear is combined with cut sprites only: whole sprites would add time and no accuracy. An exposure sums each row's
-share of each frame of a panel that lights row by row. Each quantisation, bit stealing and sprite size has a bench of its own,
-all with the same stars.
+At rest all predictions are equal, and so are points and paths: one of each is measured. Where the
+camera turns, a crude prediction or smear is combined with cut sprites only: whole sprites would add
+time and no accuracy. An exposure sums each row's share of each frame of a panel that lights row by
+row. Each quantisation, bit stealing and sprite size has a bench of its own, all with the same
+stars.
 """
 
 import math
@@ -30,8 +32,8 @@ from hilstar.server.bench.config.sky import SpacecraftSettings
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import split_by_rate
 
-# `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by the last two, from a sender
-# that tells no rates.
+# `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by
+# the last two, from a sender that tells no rates.
 Prediction = Literal["held", "rate", "two samples"]
 PREDICTIONS: tuple[Prediction, ...] = ("rate", "two samples", "held")
 Sprite = Literal["full", "cut", "coarse"]
@@ -44,7 +46,8 @@ FIELDS = 200
 DENSE = 1  # the place of the densest field among the scenes
 SEED = 1
 ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
-# The pixels that a frame lights, as places in its flattened image (n,), and the light of each, electrons per second.
+# The pixels that a frame lights, as places in its flattened image (n,), and the light of each,
+# electrons per second.
 Lit = tuple[IntArray, FloatArray]
 START_S = 0.0037  # exposure start after a frame's first light, within a refresh
 MAX_FRAMES = 16
@@ -53,7 +56,9 @@ OWN = {"effort": "auto", "quantisation": "auto"}
 
 
 def lead_ns(config: BenchConfig) -> int:
-    """Time from the start of a frame to the first light of its middle row: a refresh to draw it in, then the panel."""
+    """Time from the start of a frame to the first light of its middle row: a refresh to draw it
+    in, then the panel.
+    """
     monitor = config.monitor
     return round((monitor.period_ms + monitor.panel_delay_ms + monitor.panel_scanout_ms / 2) * NS_PER_MS)
 
@@ -72,8 +77,9 @@ def filled_timeline(samples: list[AttitudeSample], prediction: Prediction, setti
 class Combination:
     """One choice for each step.
 
-    Depth: `bit_stealing`, and the catalogue's `faintest_v_mag`. `sprite`: `full`, `cut` as `effort = "auto"` does within the
-    bench file's tolerance, or `coarse`: the same within COARSER times that. `smear`: stars along their paths, or points.
+    Depth: `bit_stealing`, and the catalogue's `faintest_v_mag`. `sprite`: `full`, `cut` as
+    `effort = "auto"` does within the bench file's tolerance, or `coarse`: the same within COARSER
+    times that. `smear`: stars along their paths, or points.
     """
 
     quantisation: Quantisation
@@ -111,7 +117,9 @@ class ChainScene:
 
 
 def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
-    """The scenes of a bench, chosen among FIELDS random fields of its sky. Raises InputError where it has no stars."""
+    """The scenes of a bench, chosen among FIELDS random fields of its sky. Raises InputError
+    where it has no stars.
+    """
     fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
     seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
     counts = np.array([len(rates) for rates in seen])
@@ -132,9 +140,11 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PanelExposure:
-    """An exposure before a panel: its begin and length, and the frames in it by number and moment of light, ns.
+    """An exposure before a panel: its begin and length, and the frames in it by number and moment
+    of light, ns.
 
-    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are the factors of each row of a frame's light.
+    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are the factors of each row
+    of a frame's light.
     """
 
     begin_s: float
@@ -148,7 +158,9 @@ class PanelExposure:
         return round((self.begin_s + self.length_s / 2) * NS_PER_S)
 
     def mean(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
-        """The mean light (H, W) of an image of `size_px`. `light_of` gives a frame's light by number and moment of light."""
+        """The mean light (H, W) of an image of `size_px`. `light_of` gives a frame's light by
+        number and moment of light.
+        """
         width, height = size_px
         total = np.zeros(height * width)
         for number, light_ns, weight in zip(self.numbers, self.light_ns, self.weights, strict=True):
@@ -186,13 +198,15 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     begin_s = first_frame * period_s + START_S % period_s
     before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
     numbers = np.arange(first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1)
-    # How long after the middle row each row lights, (H, 1); each column of a panel that is turned, (1, W).
+    # How long after the middle row each row lights, (H, 1); each column of a panel that is turned,
+    # (1, W).
     turned = bool(scan.down[0])
     along = np.arange(size[0] if turned else size[1], dtype=np.float64)
     middle = np.full(len(along), (size[1 if turned else 0] - 1) / 2)
     late_s = scan.late_s(along, middle, size)[None, :] if turned else scan.late_s(middle, along, size)[:, None]
     lit_s = numbers[:, None, None] * period_s + late_s
-    # Weights add up to 1 over a whole number of refreshes: a panel that flashes gives a refresh's light at once.
+    # Weights add up to 1 over a whole number of refreshes: a panel that flashes gives a refresh's
+    # light at once.
     if scan.hold_s:
         overlap_s = np.minimum(lit_s + scan.hold_s, begin_s + length_s) - np.maximum(lit_s, begin_s)
         weights = np.maximum(overlap_s, 0.0) / scan.hold_s * (period_s / length_s)
@@ -205,7 +219,9 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """The combinations with a name: hilstar's defaults, `effort = "auto"`, and the bench file as it is."""
+    """The combinations with a name: hilstar's defaults, `effort = "auto"`, and the bench file as
+    it is.
+    """
 
     default: Combination
     auto: Combination

@@ -1,7 +1,9 @@
-"""The tracker's glass in the study of the chain: what each PSF in its place costs a star, against a frame's time.
+"""The tracker's glass in the study of the chain: what each PSF in its place costs a star, against a
+frame's time.
 
-The frame is the virtual tracker's in the densest field, noise and truth included. Errors are of each star in its own light,
-without noise, as the bench's centroider finds it, against the file's whole basis, integrated over pixels star by star.
+The frame is the virtual tracker's in the densest field, noise and truth included. Errors are of
+each star in its own light, without noise, as the bench's centroider finds it, against the file's
+whole basis, integrated over pixels star by star.
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,8 +45,8 @@ SEED = 1
 class GlassRow:
     """A PSF in the glass's place; its fields are the columns of `chain_psf.csv`.
 
-    Errors are rms over the `stars`, `worst_percent` the largest of light. `on_front` is that of `time_ms` and `error_arcsec`,
-    `chosen` what `[tracker] effort = "auto"` takes.
+    Errors are rms over the `stars`, `worst_percent` the largest of light. `on_front` is that of
+    `time_ms` and `error_arcsec`, `chosen` what `[tracker] effort = "auto"` takes.
     """
 
     scene: str
@@ -69,7 +71,9 @@ class GlassRow:
 
 
 def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow]:
-    """Each PSF that may stand for a bench's glass, in one scene; none where the bench has no glass, or too few stars."""
+    """Each PSF that may stand for a bench's glass, in one scene; none where the bench has no
+    glass, or too few stars.
+    """
     tracker = file.config.tracker
     whole = None if tracker.optics.psf == GAUSSIAN else tracker_psf(replace(tracker, effort="full"), file.folder)
     if not isinstance(whole, GlassPsf):
@@ -114,7 +118,9 @@ def _drawable(whole: GlassPsf) -> Iterator[tuple[str, Psf]]:
 def _errors(
     tracker: Simulator, whole: GlassPsf, found: Mapping[str, Psf], scene: ChainScene
 ) -> dict[str, tuple[int, float, float, float]]:
-    """How many stars, and how far off each PSF has them: place, rms arcsec; light, rms and most, %."""
+    """How many stars, and how far off each PSF has them: place, rms arcsec; light, rms and most,
+    %.
+    """
     reach = whole.footprint_px // 2
     rows = field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam)
     row, column = (np.floor(rows[name] + 0.5).astype(np.intp) for name in ("y_px", "x_px"))

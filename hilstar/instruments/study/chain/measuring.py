@@ -1,9 +1,11 @@
-"""Measurements of the study of the chain: error over some exposures, time in turn with all other combinations, error budget.
+"""Measurements of the study of the chain: error over some exposures, time in turn with all other
+combinations, error budget.
 
-A frame goes from the sender's samples to codes; an exposure sums the light of its frames. The budget starts from a display
-that does everything exactly and adds one step at a time, in the order of the chain. Each step is charged with the change of the
-measured stars; the steps add up to the whole error, star by star. Cut sprites come last, because codes leave the cut light
-dark: earlier it would be charged twice.
+A frame goes from the sender's samples to codes; an exposure sums the light of its frames. The
+budget starts from a display that does everything exactly and adds one step at a time, in the order
+of the chain. Each step is charged with the change of the measured stars; the steps add up to the
+whole error, star by star. Cut sprites come last, because codes leave the cut light dark: earlier it
+would be charged twice.
 """
 
 import math
@@ -26,9 +28,11 @@ from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import Stars
 
 STAGES = ("prediction", "sprites", "drawing and codes", "read-back")
-# Each frame that is timed has an attitude of its own, as a sender's have: nothing can be kept from the frame before.
+# Each frame that is timed has an attitude of its own, as a sender's have: nothing can be kept from
+# the frame before.
 NUDGE_RAD = np.array([1e-7, 1e-7, 0.0])
-FIRST_FRAMES = (20, 151, 325)  # first frames of the exposures: no whole number of cycles of `temporal` or of the jitter apart
+# first frames of the exposures: no whole number of cycles of `temporal` or of the jitter apart
+FIRST_FRAMES = (20, 151, 325)
 PHASE_STEP_PX = (3.37, 4.71)  # tracker pixels, from exposure to exposure
 SIGMAS_IN_IQR = 1.349  # normal distribution
 FRAMES_A_VISIT = 2
@@ -42,7 +46,9 @@ DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a 
 
 @dataclass(slots=True)
 class DrawingChain:
-    """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed, from samples to codes."""
+    """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed,
+    from samples to codes.
+    """
 
     combination: choices.Combination
     bench: Bench
@@ -55,11 +61,15 @@ class DrawingChain:
         return choices.filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
 
     def attitude(self, light_ns: int) -> Attitude:
-        """The attitude at a frame's light, predicted from the samples received when the frame is started."""
+        """The attitude at a frame's light, predicted from the samples received when the frame is
+        started.
+        """
         return attitude_at(self.timeline(self.movement, light_ns), light_ns)
 
     def rate(self, attitude: Attitude) -> FloatArray | None:
-        """The rate along which stars are drawn as paths, rad/s; None where they are drawn as points."""
+        """The rate along which stars are drawn as paths, rad/s; None where they are drawn as
+        points.
+        """
         return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
 
     def lit(self, number: int, light_ns: int) -> choices.Lit:
@@ -71,7 +81,9 @@ class DrawingChain:
         return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
 
     def exposed(self, seen: choices.PanelExposure) -> FloatArray:
-        """The mean light (H, W) over an exposure; at rest one frame stands for all, except with `temporal`."""
+        """The mean light (H, W) over an exposure; at rest one frame stands for all, except with
+        `temporal`.
+        """
         alike = not self.movement.turns and self.combination.quantisation != "temporal"
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
 
@@ -116,7 +128,9 @@ class DrawingChain:
 
 @dataclass(frozen=True, slots=True)
 class Rounds:
-    """How many exposures each combination is judged by, and for how long a scene's combinations are timed, s."""
+    """How many exposures each combination is judged by, and for how long a scene's combinations
+    are timed, s.
+    """
 
     exposures: int = len(FIRST_FRAMES)
     time_s: float = 12.0
@@ -127,7 +141,9 @@ QUICK = Rounds(exposures=1, time_s=0.5)
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of them as one attitude."""
+    """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of
+    them as one attitude.
+    """
 
     stars: int
     lost: int
@@ -139,7 +155,9 @@ class Error:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A frame's median time, quartile range and one sigma of the median, ms; its processor time; how many were timed."""
+    """A frame's median time, quartile range and one sigma of the median, ms; its processor time;
+    how many were timed.
+    """
 
     time_ms: float
     iqr_ms: float
@@ -150,7 +168,9 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class StageTime:
-    """The median time of a stage of a frame at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
+    """The median time of a stage of a frame at a scene's `chosen` point; its fields are the
+    columns of `chain_time.csv`.
+    """
 
     scene: str
     chosen: str
@@ -160,7 +180,8 @@ class StageTime:
 
 @dataclass(frozen=True, slots=True)
 class ErrorPart:
-    """What a step adds to the error (rms) at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`.
+    """What a step adds to the error (rms) at a scene's `chosen` point; its fields are the columns
+    of `chain_budget.csv`.
 
     The steps RSS and WHOLE are the root sum of squares of the others, and the whole error.
     """
@@ -176,10 +197,11 @@ class ErrorPart:
 class CombinationRow:
     """A combination in a scene; its fields are the columns of `chain.csv`.
 
-    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are rms over the `stars` of all
-    exposures, `lost` of them not found. `on_front` and `on_front_mag` are the fronts of `time_ms` against these two.
-    `on_front_as_filed` is the first of them among the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and
-    `prediction` of the bench file.
+    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are
+    rms over the `stars` of all exposures, `lost` of them not found. `on_front` and `on_front_mag`
+    are the fronts of `time_ms` against these two. `on_front_as_filed` is the first of them among
+    the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and `prediction` of the
+    bench file.
     """
 
     scene: str
@@ -303,8 +325,8 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
 def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[float]]:
     """The times of all chains, and the median times of STAGES, ms, of one of them.
 
-    In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
-    counted: it fills caches that the chain before has emptied.
+    In rounds, each with an order of its own, so that other load on the machine affects all. A
+    visit's first frame is not counted: it fills caches that the chain before has emptied.
     """
     for chain in chains:
         chain.frame_ms()

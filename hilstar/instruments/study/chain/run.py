@@ -1,7 +1,9 @@
-"""The study of the whole chain: a frame's error against its time for each combination of a bench's choices, in five scenes.
+"""The study of the whole chain: a frame's error against its time for each combination of a bench's
+choices, in five scenes.
 
-A combination is on the front unless another of its scene has time and error no larger, and one of them smaller; two that are
-equal in both are both on it. Figures are the table's, rounded as they stand there. `auto` is judged by the run's own noise.
+A combination is on the front unless another of its scene has time and error no larger, and one of
+them smaller; two that are equal in both are both on it. Figures are the table's, rounded as they
+stand there. `auto` is judged by the run's own noise.
 """
 
 import math
@@ -56,7 +58,8 @@ OUTPUTS = (
 
 @dataclass(frozen=True, slots=True)
 class ChainStudy:
-    """What the study says: a line for each scene, whether `auto` is on every front or within its noise, and what to do.
+    """What the study says: a line for each scene, whether `auto` is on every front or within its
+    noise, and what to do.
 
     `right` is None on a busy machine.
     """
@@ -100,10 +103,11 @@ def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
 
 
 def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[list[CombinationRow], list[CombinationRow]]:
-    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose.
+    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that
+    effort may choose.
 
-    Beyond it are those faster by more than three sigmas of the difference of the medians. Else this run cannot tell the times
-    apart, and which row is on the front is chance.
+    Beyond it are those faster by more than three sigmas of the difference of the medians. Else this
+    run cannot tell the times apart, and which row is on the front is chance.
     """
     own = rows[auto_of(rows)]
     kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
@@ -117,7 +121,9 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
 
 
 def scene_line(rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load) -> str:
-    """One scene: the choice of `auto`, its error and time, its place relative to the front, and the largest part of each."""
+    """One scene: the choice of `auto`, its error and time, its place relative to the front, and
+    the largest part of each.
+    """
     own, stands = rows[auto_of(rows)], NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
@@ -141,7 +147,9 @@ def headline(rows: Sequence[CombinationRow], load: Load) -> str:
 
 
 def standing(rows: Sequence[CombinationRow]) -> str:
-    """Whether `auto` is on the front or within its noise; else its better, the reason, and its place among effort's choices."""
+    """Whether `auto` is on the front or within its noise; else its better, the reason, and its
+    place among effort's choices.
+    """
     beyond, within = beating(rows)
     own = rows[auto_of(rows)]
     if not beyond:
@@ -215,7 +223,9 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
 
 
 def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
-    """Error against time, a panel for each scene that differs, two for a glass. Raises InputError where it cannot write."""
+    """Error against time, a panel for each scene that differs, two for a glass. Raises
+    InputError where it cannot write.
+    """
     scenes = differing(rows)
     note = f"Pale: choices that another beats. {charts.capital(machine)}."
     if any(row.on_front == "true" for row in rows):
@@ -277,7 +287,9 @@ def side_names(
 
 
 def short_words(row: CombinationRow, own: CombinationRow) -> str:
-    """A row's combination for a chart: without its sprites, and with its depth only where that differs from `own`."""
+    """A row's combination for a chart: without its sprites, and with its depth only where that
+    differs from `own`.
+    """
     shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
     moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
@@ -286,7 +298,9 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
 def draw_budget(
     path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load
 ) -> None:
-    """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
+    """Where `auto`'s error and time come from, a row of panels for each scene that differs.
+    Raises InputError.
+    """
     scenes = differing(rows)
     last = list(scenes)[-1]
     steps = [part.step for part in budget if part.scene == next(iter(scenes)) and part.step != RSS]

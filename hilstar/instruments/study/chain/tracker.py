@@ -1,8 +1,8 @@
 """Stars as the bench's virtual tracker measures them, in the sky itself and on the display.
 
-At rest the bench's own centroider finds the stars (`[verify] centroider`). A star that leaves a path is measured as the centre
-of mass of the pixels around the path, extended so that a late attitude stays within it. Light is float64 and without noise:
-detector noise is not the display's.
+At rest the bench's own centroider finds the stars (`[verify] centroider`). A star that leaves a
+path is measured as the centre of mass of the pixels around the path, extended so that a late
+attitude stays within it. Light is float64 and without noise: detector noise is not the display's.
 """
 
 import math
@@ -26,14 +26,17 @@ from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import Stars
 
-# Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6 of a star in every pixel
-# (scene/exposure_motion.py); JITTER's 37 Hz over the longest exposure are well within the minimum.
+# Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6
+# of a star in every pixel (scene/exposure_motion.py); JITTER's 37 Hz over the longest exposure are
+# well within the minimum.
 NODES_PER_SIGMA, MIN_NODES = 1.02, 24
 REACH_SIGMAS = 4.0
 LOST_SHARE = 0.1  # a star with a smaller share of its light in its pixels is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
 PATH_STEP_PX = 0.5
-OTHERS_SHARE = 1e-3  # limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by 0.05 px
+# limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by
+# 0.05 px
+OTHERS_SHARE = 1e-3
 
 
 def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
@@ -43,7 +46,9 @@ def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) 
 
 
 def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArray:
-    """The sky's own mean light (H, W) over an exposure, electrons per second, by enough instants for every star's path."""
+    """The sky's own mean light (H, W) over an exposure, electrons per second, by enough instants
+    for every star's path.
+    """
     times_s, shares = [seen.begin_s + seen.length_s / 2], [1.0]
     if movement.turns:
         path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
@@ -67,7 +72,9 @@ def linear_light(bench: Bench, sprites: Sprites) -> Lit:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredStars:
-    """The judged stars (n,) of one exposure: unit directions (n, 3) in cam, NaN where lost, and light, electrons."""
+    """The judged stars (n,) of one exposure: unit directions (n, 3) in cam, NaN where lost, and
+    light, electrons.
+    """
 
     directions: FloatArray
     light_e: FloatArray
@@ -80,7 +87,9 @@ class MeasuredStars:
 
 @dataclass(frozen=True, slots=True)
 class Off:
-    """Differences of stars (n,) between two measurements, arcsec and mag, and which stars are lost."""
+    """Differences of stars (n,) between two measurements, arcsec and mag, and which stars are
+    lost.
+    """
 
     arcsec: FloatArray
     mag: FloatArray
@@ -112,7 +121,9 @@ class StudyTracker(Closing):
 
 
 class StarJudge:
-    """One exposure of a scene: its stars that stand alone, as the tracker measures them in the sky itself."""
+    """One exposure of a scene: its stars that stand alone, as the tracker measures them in the
+    sky itself.
+    """
 
     def __init__(self, tracker: StudyTracker, movement: Movement, seen: PanelExposure) -> None:
         self.tracker, self.movement, self.seen = tracker, movement, seen
@@ -128,7 +139,8 @@ class StarJudge:
         self.sky = MeasuredStars(np.zeros((0, 3)), np.zeros(0))
         # Distance from a path within which its star's light is summed.
         self._reach_px = math.ceil(REACH_SIGMAS * max(tracker.psf.width_px)) + 1
-        # The largest delay of an attitude, and the length of a star's path, extended at both ends by that.
+        # The largest delay of an attitude, and the length of a star's path, extended at both ends
+        # by that.
         self._late_s = lead_ns(bench.config) / NS_PER_S + 1 / movement.packet_hz
         path_rad = math.radians(abs(movement.rate_deg_s)) * (seen.length_s + 2 * self._late_s)
         self._path_px = path_rad * tracker.camera.scales_px_rad()[1]
@@ -175,7 +187,9 @@ class StarJudge:
         return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
 
     def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
-        """Choose the stars whose paths (k, n), extended for a late attitude, are nearly free of other stars' light."""
+        """Choose the stars whose paths (k, n), extended for a late attitude, are nearly free of
+        other stars' light.
+        """
         reach_px = self._reach_px
         y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
         disc = (x * x + y * y <= reach_px**2).nonzero()
@@ -228,8 +242,8 @@ class StarJudge:
 def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
     """Errors of the stars of a measurement in place and light.
 
-    A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star is no better than to
-    find it late.
+    A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star
+    is no better than to find it late.
     """
     lost = shown.lost | wanted.lost
     chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
@@ -239,7 +253,9 @@ def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
 
 
 def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[float, float]:
-    """Attitude error across the boresight and about it, least squares over the found stars; NaN for fewer than two."""
+    """Attitude error across the boresight and about it, least squares over the found stars; NaN
+    for fewer than two.
+    """
     found = ~(shown.lost | wanted.lost)
     if found.sum() < 2:
         return math.nan, math.nan

@@ -1,8 +1,10 @@
-"""The benchmark: a frame's time by stage, beside other methods for the same image of the same stars, timed in turn.
+"""The benchmark: a frame's time by stage, beside other methods for the same image of the same
+stars, timed in turn.
 
-Other methods are NumPy and, where installed, numba, GalSim and photutils. Each is given the places and the light that hilstar
-found: its time has no culling and no projecting, and it makes no codes. A cell is one image size and one number of stars. They
-are the catalogue's and, where it has too few, random ones. Import and first frame are timed in fresh processes.
+Other methods are NumPy and, where installed, numba, GalSim and photutils. Each is given the places
+and the light that hilstar found: its time has no culling and no projecting, and it makes no codes.
+A cell is one image size and one number of stars. They are the catalogue's and, where it has too
+few, random ones. Import and first frame are timed in fresh processes.
 """
 
 import math
@@ -66,14 +68,15 @@ print((imported - begin) * 1e3, (drawn - imported) * 1e3, int(most_kb) / 1024)
 """
 STAGES = ("cull", "project", "erase", "upload", "splat", "encode", "read_back")
 GPU_STAGES = ("gpu_splat", "gpu_encode")
-# 10 deg/s about an axis across and along the boresight: each star is drawn along its path while its row is lit.
+# 10 deg/s about an axis across and along the boresight: each star is drawn along its path while its
+# row is lit.
 TURN_RAD_S = np.radians(10.0) * np.array([0.64, -0.74, 0.21])
 SIZES: tuple[report.Size, ...] = ((1024, 1024), report.REFERENCE_PX, (2560, 2048), (3840, 2160))
 COUNTS = (100, 1000, 10_000, 50_000)
 MAX_STARS = 200_000  # NumPy's method takes 2.9 kB of memory for each
 RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
-# What the project set itself on two cores, ms: whole frames by image and stars, Python at REFERENCE_PX by stars; how many times
-# a still frame one may take that turns by 10 deg/s.
+# What the project set itself on two cores, ms: whole frames by image and stars, Python at
+# REFERENCE_PX by stars; how many times a still frame one may take that turns by 10 deg/s.
 AIMS_MS = {(report.REFERENCE_PX, 1000): 3.5, (report.REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
 PYTHON_AIMS_MS = {1000: 0.2, 10_000: 1.0}
 TURNING_TIMES = 2.0
@@ -89,9 +92,11 @@ class BenchmarkScene:
 
 
 def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> BenchmarkScene:
-    """A scene with exactly `count` stars in view: the brightest of `every`, then random ones in and around the view.
+    """A scene with exactly `count` stars in view: the brightest of `every`, then random ones in and
+    around the view.
 
-    The random ones are as bright as random stars of the fainter half of `every`. Raises InputError where `every` is empty.
+    The random ones are as bright as random stars of the fainter half of `every`. Raises InputError
+    where `every` is empty.
     """
     if not len(every):
         raise InputError("bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag")
@@ -131,7 +136,9 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
 
 
 def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
-    """The methods that are installed here, imported and compiled; and by name the remedy for each of the others."""
+    """The methods that are installed here, imported and compiled; and by name the remedy for
+    each of the others.
+    """
     found: dict[str, Draw] = {}
     missing: dict[str, str] = {}
     for name, _, make in METHODS:
@@ -140,14 +147,18 @@ def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
         except ImportError as error:
             missing[name] = f"not installed ({error}): {INSTALL}"
             continue
-        with held():  # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and lost
+        # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and
+        # lost
+        with held():
             draw(FIRST, (0.85, 0.85), (8, 8))
         found[name] = draw
     return found, missing
 
 
 def numpy_linear(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
-    """The baseline: separable erf differences and np.add.at. float32 (height, width), electrons per second."""
+    """The baseline: separable erf differences and np.add.at. float32 (height, width), electrons
+    per second.
+    """
     image = np.zeros(shape, np.float32)
     steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     columns = sprites.data["pixel"][:, :1] + steps
@@ -166,7 +177,9 @@ def _shares(pixels: IntArray, centre_px: FloatArray, sigma_px: float) -> FloatAr
 
 
 def _add_stars(image: Any, first: Any, centre_px: Any, electrons_per_s: Any, scale: Any, size: int) -> None:
-    """The plain loop that numba compiles: `first` (n, 2) is each footprint's first pixel, `scale` is 1 / (sigma sqrt 2)."""
+    """The plain loop that numba compiles: `first` (n, 2) is each footprint's first pixel,
+    `scale` is 1 / (sigma sqrt 2).
+    """
     height, width = image.shape
     share = np.empty((2, size))
     for k in range(len(first)):
@@ -259,7 +272,9 @@ def this_machine() -> report.Machine:
 
 
 class CellMeasurement(Closing):
-    """One image size and star count, measured into `result`; close it to free its two GL contexts."""
+    """One image size and star count, measured into `result`; close it to free its two GL
+    contexts.
+    """
 
     def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result) -> None:
         self.bench, self.q, self.result = bench, q_icrs_to_cam, result
@@ -301,13 +316,16 @@ class CellMeasurement(Closing):
         rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "turning", "linear_only")]
         for kind in (*STAGES, *GPU_STAGES):
             if stage_ms := self.stage_ms.get(kind):
-                rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))  # without the first turn, as in `interleaved`
+                # without the first turn, as in `interleaved`
+                rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))
         rows += [(name, "linear_only", times) for name, times in times_ms.items()]
         for method, kind, times in rows:
             self.result.rows.append(report.MethodTiming(*self.cell_key, method, kind, _spread(times)))
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
-        """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
+        """Why a method is skipped here: its time for all stars, estimated from that for one star
+        and for a hundred more.
+        """
         if len(self.sprites) <= 101:
             return None
 
@@ -353,7 +371,8 @@ class CellMeasurement(Closing):
 
 
 def interleaved(works: dict[str, Callable[[], object]], rounds: int, budget_s: float) -> dict[str, list[float]]:
-    """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within `budget_s` each.
+    """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within
+    `budget_s` each.
 
     The first turn counts only where no other fits.
     """
@@ -379,7 +398,8 @@ def _spread(times_ms: list[float]) -> report.Spread:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkPlan:
-    """What to measure: image sizes (px), star counts, and the maximum rounds and seconds of a method in one cell.
+    """What to measure: image sizes (px), star counts, and the maximum rounds and seconds of a
+    method in one cell.
 
     `file` replaces the benchmark's own bench file; `sizes` is then that file's image size.
     """
@@ -397,7 +417,9 @@ QUICK = BenchmarkPlan(sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30
 
 
 def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> report.Result:
-    """Measure every cell of a plan; `advance` hears how many are done. Raises InputError, MachineError."""
+    """Measure every cell of a plan; `advance` hears how many are done. Raises InputError,
+    MachineError.
+    """
     methods, missing = other_methods()
     others = OtherWork()
     result = report.Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
@@ -431,7 +453,9 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
 
 
 def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFile:
-    """The benchmark's own bench file for an image size, written to `path`; `render` are further keys of [render]."""
+    """The benchmark's own bench file for an image size, written to `path`; `render` are further
+    keys of [render].
+    """
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "sky": {"faintest_v_mag": 14},

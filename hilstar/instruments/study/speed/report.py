@@ -54,7 +54,9 @@ class Cell(ImageSize):
 
 @dataclass(frozen=True, slots=True)
 class MethodTiming(Cell):
-    """How long a method takes in a cell; `kind` is the whole frame, the linear image alone or a stage of hilstar's."""
+    """How long a method takes in a cell; `kind` is the whole frame, the linear image alone or a
+    stage of hilstar's.
+    """
 
     method: str
     kind: str
@@ -78,7 +80,9 @@ class SceneOrigin(Cell):
 
 @dataclass(frozen=True, slots=True)
 class Agreement(Cell):
-    """The largest difference of a method's linear image from hilstar's, as a share of hilstar's brightest pixel."""
+    """The largest difference of a method's linear image from hilstar's, as a share of hilstar's
+    brightest pixel.
+    """
 
     method: str
     worst_of_peak: float
@@ -106,7 +110,9 @@ class ProcessStart(ImageSize):
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """A time that the project set itself, and whether this run reached it; None on a busy machine."""
+    """A time that the project set itself, and whether this run reached it; None on a busy
+    machine.
+    """
 
     what: str
     aim_ms: float
@@ -116,7 +122,9 @@ class Aim:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Where the times were taken; `load` is the average of the last minute before, which is in the times too."""
+    """Where the times were taken; `load` is the average of the last minute before, which is in
+    the times too.
+    """
 
     cpu: str
     cores: int
@@ -205,7 +213,9 @@ def _notes(result: Result) -> Iterator[str]:
 
 
 def write(result: Result, folder: Path) -> None:
-    """Write bench.csv, tracker.csv and the chart into `folder`. Raises InputError where they cannot be written."""
+    """Write bench.csv, tracker.csv and the chart into `folder`. Raises InputError where they
+    cannot be written.
+    """
     columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
     for name, rows in (("bench.csv", result.rows), ("tracker.csv", result.tracker)):
         table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in rows]
@@ -247,7 +257,9 @@ def _finding(result: Result) -> str:
 
 
 def _named(rows: Sequence[MethodTiming]) -> dict[str, dict[int, float]]:
-    """Medians by star count of each line of the table, hilstar's stages indented under the whole frame."""
+    """Medians by star count of each line of the table, hilstar's stages indented under the whole
+    frame.
+    """
     named: dict[str, dict[int, float]] = {}
     for wanted in (True, False):
         for row in rows:

@@ -1,7 +1,9 @@
-"""The virtual tracker's processor times: an exposure, its stars found, a case, a field of `verify`; other programs in turn.
+"""The virtual tracker's processor times: an exposure, its stars found, a case, a field of `verify`;
+other programs in turn.
 
-Each exposure has 1024 x 1024 pixels and all noise. Peers are given hilstar's expected image, so their times have no sky and no
-drawing: NumPy's and GalSim's noise beside the whole exposure, and the finders of photutils and sep on hilstar's own DN.
+Each exposure has 1024 x 1024 pixels and all noise. Peers are given hilstar's expected image, so
+their times have no sky and no drawing: NumPy's and GalSim's noise beside the whole exposure, and
+the finders of photutils and sep on hilstar's own DN.
 """
 
 import os
@@ -98,7 +100,9 @@ class Exposing:
 
 
 def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list[Skipped]]:
-    """Processor times of each work in turn, and the peers that are not installed. Raises InputError, MachineError."""
+    """Processor times of each work in turn, and the peers that are not installed. Raises
+    InputError, MachineError.
+    """
     unset = [name for name in OWN_THREADS if name not in os.environ]
     file = read_bench_file(resource_path("configs", "demo.toml"))
     skipped: list[Skipped] = []

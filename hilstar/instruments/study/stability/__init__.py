@@ -1,7 +1,8 @@
 """Where methods fail, and hilstar's way there: each case compares two methods by one measure.
 
-Cases that draw are measured by `hilstar study stability` where it runs (`image.py`). Mathematics is the same on every machine:
-tests/authority measures those cases with every commit, and the tables beside this file have their figures.
+Cases that draw are measured by `hilstar study stability` where it runs (`image.py`). Mathematics is
+the same on every machine: tests/authority measures those cases with every commit, and the tables
+beside this file have their figures.
 """
 
 import csv
@@ -13,7 +14,9 @@ COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """One measure of two methods, in the unit of `tolerance`: `error` is hilstar's, `fault` that of the failing method."""
+    """One measure of two methods, in the unit of `tolerance`: `error` is hilstar's, `fault` that
+    of the failing method.
+    """
 
     error: float
     fault: float

@@ -1,7 +1,8 @@
-"""Where methods fail between sprites and codes: narrow and wide stars, edges, crowds, popping, uneven and coarse panels.
+"""Where methods fail between sprites and codes: narrow and wide stars, edges, crowds, popping,
+uneven and coarse panels.
 
-Each case draws, so that its figures are those of the machine that runs it. Popping is one star's light from frame to frame
-while the camera turns slowly.
+Each case draws, so that its figures are those of the machine that runs it. Popping is one star's
+light from frame to frame while the camera turns slowly.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,18 +35,22 @@ from hilstar.sky.stars import make_stars, unit_vectors_icrs
 IMAGE_PX = (512, 512)
 SIGMA_PX = 0.85
 SEED = 1
-# The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of two.
+# The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of
+# two.
 ERF_ERROR = 4.4e-7
-# The footprint cuts MAX_CUT of a star's light, and the outermost edges along both axes are off by ERF_ERROR.
+# The footprint cuts MAX_CUT of a star's light, and the outermost edges along both axes are off by
+# ERF_ERROR.
 FLUX_ERROR = MAX_CUT + 2 * ERF_ERROR
 # The share of the peak along an axis is 1 / (sqrt(2 pi) 20) at sigma 20, and there are two axes.
 PEAK_ERROR = 2 * ERF_ERROR * float(np.sqrt(2 * np.pi)) * 20
 CENTROID_PX = 1.1e-5  # README.md promises it of the linear image
 NOTHING = 0.0
 CROWD, CROWD_PX, CORNER_PX = 100_000, (1024, 1024), 128
-# Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own error.
+# Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own
+# error.
 CROWD_ERROR = FLUX_ERROR + 10 * 6e-8
-# Popping: the demo's lens and pitch (configs/demo.toml), and a star that moves by PATH_PX in STEPS frames.
+# Popping: the demo's lens and pitch (configs/demo.toml), and a star that moves by PATH_PX in STEPS
+# frames.
 FOCAL_LENGTH_MM, PITCH_UM, ALIGNED = 350.0, 57.65, np.array([1.0, 0.0, 0.0, 0.0])
 STEPS, PATH_PX, MOVING_PX = 1000, (3.0, 1.7), (32, 32)
 RIPPLE = 1e-4  # mag, a two-hundredth of the finest aim for codes: larger ripples are the monitor's
@@ -64,12 +69,14 @@ ERF_DENOMINATOR = (
 
 Draw = Callable[[Sprites], FloatArray]
 CODES_SEED = 6
-COUNT, TILE_PX = 8, 22  # groups of stars along either side of the image, and the side of each one's part of it
+# groups of stars along either side of the image, and the side of each one's part of it
+COUNT, TILE_PX = 8, 22
 SIDE_PX = COUNT * TILE_PX
 WHITE = 1.0
 FAINT_MAG = 6.0  # under the star whose peak is white
 NARROW_PX = 0.3
-# A star of equal steps can have its light within half of one and no nearer; where steps differ it comes nearer than that.
+# A star of equal steps can have its light within half of one and no nearer; where steps differ it
+# comes nearer than that.
 STEPS_A_STAR = 0.5
 # A star of so few pixels, lit by codes whose steps are several of the smallest.
 NARROW_STEPS = 0.6
@@ -101,7 +108,9 @@ def by_renderer(on: Target) -> Iterator[Draw]:
 
 
 def _outer(on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]) -> FloatArray:
-    """One star's image from its shares along each axis, by a pixel's offset from it and sigma, px."""
+    """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
+    px.
+    """
     places = zip((sprites.x_px[0], sprites.y_px[0]), on.resolution_px, on.psf.width_px, strict=True)
     along_x, along_y = (shares(np.arange(size) - at, sigma_px) for at, size, sigma_px in places)
     return np.asarray(float(sprites.data["electrons_per_s"][0]) * np.outer(along_y, along_x))
@@ -144,7 +153,8 @@ def erf_float32(value: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class PhaseErrors:
-    """The largest errors over sub-pixel phases of a star's flux, relative, and of its centre of gravity, px.
+    """The largest errors over sub-pixel phases of a star's flux, relative, and of its centre of
+    gravity, px.
 
     `peak` is that of its middle pixel's light, relative to the true share and with its sign.
     """
@@ -357,7 +367,9 @@ def flux_range() -> FailureCase:
 
 
 def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
-    """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star has moved by PATH_PX."""
+    """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star
+    has moved by PATH_PX.
+    """
     sirius = load_catalog().brighter_than(-1.0)
     vectors = unit_vectors_icrs(sirius, HIPPARCOS_EPOCH_JYEAR)
     stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))
@@ -555,7 +567,9 @@ def uneven_panel() -> CodeScene:
 
 
 def spilled(case: str, scene: CodeScene) -> FailureCase:
-    """The largest excess of a pixel's light: error diffusion hands light over white to neighbours."""
+    """The largest excess of a pixel's light: error diffusion hands light over white to
+    neighbours.
+    """
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
     diffused = diffused_light(scene.linear()[corner], scene.panel.response) - wanted[corner]
@@ -571,7 +585,9 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
 
 
 def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
-    """A panel's light of an image (h, w) by error diffusion: each pixel hands its error to the next and to those below."""
+    """A panel's light of an image (h, w) by error diffusion: each pixel hands its error to the
+    next and to those below.
+    """
     height, width = linear.shape
     left = np.zeros((height + 1, width + 2))
     left[:height, 1:-1] = linear / WHITE

@@ -1,4 +1,6 @@
-"""Where methods fail: each case with the failing method, its error, hilstar's way and the reason; charts of curves."""
+"""Where methods fail: each case with the failing method, its error, hilstar's way and the
+reason; charts of curves.
+"""
 
 from collections.abc import Callable
 from dataclasses import astuple
@@ -13,7 +15,8 @@ from hilstar.basics.files import write_whole
 from hilstar.basics.units import magnitude
 from hilstar.instruments.study.stability import COLUMNS, FailureCase, image, recorded
 
-# In the order of the light's way, between the recorded cases of catalogue and geometry and those of detector and attitude.
+# In the order of the light's way, between the recorded cases of catalogue and geometry and those of
+# detector and attitude.
 DRAWN: tuple[Callable[[], FailureCase], ...] = (
     *(image.narrow_star, image.wide_star, image.negative_wings, image.floored_wings, image.absurd_sigmas),
     *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
@@ -23,7 +26,9 @@ DRAWN: tuple[Callable[[], FailureCase], ...] = (
 
 
 def run(directory: Path) -> list[FailureCase]:
-    """Measure the cases that are drawn, and write `stability.csv` and the charts; all cases in order. Raises InputError."""
+    """Measure the cases that are drawn, and write `stability.csv` and the charts; all cases in
+    order. Raises InputError.
+    """
     drawn = [measure() for measure in DRAWN]
     cases = [*recorded("catalogue_and_geometry"), *drawn, *recorded("detector_and_attitude")]
     write_csv(directory / "stability.csv", COLUMNS, [case.row() for case in cases])
@@ -67,7 +72,9 @@ def narrow_sigmas(directory: Path) -> None:
 
 
 def narrow_finding(sigmas_px: FloatArray, ours: FloatArray, sampled: FloatArray) -> str:
-    """From which sigma (n,) on sampling places a star nearer, and its middle pixel; errors (3, n)."""
+    """From which sigma (n,) on sampling places a star nearer, and its middle pixel; errors (3,
+    n).
+    """
     nearer = sampled[1] < ours[1]
     if not nearer.any():
         every = f"at every sigma to {sigmas_px[-1]:g} px"

@@ -1,4 +1,6 @@
-"""Trade-offs of light: brightness integral, spectrum from colours, PSF, quantisation, depth of the catalogue."""
+"""Trade-offs of light: brightness integral, spectrum from colours, PSF, quantisation, depth of
+the catalogue.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -41,7 +43,8 @@ STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
 DEGREES = (5, 10, 20, electrons.TABLE_DEGREE)
 BV_TABLE_SIZES = (16, 128, 1024)
-# quad_vec is asked for this, relative to the largest of all stars' integrals, each near 1 by its own scale.
+# quad_vec is asked for this, relative to the largest of all stars' integrals, each near 1 by its
+# own scale.
 QUAD = 1e-12
 # Two float64 integrals of some hundred terms, each known to about 1e-13, and QUAD's own.
 PHOTOMETRY_ROUNDING_MAG = 5e-12
@@ -53,9 +56,11 @@ OWN_SPECTRUM = "each star's own spectrum"
 LIBRARY_MAG = 1e-3
 PSF_PHASES = 16
 SIZES_PX = (6, 8, 9, 10, 11, 12, 16, 24)
-# Wider than every sprite here, so that no tile of the phases loses light to its neighbour: 13 px are 15 sigma.
+# Wider than every sprite here, so that no tile of the phases loses light to its neighbour: 13 px
+# are 15 sigma.
 TILE_PX = 26
-# Two stars' brightnesses: white, and 8 magnitudes under it, as faint as a 10-bit monitor is asked to show.
+# Two stars' brightnesses: white, and 8 magnitudes under it, as faint as a 10-bit monitor is asked
+# to show.
 FAINTER_MAG = 8.0
 SMALL_SIGMA_PX = 0.4
 TABLE_SIZES = (64, 512, 4096)
@@ -67,7 +72,9 @@ LIMITS_V_MAG = (5.0, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 10.0)
 
 
 def brightness(stack: ExitStack, quick: bool) -> Trials:
-    """The integral of black bodies through a sensor: error, mag, worst over COLOURS of the catalogue and at the median one."""
+    """The integral of black bodies through a sensor: error, mag, worst over COLOURS of the
+    catalogue and at the median one.
+    """
     del stack, quick
     # Equal shares of the catalogue, the bluest and the reddest star among them.
     bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
@@ -119,7 +126,9 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
 
 
 def adaptive_rates(kelvin: FloatArray, optics: electrons.Optics) -> FloatArray:
-    """Electron rates of V = 0 black bodies (n,) by adaptive quadrature between the curves' knots."""
+    """Electron rates of V = 0 black bodies (n,) by adaptive quadrature between the curves'
+    knots.
+    """
 
     def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
         knots = shared_knots(*curves)
@@ -134,7 +143,9 @@ def adaptive_rates(kelvin: FloatArray, optics: electrons.Optics) -> FloatArray:
 
 
 def _rates(kelvin: FloatArray, optics: electrons.Optics, integral: Callable[..., FloatArray]) -> FloatArray:
-    """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one tolerance fits all stars."""
+    """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one
+    tolerance fits all stars.
+    """
     passband, curves = load_curve("johnson-v", "johnson-v"), (optics.quantum_efficiency, optics.transmission)
     scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin[:, None])
 
@@ -149,7 +160,9 @@ def _rates(kelvin: FloatArray, optics: electrons.Optics, integral: Callable[...,
 
 
 def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
-    """Nodes, nm, and weights, m, of the trapezoid rule over the curves' range in steps of at most `step_nm`."""
+    """Nodes, nm, and weights, m, of the trapezoid rule over the curves' range in steps of at
+    most `step_nm`.
+    """
     knots = shared_knots(*curves)
     nodes = np.linspace(knots[0], knots[-1], int(np.ceil((knots[-1] - knots[0]) / step_nm)) + 1)
     weight = np.full(len(nodes), nodes[1] - nodes[0])
@@ -158,7 +171,9 @@ def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
 
 
 def gauss(order: int, *curves: Curve) -> tuple[FloatArray, FloatArray]:
-    """Nodes, nm, and weights, m, of Gauss-Legendre quadrature between every two knots of the curves."""
+    """Nodes, nm, and weights, m, of Gauss-Legendre quadrature between every two knots of the
+    curves.
+    """
     at, weight = np.polynomial.legendre.leggauss(order)
     knots = shared_knots(*curves)
     half = np.diff(knots)[:, None] / 2
@@ -173,7 +188,9 @@ def shared_knots(*curves: Curve) -> FloatArray:
 
 
 def spectrum(stack: ExitStack, quick: bool) -> Trials:
-    """Spectra from colours: error, mag, 95 % and median of the Pickles library bluer than V-I = 2.5."""
+    """Spectra from colours: error, mag, 95 % and median of the Pickles library bluer than V-I =
+    2.5.
+    """
     del stack, quick
     library, optics = electrons.load_library(), study_optics(SENSOR)
     exact, zero = (
@@ -219,7 +236,9 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
 
 
 def psf(stack: ExitStack, quick: bool) -> Trials:
-    """Methods that spread a star over pixels: flux error, mag, and centroid error, px, over PSF_PHASES^2 phases."""
+    """Methods that spread a star over pixels: flux error, mag, and centroid error, px, over
+    PSF_PHASES^2 phases.
+    """
     del quick  # every error is found in one draw
     side = PSF_PHASES * TILE_PX
     errors = _psf_errors(TILE_PX, lambda sprites: linear_image(sprites, (side, side), SPRITE_PSF))
@@ -268,7 +287,9 @@ def splat_variants() -> dict[str, SplatVariant]:
 
 
 def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[float, float]:
-    """Worst flux error, mag, and centroid error, px, of stars of a footprint, as `image` draws them."""
+    """Worst flux error, mag, and centroid error, px, of stars of a footprint, as `image` draws
+    them.
+    """
     side = PSF_PHASES * TILE_PX
     place = (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
@@ -280,7 +301,9 @@ def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[f
 
 
 def quantisation(stack: ExitStack, quick: bool) -> Trials:
-    """From light to codes at the default depth: flux error, mag, and centroid error, px, of a star at its aim's faint end."""
+    """From light to codes at the default depth: flux error, mag, and centroid error, px, of a
+    star at its aim's faint end.
+    """
     del quick  # every error is found at once
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
     mag, stealing, trials = AIMS[bits][1], RenderSettings().bit_stealing, []
@@ -311,7 +334,9 @@ def _codes(renderer: Renderer, field: Sprites, numbers: Iterator[int]) -> None:
 
 
 def depth(stack: ExitStack, quick: bool) -> Trials:
-    """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in the field."""
+    """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in
+    the field.
+    """
     del quick
     config, camera = demo_config(), ideal_monitor(demo_config())
     every = stars_to(NO_LIMIT_V_MAG)

@@ -1,4 +1,6 @@
-"""Trade-offs of place: culling, projection, smear along a turning star's path, prediction; on the demo's bench."""
+"""Trade-offs of place: culling, projection, smear along a turning star's path, prediction; on
+the demo's bench.
+"""
 
 import math
 from collections.abc import Callable
@@ -76,13 +78,17 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
 
 
 def random_turns(count: int, camera: Camera) -> list[FloatArray]:
-    """ICRS to image axes, (3, 3) each, at attitudes of which any is as likely as any other; ORION is the first."""
+    """ICRS to image axes, (3, 3) each, at attitudes of which any is as likely as any other;
+    ORION is the first.
+    """
     drawn = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
     return [turn_to_image(q, camera) for q in (ORION, *drawn)]
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
-    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars tested that are not in view."""
+    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars
+    tested that are not in view.
+    """
     del stack
     camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(10 if quick else ATTITUDES, camera)
@@ -148,7 +154,9 @@ def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> 
 
 
 def projection(stack: ExitStack, quick: bool) -> Trials:
-    """Where stars fall, by the precision of it all: error, px, worst and rms over the stars of ATTITUDES random fields."""
+    """Where stars fall, by the precision of it all: error, px, worst and rms over the stars of
+    ATTITUDES random fields.
+    """
     del stack
     camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(6 if quick else ATTITUDES, camera)
@@ -175,13 +183,17 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """From directions to sprites: the precision of the mathematics, and the layout of the sprites."""
+    """From directions to sprites: the precision of the mathematics, and the layout of the
+    sprites.
+    """
 
     kind: type[np.floating[Any]]
     dtype: np.dtype[np.void]
 
     def pack(self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera) -> tuple[npt.NDArray[np.void], IntArray]:
-        """Sprites of stars of one electron per second, in the layout, and which of `vectors` (n, 3) they are."""
+        """Sprites of stars of one electron per second, in the layout, and which of `vectors`
+        (n, 3) they are.
+        """
         kind = self.kind
         x, y, z = (vectors.astype(kind, copy=False) @ icrs_to_image.T.astype(kind)).T
         scale = kind(camera.focal_length_px) / z
@@ -231,7 +243,8 @@ EVENLY = (4, 8, 16, 32, 64)
 GAUSS = (8, 16, 24, 32)
 # 200 nodes on 28 sigmas at most: six times as many as the module's rule asks for.
 EXACT_NODES = 200
-# Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21 sigma on either side.
+# Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21
+# sigma on either side.
 WIDE_PX = 24
 STARS_ACROSS = 16
 # float32 fluxes and fractions of the sprites: 6e-8 of each.
@@ -242,7 +255,9 @@ SpritesOf = Callable[[Stars], Sprites]
 
 
 def smear(stack: ExitStack, quick: bool) -> Trials:
-    """Sprites on a turning star's path: worst pixel, share of the star's flux, and centroid, px, over a grid of stars."""
+    """Sprites on a turning star's path: worst pixel, share of the star's flux, and centroid, px,
+    over a grid of stars.
+    """
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
     motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
     few, many = grid_stars(across, motion), grid_stars(STARS_ACROSS, motion)
@@ -286,7 +301,9 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
 
 
 def grid_stars(across: int, motion: Motion) -> Stars:
-    """Stars of one electron per second, across^2 of them evenly over the detector in the middle of the exposure."""
+    """Stars of one electron per second, across^2 of them evenly over the detector in the middle
+    of the exposure.
+    """
     place = (np.arange(across) + 0.5) * SIZE_PX / across - 0.5
     x_px, y_px = (axis.ravel() - (SIZE_PX - 1) / 2 for axis in np.meshgrid(place, place))
     image = np.column_stack([x_px, y_px, np.full(across**2, CAMERA.focal_length_px)])
@@ -312,7 +329,9 @@ def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray
 
 
 def prediction(stack: ExitStack, quick: bool) -> Trials:
-    """The attitude at the moment of light, after the newest sample: worst and rms error, arcsec, on a shaken slew."""
+    """The attitude at the moment of light, after the newest sample: worst and rms error, arcsec,
+    on a shaken slew.
+    """
     del stack
     samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)]
     frames_ns = (np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns).tolist()

@@ -1,4 +1,6 @@
-"""For each step of the chain: every method against the exact one, error against time, on the machine at hand."""
+"""For each step of the chain: every method against the exact one, error against time, on the
+machine at hand.
+"""
 
 import os
 from collections.abc import Callable
@@ -22,7 +24,8 @@ STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     *(culling, projection, prediction, smear),
     *(psf, quantisation),
 )
-# Time for the rounds of one step, s: 30 s in all with --quick, five minutes without, set-up and charts included.
+# Time for the rounds of one step, s: 30 s in all with --quick, five minutes without, set-up and
+# charts included.
 QUICK_BUDGET_S, BUDGET_S = 0.8, 25.0
 COLUMNS = (
     *("step", "work", "method", "error", "error_unit", "error_is", "second", "second_unit", "second_is"),
@@ -33,7 +36,8 @@ MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
-    """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a person.
+    """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a
+    person.
 
     A step that was timed on a busy machine has no front: its `front` and `beaten_by` are empty.
     """
@@ -99,7 +103,9 @@ def said(value: float, figure: Figure) -> str:
 
 
 def draw(path: Path, step: Trials, machine: str) -> None:
-    """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
+    """Draw error against time on logarithmic axes: the front as a line, the default ringed,
+    every method named at the side.
+    """
     floor, own = step.error.floor, step.default
     shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.trials}
     dotted = f" Dotted: {said(floor, step.error)}, no error below it." if floor else ""

@@ -1,6 +1,7 @@
 """The bench file: TOML in, checked and frozen tables out.
 
-Each key's type, limits, default and meaning stand once, in the class of its table; docs/bench-file.md is made from them.
+Each key's type, limits, default and meaning stand once, in the class of its table;
+docs/bench-file.md is made from them.
 """
 
 from hilstar.server.bench.config.answers import AnswersSettings

@@ -36,7 +36,9 @@ class FrameField(Table, frozen=True):
 
 
 class FrameLength(Table, frozen=True):
-    """A field that says how long its frame is: raw + add bytes, from the frame's first to its last."""
+    """A field that says how long its frame is: raw + add bytes, from the frame's first to its
+    last.
+    """
 
     at: Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)]
     type: str = "u8"
@@ -51,75 +53,93 @@ class FrameMatch(Table, frozen=True):
 
 
 class AnswersSettings(Table, frozen=True):
-    """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md))."""
+    """Where the answers of the star tracker come from, and what their bytes mean (see
+    [answers](answers.md)).
+    """
 
-    #: The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something appends: what is appended after
-    #: the start counts.
+    #: The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something
+    #: appends: what is appended after the start counts.
     source: Literal["serial", "udp", "tcp", "zmq", "file"]
-    #: `"packet"`: hilstar's own (kind 5), as COBS frames over serial lines, TCP and files. `"json"`: an object a line or a
-    #: message. `"frame"`: the tracker's own telemetry, declared by the keys below. `"python:MODULE:FUNCTION"`: bytes in,
-    #: answers out.
+    #: `"packet"`: hilstar's own (kind 5), as COBS frames over serial lines, TCP and files.
+    #: `"json"`: an object a line or a message. `"frame"`: the tracker's own telemetry, declared by
+    #: the keys below. `"python:MODULE:FUNCTION"`: bytes in, answers out.
     format: Annotated[str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})] = "packet"
-    #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's folder (see
+    #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's
+    #: folder (see
     #: [what runs](what-runs.md)).
     trust: Annotated[tuple[str, ...], Meta(extra={"form": '["PACKAGE", ...]'})] = ()
-    #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`, another way to write `bind`.
-    #: Default: `tcp://127.0.0.1:5562` for ZeroMQ
+    #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`,
+    #: another way to write `bind`. Default: `tcp://127.0.0.1:5562` for ZeroMQ
     endpoint: str | None = None
-    #: ZeroMQ: `true` when hilstar binds. UDP: the address and port listened on. Default: `false`; `"127.0.0.1:5562"` over UDP
+    #: ZeroMQ: `true` when hilstar binds. UDP: the address and port listened on. Default: `false`;
+    #: `"127.0.0.1:5562"` over UDP
     bind: bool | str | None = None
-    #: TCP: the tracker's `"HOST:PORT"`. UDP: the same, where the tracker has to be asked (`poll_hex`). Default: none
+    #: TCP: the tracker's `"HOST:PORT"`. UDP: the same, where the tracker has to be asked
+    #: (`poll_hex`). Default: none
     connect: str | None = None
     listen: str | None = None  #: TCP: where hilstar listens, `"ADDRESS:PORT"`. Default: none
-    path: str | None = None  #: File: its path, relative to the bench file. Default: none; required for file
-    #: UDP, and TCP with `listen`: who may send: addresses and networks. Default: this machine; required where the address is
-    #: not loopback
+    #: File: its path, relative to the bench file. Default: none; required for file
+    path: str | None = None
+    #: UDP, and TCP with `listen`: who may send: addresses and networks. Default: this machine;
+    #: required where the address is not loopback
     allow: Annotated[tuple[str, ...], Meta(extra={"form": '["ADDRESS", ...]'})] = ()
-    curve_secret_key: str | None = None  #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    curve_secret_key: str | None = None
     #: ZeroMQ: the file of the binding side's public key, when hilstar connects. Default: none
     curve_server_key: str | None = None
-    allowed_clients: str | None = None  #: ZeroMQ: the directory with the public keys that may connect. Default: none
-    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default: none; required for serial
+    #: ZeroMQ: the directory with the public keys that may connect. Default: none
+    allowed_clients: str | None = None
+    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default:
+    #: none; required for serial
     port: str | int = ""
     baud: Annotated[int, Meta(ge=1, le=12_000_000)] = 115_200  #: Serial: the speed, 8N1.
     #: What is sent to a tracker that answers only when it is asked, in hexadecimal. Default: none
     poll_hex: Annotated[HexBytes | None, Meta(extra={"form": '"55 AA 01 ..."'})] = None
     poll_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 10.0  #: How often that is sent.
     convention: Convention = HILSTARS
-    #: Where in the exposure the tracker's stamp stands: in its `"middle"`, at its `"start"` or `"end"`. `"arrival"`: it is not
-    #: used, or there is none.
+    #: Where in the exposure the tracker's stamp stands: in its `"middle"`, at its `"start"` or
+    #: `"end"`. `"arrival"`: it is not used, or there is none.
     stamp: Literal["middle", "start", "end", "arrival"] = "middle"
-    #: The stamps' clock. `"own"`: the tracker's, fitted from the answers. `"unix"`: UTC since 1970, of a tracker that PTP or
-    #: NTP disciplines. `"host"`: this machine's monotonic clock.
+    #: The stamps' clock. `"own"`: the tracker's, fitted from the answers. `"unix"`: UTC since 1970,
+    #: of a tracker that PTP or NTP disciplines. `"host"`: this machine's monotonic clock.
     clock: Literal["own", "unix", "host"] = "own"
-    #: How much later than the middle of its exposure an answer comes, where it is known. Default: fitted
+    #: How much later than the middle of its exposure an answer comes, where it is known. Default:
+    #: fitted
     latency_ms: NotNegative | None = None
-    wrong_arcsec: Positive = 3600.0  #: An answer further than this from what was lit is a wrong one.
-    #: How frames are told apart. `"sync"`: by `sync_hex`. `"slip"` (RFC 1055), `"cobs"`. `"fixed"`: each as long as `length`.
-    #: `"ccsds"`: Space Packets (133.0-B), by the length in their header. Default: none; required for frame
+    #: An answer further than this from what was lit is a wrong one.
+    wrong_arcsec: Positive = 3600.0
+    #: How frames are told apart. `"sync"`: by `sync_hex`. `"slip"` (RFC 1055), `"cobs"`. `"fixed"`:
+    #: each as long as `length`. `"ccsds"`: Space Packets (133.0-B), by the length in their header.
+    #: Default: none; required for frame
     framing: Literal["sync", "slip", "cobs", "fixed", "ccsds"] | None = None
     #: The bytes with which a frame begins. Default: none
     sync_hex: Annotated[HexBytes | None, Meta(extra={"form": '"1A CF"'})] = None
-    #: Bytes of a frame, sync and checksum among them; or the field that says it, `{ at = 2, type = "u8", add = 5 }`: raw + add.
-    #: Default: none; required for sync and fixed
+    #: Bytes of a frame, sync and checksum among them; or the field that says it, `{ at = 2, type =
+    #: "u8", add = 5 }`: raw + add. Default: none; required for sync and fixed
     length: Annotated[
         Annotated[int, Meta(ge=1, le=MAX_FRAME_BYTES)] | FrameLength | None,
         Meta(extra={"form": 'N or { at = N, type = "u8", add = N }'}),
     ] = None
-    #: A frame's checksum: `"crc16-ccitt-false"`, `"crc16-xmodem"`, `"crc32"`, `"sum8"`, `"xor8"`. With `"none"` a damaged frame
-    #: may be taken for an answer.
+    #: A frame's checksum: `"crc16-ccitt-false"`, `"crc16-xmodem"`, `"crc32"`, `"sum8"`, `"xor8"`.
+    #: With `"none"` a damaged frame may be taken for an answer.
     checksum: Literal["none", "crc16-ccitt-false", "crc16-xmodem", "crc32", "sum8", "xor8"] = "none"
-    checksum_at: Byte | None = None  #: Its first byte; below 0 from the end. Default: the end of the frame
-    checksum_from: Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)] = 0  #: The first byte that it covers.
-    checksum_order: Literal["big", "little"] = "big"  #: The order of its bytes, `"big"` or `"little"` end first.
-    #: Bytes that frames with an attitude have; others are counted (`other`) and not decoded. Default: all frames
+    #: Its first byte; below 0 from the end. Default: the end of the frame
+    checksum_at: Byte | None = None
+    #: The first byte that it covers.
+    checksum_from: Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)] = 0
+    #: The order of its bytes, `"big"` or `"little"` end first.
+    checksum_order: Literal["big", "little"] = "big"
+    #: Bytes that frames with an attitude have; others are counted (`other`) and not decoded.
+    #: Default: all frames
     match: Annotated[tuple[FrameMatch, ...], Meta(extra={"form": '[{ at = N, hex = "21" }, ...]'})] = ()
     #: The numbers in a frame. Default: none; required for frame
     fields: Annotated[tuple[FrameField, ...], Meta(extra={"form": '[{ name = "qw", at = N, type = "f32be" }, ...]'})] = ()
 
 
 def field_format(type_name: str) -> tuple[str, int, bool] | None:
-    """Kind ("u", "i", "f"), size in bytes and whether big-endian of a type such as "i32be"; None for no such type."""
+    """Kind ("u", "i", "f"), size in bytes and whether big-endian of a type such as "i32be"; None
+    for no such type.
+    """
     match = FIELD_TYPE.fullmatch(type_name)
     if match is None or (match[1] == "f" and match[2] not in {"32", "64"}):
         return None

@@ -1,4 +1,6 @@
-"""The tables of the streams: [attitude], with the checks of its keys for each kind of link, and [faults]."""
+"""The tables of the streams: [attitude], with the checks of its keys for each kind of link, and
+[faults].
+"""
 
 from typing import Annotated, Literal
 
@@ -13,7 +15,8 @@ from hilstar.server.bench.config.values import NotNegative
 ENDPOINTS = {
     ("zmq", False): "tcp://127.0.0.1:5560",
     ("zmq", True): "tcp://127.0.0.1:5560",
-    ("vizard", False): "tcp://127.0.0.1:5570",  # where Basilisk broadcasts, and where it looks for Vizard
+    # where Basilisk broadcasts, and where it looks for Vizard
+    ("vizard", False): "tcp://127.0.0.1:5570",
     ("vizard", True): "tcp://127.0.0.1:5556",
     ("42", False): "tcp://127.0.0.1:10001",  # from 42's own Inp_IPC.txt
     ("42", True): "tcp://127.0.0.1:10001",
@@ -27,70 +30,83 @@ PACKET_SOURCES = ("zmq", "serial", "udp")
 class AttitudeSettings(Table, frozen=True):
     """Where the attitude comes from, and what is shown without one."""
 
-    #: `"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet or JSON in each
-    #: datagram. `"vizard"`: Basilisk's Vizard stream, and `"42"`: the text stream of NASA's 42; their attitude is the body's
-    #: (`[tracker] q_body_to_cam`). `"scpi"`: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other
-    #: key of a source.
+    #: `"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a
+    #: packet or JSON in each datagram. `"vizard"`: Basilisk's Vizard stream, and `"42"`: the text
+    #: stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`). `"scpi"`:
+    #: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other key of a
+    #: source.
     source: Literal["zmq", "serial", "udp", "vizard", "42", "scpi"] = "zmq"
-    #: ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST is an IPv4 address,
-    #: an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for a free one, which is then
-    #: reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this machine. UDP: `udp://ADDRESS:PORT`,
-    #: another way to write `bind`. 42: where its socket is, when it is the server. Default: `tcp://127.0.0.1:5560`; of Vizard
-    #: `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of 42 `tcp://127.0.0.1:10001`
+    #: ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`,
+    #: where HOST is an IPv4 address, an IPv6 address in brackets, or a name (when hilstar binds
+    #: also `*`, and PORT may be `*` for a free one, which is then reported), or
+    #: `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this machine. UDP:
+    #: `udp://ADDRESS:PORT`, another way to write `bind`. 42: where its socket is, when it is the
+    #: server. Default: `tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep
+    #: `tcp://127.0.0.1:5556`; of 42 `tcp://127.0.0.1:10001`
     endpoint: str | None = None
-    #: ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address and port listened on,
-    #: `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported). Default: `false`; `true` in
-    #: lockstep; `"127.0.0.1:5560"` over UDP
+    #: ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address
+    #: and port listened on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one,
+    #: which is reported). Default: `false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP
     bind: bool | str | None = None
-    #: UDP, and 42 where hilstar binds: who may send: addresses and networks, such as `["192.168.1.20", "fd00::/64"]`. What
-    #: others send is counted, and never answered. Default: this machine; required where `bind` is not loopback
+    #: UDP, and 42 where hilstar binds: who may send: addresses and networks, such as
+    #: `["192.168.1.20", "fd00::/64"]`. What others send is counted, and never answered. Default:
+    #: this machine; required where `bind` is not loopback
     allow: Annotated[tuple[str, ...], Meta(extra={"form": '["ADDRESS", ...]'})] = ()
-    #: ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at whatever speed the
-    #: sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar stands in Vizard's place, and
-    #: Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge each message once its frame is out, so
-    #: that 42 may run as fast as it can.
+    #: ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one
+    #: reply, at whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of
+    #: its broadcast; hilstar stands in Vizard's place, and Basilisk's cameras get pictures of the
+    #: virtual tracker. 42: `true` to acknowledge each message once its frame is out, so that 42 may
+    #: run as fast as it can.
     lockstep: bool = False
-    #: Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as `"SC[0]"`. Default: the only one
-    #: that is there; `"SC[0]"`
+    #: Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as
+    #: `"SC[0]"`. Default: the only one that is there; `"SC[0]"`
     spacecraft: str | int | None = None
-    #: Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It adds to `[sky]
-    #: observer_velocity_km_s`, which is then that of the origin of Basilisk's frame.
+    #: Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It
+    #: adds to `[sky] observer_velocity_km_s`, which is then that of the origin of Basilisk's frame.
     use_velocity: bool = True
     convention: Convention = HILSTARS
-    curve_secret_key: str | None = None  #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    curve_secret_key: str | None = None
     #: ZeroMQ: the file of the binding side's public key, when hilstar connects. Default: none
     curve_server_key: str | None = None
-    #: ZeroMQ: the directory with the public keys that may connect, when hilstar binds. Default: none
+    #: ZeroMQ: the directory with the public keys that may connect, when hilstar binds. Default:
+    #: none
     allowed_clients: str | None = None
-    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default: none; required for serial
+    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default:
+    #: none; required for serial
     port: str | int = ""
     baud: Annotated[int, Meta(ge=1, le=12_000_000)] = 115_200  #: Serial: the speed, 8N1.
     #: Serial and UDP: status packets sent back to the sender per second; 0 for none.
     status_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0
-    #: Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its packets alone.
+    #: Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its
+    #: packets alone.
     time_requests: bool = True
-    #: `"estimated"`: the offset of the sender's clock is estimated. `"shared"`: the sender runs on this machine and `t_ns` is
-    #: its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute. `"unix"`: `t_ns` is Unix time of a machine that PTP
-    #: or NTP disciplines, as this one; the offset is that of this machine's own clock, with the error that its kernel states.
+    #: `"estimated"`: the offset of the sender's clock is estimated. `"shared"`: the sender runs on
+    #: this machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is
+    #: absolute. `"unix"`: `t_ns` is Unix time of a machine that PTP or NTP disciplines, as this
+    #: one; the offset is that of this machine's own clock, with the error that its kernel states.
     clock: Literal["estimated", "shared", "unix"] = "estimated"
     #: The age at which an attitude counts as stale; below half of that it counts as fresh again.
     stale_after_ms: NotNegative = 250.0
-    #: How long the rate of the newest sample carries the attitude on; after that the attitude stands still.
+    #: How long the rate of the newest sample carries the attitude on; after that the attitude
+    #: stands still.
     max_extrapolation_ms: NotNegative = 250.0
     #: What is shown while the attitude is stale. `"hold"`: the last attitude. `"blank"`: no stars.
     on_stale: Literal["hold", "blank"] = "hold"
-    #: A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are rad/s), and two samples that
-    #: would need a faster turn between them are a jump, never a turn.
+    #: A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are
+    #: rad/s), and two samples that would need a faster turn between them are a jump, never a turn.
     max_rate_deg_s: Annotated[float, Meta(ge=1e-3, le=1e9)] = 60.0
-    #: How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is exact for a steady turn and
-    #: amplifies jitter from about 0.3 / age on (15 Hz at 20 ms). `"auto"`: a steady turn as before, and of the jitter as much
-    #: as the last second's samples show to go on ([On time](on-time.md#prediction-and-jitter)).
+    #: How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is
+    #: exact for a steady turn and amplifies jitter from about 0.3 / age on (15 Hz at 20 ms).
+    #: `"auto"`: a steady turn as before, and of the jitter as much as the last second's samples
+    #: show to go on ([On time](on-time.md#prediction-and-jitter)).
     prediction: Literal["rate", "auto"] = "rate"
-    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, by a factor, late,
-    #: or zero) are reported (`rates-wrong`), and quaternions that rates show to be of another convention (`convention-wrong`).
-    #: `"use-quaternions"`: and the sky is drawn by the quaternions' own turn until the rates are right. `"warn"`: they are used
-    #: all the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are used only where they fit its
-    #: attitudes.
+    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes
+    #: or frame, by a factor, late, or zero) are reported (`rates-wrong`), and quaternions that
+    #: rates show to be of another convention (`convention-wrong`). `"use-quaternions"`: and the sky
+    #: is drawn by the quaternions' own turn until the rates are right. `"warn"`: they are used all
+    #: the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are used
+    #: only where they fit its attitudes.
     check_rates: Literal["use-quaternions", "warn", "off"] = "use-quaternions"
 
     @property
@@ -131,9 +147,11 @@ def _check_simulation(settings: AttitudeSettings, name: str) -> None:
 
 
 def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
-    """Where UDP is bound, and who may send. Raises InputError, also where an open address has no list of senders.
+    """Where UDP is bound, and who may send. Raises InputError, also where an open address has no
+    list of senders.
 
-    For SCPI it is a free port on loopback, to which the process that speaks SCPI sends packets as any sender would.
+    For SCPI it is a free port on loopback, to which the process that speaks SCPI sends packets as
+    any sender would.
     """
     if settings.source == "scpi":
         for key in ("endpoint", "bind", "port"):
@@ -153,19 +171,23 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
     place, allowed = parse_endpoint(settings.address), AllowedSenders(settings.allow)
     if settings.bind is True and not allowed and not place.loopback:
         raise InputError(f"{settings.address} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
-    from hilstar.attitude.wire.nasa42 import spacecraft_number  # links and packets take 12 ms, which no other source needs here
+    # links and packets take 12 ms, which no other source needs here
+    from hilstar.attitude.wire.nasa42 import spacecraft_number
 
     return spacecraft_number(settings.spacecraft), allowed
 
 
 class FaultSettings(Table, frozen=True):
-    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see [faults](faults.md))."""
+    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see
+    [faults](faults.md)).
+    """
 
-    #: The address to which hilstar's SUB socket connects, as in `[attitude]`: `tcp://HOST:PORT` or `ipc:///WHOLE/PATH`. Without
-    #: it there is no stream of faults. Default: none
+    #: The address to which hilstar's SUB socket connects, as in `[attitude]`: `tcp://HOST:PORT` or
+    #: `ipc:///WHOLE/PATH`. Without it there is no stream of faults. Default: none
     endpoint: str | None = None
     bind: bool = False  #: `true` when hilstar binds and the senders connect.
     curve_secret_key: str | None = None  #: The file of this side's secret key. Default: none
-    curve_server_key: str | None = None  #: The file of the binding side's public key, when hilstar connects. Default: none
+    #: The file of the binding side's public key, when hilstar connects. Default: none
+    curve_server_key: str | None = None
     #: The directory with the public keys that may connect, when hilstar binds. Default: none
     allowed_clients: str | None = None

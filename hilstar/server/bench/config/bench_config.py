@@ -1,4 +1,6 @@
-"""The whole bench file: read, its keys checked together, and refused in one line where it is wrong."""
+"""The whole bench file: read, its keys checked together, and refused in one line where it is
+wrong.
+"""
 
 import math
 import time
@@ -59,7 +61,9 @@ class BenchConfig(Table, frozen=True):
 
 
 def epoch_utc_ns(config: BenchConfig) -> int | None:
-    """The UTC of t = 0, ns since 1970 where every day has 86400 s; None where the file has none. Raises InputError."""
+    """The UTC of t = 0, ns since 1970 where every day has 86400 s; None where the file has none.
+    Raises InputError.
+    """
     if config.sky.epoch_utc is None:
         return None
     if config.sky.epoch_utc == UNIX:
@@ -69,20 +73,25 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
             f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
             " write the UTC of t_ns = 0"
         )
-    from hilstar.attitude.logs.earth import utc_ns_of  # importing ERFA takes 30 ms, which only a date needs
+    # importing ERFA takes 30 ms, which only a date needs
+    from hilstar.attitude.logs.earth import utc_ns_of
 
     return utc_ns_of(config.sky.epoch_utc, EPOCH_KEY)
 
 
 def sky_jd(config: BenchConfig, t_ns: int | None) -> float:
-    """The Julian date of a moment of a bench that has a date (None: the start), UTC. Raises InputError."""
+    """The Julian date of a moment of a bench that has a date (None: the start), UTC. Raises
+    InputError.
+    """
     if t_ns is None:
         return J2000_JD + (config.sky.epoch_jyear - J2000_JYEAR) * JYEAR_DAYS
     return UNIX_JD + ((epoch_utc_ns(config) or 0) + t_ns) / DAY_NS
 
 
 def has_observer(config: BenchConfig) -> bool:
-    """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
+    """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's
+    centre.
+    """
     bodies = config.sky.bodies
     shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
     return shown or config.spacecraft.orbit is not None or config.site is not None
@@ -101,11 +110,13 @@ def from_source(config: BenchConfig) -> bool:
 
 
 def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchConfig:
-    """The configuration for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
+    """The configuration for a source that gives the dates: its first time, ns since 1970 on a time
+    scale (see `Conventions`).
 
-    `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear` the beginning of the day: for
-    it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates, and for
-    one whose times are none of Unix where the file says that they are.
+    `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear`
+    the beginning of the day: for it stars are placed. Unchanged where the file has a date of its
+    own. Raises InputError for a source without dates, and for one whose times are none of Unix
+    where the file says that they are.
     """
     if config.sky.epoch_utc == UNIX:
         if scale in SCALES and scale != "UTC":
@@ -125,12 +136,16 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
 
 
 def today(config: BenchConfig) -> BenchConfig:
-    """The configuration with stars of the present day, by this machine's clock, where t_ns counts from 1970."""
+    """The configuration with stars of the present day, by this machine's clock, where t_ns
+    counts from 1970.
+    """
     return _on_day(config, UNIX, time.time_ns()) if config.sky.epoch_utc == UNIX else config
 
 
 def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
-    """The configuration with this `epoch_utc`, and stars placed for the beginning of a UTC's day."""
+    """The configuration with this `epoch_utc`, and stars placed for the beginning of a UTC's
+    day.
+    """
     day = jyear(utc_ns // DAY_NS * DAY_NS)
     return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day))
 
@@ -159,17 +174,23 @@ KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
 
 
 def read_config(path: Path) -> BenchConfig:
-    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to
+    write.
+    """
     return parse_config(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
 
 
 def parse_config(path: Path, text: str) -> BenchConfig:
-    """Parse and check the text of the bench file `path`. Raises InputError: file, key, what is wrong and what to write."""
+    """Parse and check the text of the bench file `path`. Raises InputError: file, key, what is
+    wrong and what to write.
+    """
     return config_of(path, parse_toml(path, text))
 
 
 def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
-    """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as `parse_config` does."""
+    """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as
+    `parse_config` does.
+    """
     if HEADS in tables:
         raise InputError(f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files")
     try:

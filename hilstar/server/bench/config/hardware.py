@@ -1,4 +1,6 @@
-"""The tables of the bench's hardware: [tracker], [monitor], [collimator], [sync], and [verify], their true state."""
+"""The tables of the bench's hardware: [tracker], [monitor], [collimator], [sync], and [verify],
+their true state.
+"""
 
 import json
 import re
@@ -44,10 +46,11 @@ Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1,
 class TrackerOptics(Table, frozen=True):
     """How the tracker's lens spreads a star over the detector."""
 
-    #: `"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of [`hilstar optics`](optics.md) has point
-    #: spread functions over field, wavelength and focus. Or it has one image of the point spread function, the same all over
-    #: the field and for all colours. Its header has `OVERSAMP`, samples a tracker pixel (1 where it is missing), and `PIXINT`,
-    #: whether the pixel is integrated (F where it is missing).
+    #: `"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of [`hilstar
+    #: optics`](optics.md) has point spread functions over field, wavelength and focus. Or it has
+    #: one image of the point spread function, the same all over the field and for all colours. Its
+    #: header has `OVERSAMP`, samples a tracker pixel (1 where it is missing), and `PIXINT`, whether
+    #: the pixel is integrated (F where it is missing).
     psf: str = GAUSSIAN
     #: Where the detector stands along the axis, as the file of `psf` counts it.
     focus_um: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
@@ -75,35 +78,41 @@ class Tracker(Table, frozen=True):
     focal_length_mm: Positive  #: Focal length of the tracker's lens.
     pixel_pitch_um: PixelPitch  #: Distance between the centres of adjacent pixels.
     resolution_px: Size  #: Size of the detector.
-    #: `"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV file with the header
-    #: `wavelength_nm,value`, or one number for all wavelengths. Default: **required**, or the next three
+    #: `"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV
+    #: file with the header `wavelength_nm,value`, or one number for all wavelengths. Default:
+    #: **required**, or the next three
     quantum_efficiency: str | float | None = None
-    quantum_efficiency_r: str | float | None = None  #: The same of the red channel alone. Default: one channel
+    #: The same of the red channel alone. Default: one channel
+    quantum_efficiency_r: str | float | None = None
     quantum_efficiency_g: str | float | None = None  #: The green channel's. Default: one channel
     quantum_efficiency_b: str | float | None = None  #: The blue channel's. Default: one channel
-    #: Of the tracker's optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as above, or one number.
+    #: Of the tracker's optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as
+    #: above, or one number.
     transmission: str | float = 1.0
     exposure_s: NotNegative = 0.1  #: Exposure time.
-    #: How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of their beat (see
-    #: [sync](#sync)). Default: one exposure after the other
+    #: How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of
+    #: their beat (see [sync](#sync)). Default: one exposure after the other
     frame_hz: Frequency | None = None
-    #: `"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a frame of the monitor (see
-    #: [sync](#sync)): nothing beats.
+    #: `"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a
+    #: frame of the monitor (see [sync](#sync)): nothing beats.
     trigger: Literal["free", "external"] = "free"
-    #: Gaussian sigma of the tracker's own point spread function, in tracker pixels; not used where `[tracker.optics] psf` names
-    #: a file. It never widens the stars on the monitor.
+    #: Gaussian sigma of the tracker's own point spread function, in tracker pixels; not used where
+    #: `[tracker.optics] psf` names a file. It never widens the stars on the monitor.
     psf_sigma_px: Sigma = DEFAULT_PSF_SIGMA_PX
-    #: Where the boresight meets the detector, in tracker pixels. Default: the middle of the detector
+    #: Where the boresight meets the detector, in tracker pixels. Default: the middle of the
+    #: detector
     principal_point_px: Point | None = None
-    #: The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, `k3`, `p1` and `p2`
-    #: of tangents of field angles, from direction to pixel; those not given are 0. Default: an ideal lens
+    #: The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`,
+    #: `k2`, `k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those not
+    #: given are 0. Default: an ideal lens
     distortion: str | None = None
-    #: How the tracker sits in the spacecraft: turns body components into camera components. Applied to each source whose
-    #: attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's. Default: the body's
-    #: axes, with a notice
+    #: How the tracker sits in the spacecraft: turns body components into camera components. Applied
+    #: to each source whose attitude is the body's (see [attitude in](attitude-in.md)); packets,
+    #: JSON and CSV hold the camera's. Default: the body's axes, with a notice
     q_body_to_cam: Rotation | None = None
-    #: `"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and centroid of a star within the
-    #: next two, a Gaussian first; a notice says which. `"full"`: all of the file.
+    #: `"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and
+    #: centroid of a star within the next two, a Gaussian first; a notice says which. `"full"`: all
+    #: of the file.
     effort: Literal["full", "auto"] = "full"
     tolerance_mag: Positive = 0.02  #: Flux error that a star may then have, for `effort = "auto"`.
     tolerance_px: Positive = 0.02  #: Centroid error that it may have, in tracker pixels.
@@ -112,7 +121,9 @@ class Tracker(Table, frozen=True):
 
     @property
     def quantum_efficiencies(self) -> dict[str, str | float]:
-        """The quantum efficiency of each channel by its key: one, or those of red, green and blue."""
+        """The quantum efficiency of each channel by its key: one, or those of red, green and
+        blue.
+        """
         given = {key: getattr(self, key) for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb"))}
         return {key: value for key, value in given.items() if value is not None}
 
@@ -137,22 +148,25 @@ def check_channels(tracker: Tracker) -> None:
 class PrimariesSettings(Table, frozen=True):
     """The light of the monitor's red, green and blue, and where it lies within a pixel."""
 
-    #: The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of each primary at full
-    #: drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the display's own samples: its primaries are those three of
-    #: which all others are mixtures. Default: not known
+    #: The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per
+    #: nm of each primary at full drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the
+    #: display's own samples: its primaries are those three of which all others are mixtures.
+    #: Default: not known
     file: str | None = None
-    #: In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a Gaussian of about that
-    #: chromaticity, and all three together are D65: approximate, as every run says. Default: by `file`
+    #: In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a
+    #: Gaussian of about that chromaticity, and all three together are D65: approximate, as every
+    #: run says. Default: by `file`
     xy_r: Chromaticity | None = None
     xy_g: Chromaticity | None = None  #: For green. Default: by `file`
     xy_b: Chromaticity | None = None  #: For blue. Default: by `file`
-    width_nm: Annotated[float, Meta(ge=1, le=200)] = 30.0  #: Full width at half maximum of each primary that is given by `xy_`.
-    #: `"white"`: all three have their light in the pixel's middle. `"rgb-stripe"`, `"bgr-stripe"`: side by side, a third of a
-    #: pixel apart. `"vertical"`: red above green above blue. A pixel with a fourth subpixel, or that shares subpixels, is
-    #: refused.
+    #: Full width at half maximum of each primary that is given by `xy_`.
+    width_nm: Annotated[float, Meta(ge=1, le=200)] = 30.0
+    #: `"white"`: all three have their light in the pixel's middle. `"rgb-stripe"`, `"bgr-stripe"`:
+    #: side by side, a third of a pixel apart. `"vertical"`: red above green above blue. A pixel
+    #: with a fourth subpixel, or that shares subpixels, is refused.
     layout: str = "white"
-    #: In place of `layout`: where the light of red, green and blue lies, in pixels from the middle, right and down on the
-    #: screen. Default: by `layout`
+    #: In place of `layout`: where the light of red, green and blue lies, in pixels from the middle,
+    #: right and down on the screen. Default: by `layout`
     offsets_px: Annotated[tuple[Offset, Offset, Offset] | None, Meta(extra={"form": "[[x, y], [x, y], [x, y]]"})] = None
 
     @property
@@ -167,7 +181,9 @@ class PrimariesSettings(Table, frozen=True):
 
 
 def check_primaries(primaries: PrimariesSettings) -> None:
-    """Refuse (InputError) primaries that are given twice or in part, and layouts that three primaries of a pixel have not."""
+    """Refuse (InputError) primaries that are given twice or in part, and layouts that three
+    primaries of a pixel have not.
+    """
     given = [key for key in ("xy_r", "xy_g", "xy_b") if getattr(primaries, key) is not None]
     if primaries.file is not None and given:
         raise InputError(f"[monitor.primaries] has file and {given[0]}; write one of them")
@@ -191,26 +207,34 @@ class Monitor(Table, frozen=True):
 
     resolution_px: Size  #: Size of the screen.
     pixel_pitch_um: Positive  #: Distance between the centres of adjacent pixels.
-    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 60.0  #: Refresh rate; headless, the frame rate.
+    #: Refresh rate; headless, the frame rate.
+    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 60.0
     bits: Annotated[int, Meta(ge=1, le=16)] = 8  #: Bits of a code value.
-    #: Light as a function of the code value: `"srgb"`, `"gamma2.2"`, `"lcd-example"` (invented, with a black level and
-    #: vignetting), or the path of a file that `hilstar calibrate photometric` wrote (see
-    #: [CALIBRATION.md](../configs/CALIBRATION.md)).
+    #: Light as a function of the code value: `"srgb"`, `"gamma2.2"`, `"lcd-example"` (invented,
+    #: with a black level and vignetting), or the path of a file that `hilstar calibrate
+    #: photometric` wrote (see [CALIBRATION.md](../configs/CALIBRATION.md)).
     calibration: str = "srgb"
-    #: How long the files of `calibration` and `[collimator] geometry` hold: with older ones a screen is refused.
+    #: How long the files of `calibration` and `[collimator] geometry` hold: with older ones a
+    #: screen is refused.
     calibration_valid_days: Annotated[float, Meta(gt=0, le=36500)] = 180
-    display: int | str = 0  #: Which display the window fills: its index, or a part of its name. `hilstar doctor` lists them.
-    flip_x: bool = False  #: The optics mirror left and right: the columns of the screen are reversed.
+    #: Which display the window fills: its index, or a part of its name. `hilstar doctor` lists
+    #: them.
+    display: int | str = 0
+    #: The optics mirror left and right: the columns of the screen are reversed.
+    flip_x: bool = False
     flip_y: bool = False  #: The optics mirror up and down: the rows of the screen are reversed.
     rotate_deg: Literal[0, 90, 180, 270] = 0  #: Turns the image clockwise on the screen.
-    panel_delay_ms: NotNegative = 0.0  #: From the buffer swap to the light of the first row. `hilstar latency` measures it.
-    #: How long the panel takes to light its rows, first to last; 0 where all rows light at once. Default: one refresh period
+    #: From the buffer swap to the light of the first row. `hilstar latency` measures it.
+    panel_delay_ms: NotNegative = 0.0
+    #: How long the panel takes to light its rows, first to last; 0 where all rows light at once.
+    #: Default: one refresh period
     scanout_ms: NotNegative | None = None
-    hold_ms: NotNegative | None = None  #: How long a row stays lit; 0 for a panel that flashes. Default: one refresh period
+    #: How long a row stays lit; 0 for a panel that flashes. Default: one refresh period
+    hold_ms: NotNegative | None = None
     #: Side of a square for a photodiode in the lower left corner; 0 for none.
     photodiode_px: Annotated[int, Meta(ge=0, le=1000)] = 0
-    #: `"toggle"`: the square is white in every other frame. `"code"`: it follows a sequence in which any 7 consecutive frames
-    #: identify themselves.
+    #: `"toggle"`: the square is white in every other frame. `"code"`: it follows a sequence in
+    #: which any 7 consecutive frames identify themselves.
     photodiode: Literal["toggle", "code"] = "toggle"
     primaries: PrimariesSettings = msgspec.field(default_factory=PrimariesSettings)
 
@@ -236,31 +260,39 @@ class Collimator(Table, frozen=True):
     focal_length_mm: Positive  #: Focal length of the collimating lens.
     #: Misalignment: the unit quaternion that turns cam components into mon components.
     q_cam_to_mon: Rotation = (1.0, 0.0, 0.0, 0.0)
-    #: Where the optical axis of the collimator meets the monitor, in monitor pixels. Default: the middle of the screen
+    #: Where the optical axis of the collimator meets the monitor, in monitor pixels. Default: the
+    #: middle of the screen
     principal_point_px: Point | None = None
-    #: Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees it.
+    #: Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees
+    #: it.
     psf_sigma_px: NotNegative = 0.0
-    #: The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and the real alignment. It takes the
-    #: place of the other keys of this table but `psf_sigma_px`. Default: an ideal lens
+    #: The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and the
+    #: real alignment. It takes the place of the other keys of this table but `psf_sigma_px`.
+    #: Default: an ideal lens
     geometry: str | None = None
 
 
 class SyncSettings(Table, frozen=True):
-    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger."""
+    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a
+    tracker that takes a trigger.
+    """
 
-    #: The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the attitude's. Default:
-    #: none
+    #: The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`.
+    #: Not the attitude's. Default: none
     port: str | None = None
     pulse_ms: Positive = 1.0  #: Width of the pulse, at least.
-    #: `"high"`: RTS is set (positive on RS-232) in the pulse and cleared between. `"low"`: the other way round. Adapters with
-    #: TTL levels have their lines inverted: set is 0 V.
+    #: `"high"`: RTS is set (positive on RS-232) in the pulse and cleared between. `"low"`: the
+    #: other way round. Adapters with TTL levels have their lines inverted: set is 0 V.
     active: Literal["high", "low"] = "high"
     every_frames: Annotated[int, Meta(ge=1, le=1_000_000)] = 1  #: A pulse at every so many frames.
-    turn_deg_s: Positive = 1.0  #: Rate of turn at which `serve` and `first-light` judge what a beat costs.
+    #: Rate of turn at which `serve` and `first-light` judge what a beat costs.
+    turn_deg_s: Positive = 1.0
 
 
 def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude: AttitudeSettings) -> None:
-    """Refuse (InputError) exposures that overlap, a pulse that lasts until the next, and a port that is the attitude's."""
+    """Refuse (InputError) exposures that overlap, a pulse that lasts until the next, and a port
+    that is the attitude's.
+    """
     if tracker.frame_hz is not None and tracker.frame_hz * tracker.exposure_s > 1 + ROUNDING:
         most = f"{1 / tracker.exposure_s:.6g} or less"
         raise InputError(
@@ -282,37 +314,50 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
 
 
 class Verify(Table, frozen=True):
-    """The digital twin: what `hilstar verify` takes as true where the bench assumes otherwise, and the limits within which
-    the bench passes."""
+    """The digital twin: what `hilstar verify` takes as true where the bench assumes otherwise, and
+    the limits within which the bench passes.
+    """
 
-    #: The monitor's true light: a built-in name or a calibration file. Default: as the bench assumes
-    true_calibration: str | None = None
-    true_flux_at_white_e_per_s: Positive | None = None  #: The true full scale. Default: as the bench assumes
-    true_focal_length_mm: Positive | None = None  #: The collimator's true focal length. Default: as the bench assumes
-    true_pixel_pitch_um: Positive | None = None  #: The monitor's true pixel pitch. Default: as the bench assumes
-    true_q_cam_to_mon: Rotation | None = None  #: The true misalignment. Default: as the bench assumes
-    #: The true lens and the true alignment: a file as `hilstar calibrate geometric` writes it. Not beside
-    #: `true_focal_length_mm`, `true_pixel_pitch_um` or `true_q_cam_to_mon`, which are of an ideal lens. Default: as the bench
+    #: The monitor's true light: a built-in name or a calibration file. Default: as the bench
     #: assumes
+    true_calibration: str | None = None
+    #: The true full scale. Default: as the bench assumes
+    true_flux_at_white_e_per_s: Positive | None = None
+    #: The collimator's true focal length. Default: as the bench assumes
+    true_focal_length_mm: Positive | None = None
+    #: The monitor's true pixel pitch. Default: as the bench assumes
+    true_pixel_pitch_um: Positive | None = None
+    #: The true misalignment. Default: as the bench assumes
+    true_q_cam_to_mon: Rotation | None = None
+    #: The true lens and the true alignment: a file as `hilstar calibrate geometric` writes it. Not
+    #: beside `true_focal_length_mm`, `true_pixel_pitch_um` or `true_q_cam_to_mon`, which are of an
+    #: ideal lens. Default: as the bench assumes
     true_geometry: str | None = None
-    #: What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or swaps its axes (`"swap"`).
+    #: What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or
+    #: swaps its axes (`"swap"`).
     true_mirror: Literal["none", "x", "y", "swap"] = "none"
-    #: What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; `"wide"`, one half as
-    #: wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a Gaussian; `"psf"`, that of the PSF of
-    #: `[tracker.optics]`, which is `fit` where codes are judged; `"box3"` or `"box5"`, the centre of mass of so many pixels a
-    #: side. `quantisation = "auto"` judges codes by it, too. Default: `"window"`; to judge codes, all of them
+    #: What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as
+    #: wide; `"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the
+    #: least squares of a Gaussian; `"psf"`, that of the PSF of `[tracker.optics]`, which is `fit`
+    #: where codes are judged; `"box3"` or `"box5"`, the centre of mass of so many pixels a side.
+    #: `quantisation = "auto"` judges codes by it, too. Default: `"window"`; to judge codes, all of
+    #: them
     centroider: Literal["window", "wide", "moment", "fit", "psf", "box3", "box5"] | None = None
-    #: Limit for the flux error of 95 % of stars, with their common zero point taken out; also the limit of that zero point.
+    #: Limit for the flux error of 95 % of stars, with their common zero point taken out; also the
+    #: limit of that zero point.
     flux_mag: Positive = 0.05
-    centroid_px: Positive = 0.1  #: Limit for the centroid error of 95 % of stars, in tracker pixels.
-    #: Limit for the share of lost stars among those that stand alone, are shown, and are not clipped.
+    #: Limit for the centroid error of 95 % of stars, in tracker pixels.
+    centroid_px: Positive = 0.1
+    #: Limit for the share of lost stars among those that stand alone, are shown, and are not
+    #: clipped.
     lost_share: NotNegative = 0.02
-    #: Limit for the sigma of a star as the tracker sees the display, to that of a star of the sky through the same lens, the
-    #: tracker's pixel in both. A centroider tuned to the sky's stars meets others beyond it. README's bench has 1.68, those of
-    #: configs 1.24 to 1.68. See [how wide a star is](twin.md#how-wide-a-star-is).
+    #: Limit for the sigma of a star as the tracker sees the display, to that of a star of the sky
+    #: through the same lens, the tracker's pixel in both. A centroider tuned to the sky's stars
+    #: meets others beyond it. README's bench has 1.68, those of configs 1.24 to 1.68. See [how wide
+    #: a star is](twin.md#how-wide-a-star-is).
     star_sigma_ratio: Annotated[float, Meta(ge=1, le=MAX_NUMBER)] = 2.0
-    #: Limit for the screen's black level in a tracker pixel, seen minus assumed. Default: a tenth of the faintest star's light
-    #: over its disc (4 pi sigma^2)
+    #: Limit for the screen's black level in a tracker pixel, seen minus assumed. Default: a tenth
+    #: of the faintest star's light over its disc (4 pi sigma^2)
     black_e_per_s_px: NotNegative | None = None
 
     @property

@@ -1,8 +1,10 @@
-"""The reference of the bench file, docs/bench-file.md: `python -m hilstar.server.bench.config.reference` prints it.
+"""The reference of the bench file, docs/bench-file.md: `python -m
+hilstar.server.bench.config.reference` prints it.
 
-All of it comes from the classes of the tables: keys, types, units, limits and defaults, and their meanings from the comments
-`#:` above or beside each key, which may end in a default in words (`Default: the middle of the screen`). What is to be said
-of a whole table stands in bench-file.md beside this file.
+All of it comes from the classes of the tables: keys, types, units, limits and defaults, and their
+meanings from the comments `#:` above or beside each key, which may end in a default in words
+(`Default: the middle of the screen`). What is to be said of a whole table stands in bench-file.md
+beside this file.
 """
 
 import ast
@@ -67,7 +69,9 @@ def page() -> str:
 
 
 def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Each table inside `table` by its name in the file, outer ones first: ("tracker", Tracker), ("tracker.detector", ...)."""
+    """Each table inside `table` by its name in the file, outer ones first: ("tracker", Tracker),
+    ("tracker.detector", ...).
+    """
     for field in msgspec.structs.fields(table):
         inner = table_in(field.type)
         if inner is not None:
@@ -109,7 +113,9 @@ def meanings_of(table: type) -> dict[str, str]:
 
 
 def row(field: FieldInfo, hint: Any, told: str) -> str:
-    """A key: its name, what it may hold, what it holds otherwise, and what it means by its comment (see `meanings_of`)."""
+    """A key: its name, what it may hold, what it holds otherwise, and what it means by its
+    comment (see `meanings_of`).
+    """
     meaning, _, default = told.partition(" Default: ")
     if field.default is NODEFAULT:
         default = "**required**"

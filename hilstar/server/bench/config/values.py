@@ -12,7 +12,8 @@ NotNegative = Annotated[float, Meta(ge=0, le=MAX_NUMBER)]
 Magnitude = Annotated[float, Meta(ge=-100, le=100)]
 EpochJyear = Annotated[float, Meta(ge=1800, le=2200)]
 Pixels = Annotated[int, Meta(ge=1, le=32768)]
-SigmaPx = Annotated[float, Meta(ge=0.05, le=20)]  # a GL draws sprites up to 255 px, which is 25 sigmas
+# a GL draws sprites up to 255 px, which is 25 sigmas
+SigmaPx = Annotated[float, Meta(ge=0.05, le=20)]
 Size = Annotated[tuple[Pixels, Pixels], Meta(extra={"form": "[width, height]"})]
 Sigma = Annotated[tuple[SigmaPx, SigmaPx], Meta(extra={"form": "[x, y]"})]
 PlacePx = Annotated[float, Meta(ge=-1e6, le=1e6)]

@@ -1,1 +1,3 @@
-"""The page's own process: reads a run's shared memory and serves it to browsers and monitoring, without OpenGL."""
+"""The page's own process: reads a run's shared memory and serves it to browsers and monitoring,
+without OpenGL.
+"""

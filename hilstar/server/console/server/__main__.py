@@ -1,5 +1,5 @@
-"""The page's process. `console.page_process` starts it with five file descriptors: setup, shared memory, channel, and the
-listeners of the page and of SCPI, of which one may be missing (-1).
+"""The page's process. `console.page_process` starts it with five file descriptors: setup, shared
+memory, channel, and the listeners of the page and of SCPI, of which one may be missing (-1).
 
 It ends with the run, when the other end of the channel is closed for whatever reason.
 """
@@ -158,7 +158,8 @@ def main() -> None:
     """Set the process up, and serve."""
     setup_fd, board_fd, wire_fd, page_fd, scpi_fd = map(int, sys.argv[1:])
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # even where this process hangs
-    for number in (signal.SIGINT, signal.SIGHUP):  # a terminal sends them to all; the run ends this process
+    # a terminal sends them to all; the run ends this process
+    for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(OSError):
         os.nice(NICE)

@@ -1,4 +1,6 @@
-"""The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in docs/console-server.md."""
+"""The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in
+docs/console-server.md.
+"""
 
 import asyncio
 import contextlib
@@ -58,8 +60,9 @@ class Refused(Exception):
 class Guard:
     """Judges requests by their headers (lower-case names).
 
-    A page of another site can make a browser send requests here. By a name that it points at this machine (DNS rebinding) it
-    can even read the answers. So the name in `Host` has to be one of this page's, and an `Origin` that of the page itself.
+    A page of another site can make a browser send requests here. By a name that it points at this
+    machine (DNS rebinding) it can even read the answers. So the name in `Host` has to be one of
+    this page's, and an `Origin` that of the page itself.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -77,7 +80,8 @@ class Guard:
 
     def _is_own(self, host: str) -> bool:
         name, port = _split(host)
-        if name in LOOPBACK and (port.isdecimal() or not port):  # by any port: that of a tunnel, such as ssh -L
+        # by any port: that of a tunnel, such as ssh -L
+        if name in LOOPBACK and (port.isdecimal() or not port):
             return True
         if port not in {"", str(self._port)} or (not port and self._port != 80):
             return False
@@ -96,14 +100,17 @@ class Guard:
             raise Refused(403, "another site's page may not ask here")
 
     def check_token(self, headers: Mapping[str, str], protocols: Iterable[str] = ()) -> None:
-        """Raises Refused (401) without the token, in a header or as a WebSocket's subprotocol; compared in constant time."""
+        """Raises Refused (401) without the token, in a header or as a WebSocket's subprotocol;
+        compared in constant time.
+        """
         if not self._token:
             return
         scheme, _, given = headers.get("authorization", "").partition(" ")
         tokens = [given.strip()] if scheme.lower() == "bearer" else []
         tokens += [name.removeprefix(TOKEN_PROTOCOL) for name in protocols if name.startswith(TOKEN_PROTOCOL)]
         wanted = self._token.encode()
-        matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]  # each, whichever was right
+        # each, whichever was right
+        matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]
         if True not in matches:
             raise Refused(
                 401, "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer"
@@ -160,7 +167,8 @@ class RunCollector(Collector):
         tracker = seen.tracker
         if tracker is not None:
             yield from tracker_metrics(tracker)
-        gauges: list[tuple[str, str, float | None, float]] = [  # in units of the last; None is left out
+        # in units of the last; None is left out
+        gauges: list[tuple[str, str, float | None, float]] = [
             ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
             ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
             ("attitude_missing", "1 until an attitude has come.", seen.frame.missing, 1),
@@ -225,7 +233,8 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 4_000
-MAX_DRAINED_BYTES = 64_000_000  # a body that is too long is read this far, so that its sender comes to read why
+# a body that is too long is read this far, so that its sender comes to read why
+MAX_DRAINED_BYTES = 64_000_000
 BODY_S = 5.0
 STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
 ORDERED_S = 30.0  # a ledger on a slow disk
@@ -350,7 +359,9 @@ def _refusal(status: int, line: str) -> JSONResponse:
 
 
 class Guarded:
-    """The application behind its guard: every request is checked first, and every answer has the same headers."""
+    """The application behind its guard: every request is checked first, and every answer has the
+    same headers.
+    """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
         self._app, self._guard = app, guard
@@ -380,7 +391,9 @@ class Guarded:
 
 
 def _with_headers(send: Send, host: str) -> Send:
-    """Add the headers of every answer; `host` is the name in an allowed request, "" in a refused one."""
+    """Add the headers of every answer; `host` is the name in an allowed request, "" in a refused
+    one.
+    """
     sockets = f" ws://{host} wss://{host}" if host else ""
     headers = HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
     extra = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers.items()]

@@ -1,4 +1,6 @@
-"""Connections to pages: HTTP and WebSockets with bounds; every open page gets messages at its own speed."""
+"""Connections to pages: HTTP and WebSockets with bounds; every open page gets messages at its
+own speed.
+"""
 
 import asyncio
 import socket
@@ -31,7 +33,8 @@ _connections: "OrderedDict[BoundedHttp, None]" = OrderedDict()
 class BoundedHttp(H11Protocol):
     """One connection. It is closed where the peer says nothing, says it slowly, or does not read.
 
-    uvicorn bounds what a request may hold, but neither how long it may take nor what waits for a peer that does not read.
+    uvicorn bounds what a request may hold, but neither how long it may take nor what waits for a
+    peer that does not read.
     """
 
     _limit: asyncio.TimerHandle | None = None
@@ -186,7 +189,9 @@ class OpenPage:
             self.line.drop()
 
     async def send_all(self) -> None:
-        """Send what is queued until it is to be closed; WebSocketDisconnect, TimeoutError where it cannot."""
+        """Send what is queued until it is to be closed; WebSocketDisconnect, TimeoutError where
+        it cannot.
+        """
         while self.closing is None:
             await self._wake.wait()
             self._wake.clear()
@@ -214,7 +219,8 @@ class OpenPage:
             self._wishes_s.append(now_s)
             try:
                 self.want = msgspec.json.decode(message.get("text") or "", type=PageMessage).want
-            except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
+            except (msgspec.MsgspecError, ValueError, RecursionError):
+                # not its JSON, no UTF-8, deeper than any
                 self.close(POLICY)
                 return
             self.asked = True
@@ -223,8 +229,9 @@ class OpenPage:
 class OpenPages:
     """All pages that are open. A slow one loses pictures, then its connection.
 
-    A new page always gets a place. Where all are taken, another gives way: first one that does not read, then one that has
-    asked for nothing, then one that is no browser's, then the oldest of the address with the most pages.
+    A new page always gets a place. Where all are taken, another gives way: first one that does not
+    read, then one that has asked for nothing, then one that is no browser's, then the oldest of the
+    address with the most pages.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,6 @@
-"""A run's shared memory, read ten times a second and worded for the page: state, health, chart points, events, pictures."""
+"""A run's shared memory, read ten times a second and worded for the page: state, health, chart
+points, events, pictures.
+"""
 
 import contextlib
 import math
@@ -35,7 +37,9 @@ MANY_MISSED_SHARE = 0.5  # share of the last second's frames
 
 @dataclass(frozen=True, slots=True)
 class RecentFrames:
-    """The newest frame's swap (host time, ns), and the missing share of the last second's frames."""
+    """The newest frame's swap (host time, ns), and the missing share of the last second's
+    frames.
+    """
 
     swap_ns: int = 0
     missed_share: float = 0.0
@@ -126,7 +130,8 @@ class RunReader:
     def __init__(self, memory: messages.SharedMemory, setup: messages.Setup) -> None:
         self._memory, self.setup = memory, setup
         self.seen: messages.RunState | None = None
-        self.health = Health(memory.wrong_since_s or time.time())  # an earlier page of this run may have died
+        # an earlier page of this run may have died
+        self.health = Health(memory.wrong_since_s or time.time())
         self.points: deque[protocol.ChartPoint] = deque(maxlen=round(protocol.HISTORY_S / TICK_S))
         self.events: deque[protocol.EventLine] = deque(maxlen=protocol.KEPT_EVENTS)
         self._frame_at = self._event_at = self._answer_at = 0
@@ -145,7 +150,8 @@ class RunReader:
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._memory.states.last()
         if found is not None:
-            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):  # cut, being too long: the one before stays
+            # cut, being too long: the one before stays
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
                 self.seen = msgspec.json.decode(found[1], type=messages.RunState)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:

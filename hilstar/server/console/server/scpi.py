@@ -1,12 +1,15 @@
-"""SCPI over TCP, in the page's process: a test stand asks the run, gives it orders, and may steer the sky.
+"""SCPI over TCP, in the page's process: a test stand asks the run, gives it orders, and may steer
+the sky.
 
-Commands go where the page's go: the run's state is read from shared memory, orders are those of an operator. With `[attitude]
-source = "scpi"` an attitude packet goes to the run's own UDP port on loopback SENT_HZ times a second, as any sender's does. No
-frame waits for any of it. Every connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
+Commands go where the page's go: the run's state is read from shared memory, orders are those of an
+operator. With `[attitude] source = "scpi"` an attitude packet goes to the run's own UDP port on
+loopback SENT_HZ times a second, as any sender's does. No frame waits for any of it. Every
+connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
 
-A controller is a connection that gave the token, or acted where none is needed; any other is a stranger. Whatever strangers do,
-attitudes go out in time: a connection has few commands a turn, all strangers together have one turn in STRANGERS_S, and a
-stranger takes the place of strangers alone (`Turns`, `Peers`).
+A controller is a connection that gave the token, or acted where none is needed; any other is a
+stranger. Whatever strangers do, attitudes go out in time: a connection has few commands a turn, all
+strangers together have one turn in STRANGERS_S, and a stranger takes the place of strangers alone
+(`Turns`, `Peers`).
 """
 
 import asyncio
@@ -46,7 +49,8 @@ MARGIN_NS = NS_PER_MS  # between a state's time and what it was read from
 POLL_S = 0.01
 ALIVE_NS = NS_PER_S  # the run writes its state ten times a second
 MAX_CONTROLLERS, MAX_STRANGERS = 16, 16
-# Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms to the others.
+# Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms
+# to the others.
 UNITS_A_TURN, TURN_S = 8, 0.001
 # Strangers have 800 a second together, 3 % of a core.
 STRANGER_UNITS_A_TURN, STRANGERS_S = 4, 0.005
@@ -55,10 +59,12 @@ MAX_UNSENT_BYTES = 65_536
 UNREAD_S = 10.0
 MAX_WRONG_TOKENS = 5
 WRONG_TOKEN_S = 0.5
-ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}  # by an order's HTTP status; else -310
+# by an order's HTTP status; else -310
+ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}
 UNLOCKED = {"*IDN?", "*CLS", "SYSTem:AUTHenticate", "SYSTem:ERRor[:NEXT]?", "SYSTem:ERRor:COUNt?", "SYSTem:VERSion?"}
 
-# Bits of the operation and the questionable status; SCPI-1999 leaves bits 8 to 12 and 9 to 12 to a device.
+# Bits of the operation and the questionable status; SCPI-1999 leaves bits 8 to 12 and 9 to 12 to a
+# device.
 SKY_SHOWN, LEDGER_ON, FAULT_ON, OPERATOR_ON = 1 << 8, 1 << 9, 1 << 10, 1 << 11
 NO_ATTITUDE, LEDGER_FAILS, FRAMES_MISSED, NOT_WELL = 1 << 9, 1 << 10, 1 << 11, 1 << 12
 
@@ -66,7 +72,9 @@ Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
 class SkySource:
-    """The attitude that SCPI steers: held, or turning at a rate from the moment that it was set; sent to a UDP port."""
+    """The attitude that SCPI steers: held, or turning at a rate from the moment that it was set;
+    sent to a UDP port.
+    """
 
     def __init__(self, port: int, max_rate_deg_s: float) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -144,14 +152,18 @@ class Turns:
 
 
 class Peers:
-    """The connections that are open, controllers and strangers apart, in each the one that was silent longest first."""
+    """The connections that are open, controllers and strangers apart, in each the one that was
+    silent longest first.
+    """
 
     def __init__(self) -> None:
         self.controllers: dict[Connection, asyncio.StreamWriter] = {}
         self.strangers: dict[Connection, asyncio.StreamWriter] = {}
 
     def enter(self, client: "Connection", outgoing: asyncio.StreamWriter) -> None:
-        """Let a stranger in. Where there are too many, one of the address that has most of them gives way."""
+        """Let a stranger in. Where there are too many, one of the address that has most of them
+        gives way.
+        """
         if len(self.strangers) >= MAX_STRANGERS:
             ((crowded, _),) = Counter(each.address for each in self.strangers).most_common(1)
             first = next(each for each in self.strangers if each.address == crowded)
@@ -165,7 +177,9 @@ class Peers:
                 peers[client] = peers.pop(client)
 
     def promote(self, client: "Connection") -> None:
-        """A stranger is a controller from now on. Where there are too many, the one that was silent longest gives way."""
+        """A stranger is a controller from now on. Where there are too many, the one that was
+        silent longest gives way.
+        """
         outgoing = self.strangers.pop(client, None)
         if outgoing is None:
             return
@@ -219,7 +233,9 @@ class ScpiServer:
         return operation, questionable | NOT_WELL * (not self.reader.health.ok)
 
     def pending(self) -> bool:
-        """Whether the newest setting of the sky is not shown yet, or not in the run's state; for SETTLES_NS at most."""
+        """Whether the newest setting of the sky is not shown yet, or not in the run's state; for
+        SETTLES_NS at most.
+        """
         sky, seen = self.sky, self.reader.seen
         now_ns = time.monotonic_ns()
         if sky is None or now_ns - sky.set_ns > SETTLES_NS:
@@ -229,14 +245,17 @@ class ScpiServer:
             if found is None or seen is None:
                 return True
             frame = FrameNumbers._make(FRAME.unpack(found[1]))
-            follows = frame.flags & HAS_AGE and not seen.operator.get("pause")  # a covered or paused sky is not of now
+            # a covered or paused sky is not of now
+            follows = frame.flags & HAS_AGE and not seen.operator.get("pause")
             if (frame.swap_ns - frame.age_ns if follows else frame.draw_ns) < sky.set_ns:
                 return True
             self._settled = Settled(sky.set_ns, now_ns + MARGIN_NS)
         return seen is None or seen.host_ns <= self._settled.seen_ns
 
     async def settled(self) -> None:
-        """Wait until the sky is as it was set. Raises ScpiError (-365) where that takes over SETTLES_S."""
+        """Wait until the sky is as it was set. Raises ScpiError (-365) where that takes over
+        SETTLES_S.
+        """
         if not self.pending():
             return
         while self.pending():
@@ -255,19 +274,22 @@ class ScpiServer:
         lines = LineBuffer()
         try:
             while data := await incoming.read(MAX_READ_BYTES):
-                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)  # else a write after a write waits for 40 ms
+                # else a write after a write waits for 40 ms
+                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
                 self.peers.heard(client)
                 await client.turn()
                 for line in lines.feed(data):
                     answer = await client.answer(line)
-                    if client.wrong_tokens >= MAX_WRONG_TOKENS or outgoing.is_closing():  # it gave way to another
+                    # it gave way to another
+                    if client.wrong_tokens >= MAX_WRONG_TOKENS or outgoing.is_closing():
                         return
                     if answer:
                         outgoing.write(answer.encode("ascii", "replace") + b"\n")
                         async with asyncio.timeout(UNREAD_S):
                             await outgoing.drain()
         except NotScpi:
-            outgoing.transport.abort()  # a browser, as a rule, that another site's page made ask here: it gets no answer
+            # a browser, as a rule, that another site's page made ask here: it gets no answer
+            outgoing.transport.abort()
         except (OSError, TimeoutError):
             outgoing.transport.abort()  # it has gone, or does not read
         finally:
@@ -344,19 +366,23 @@ class Connection:
         if answer.status >= 400:
             raise ScpiError(ORDER_ERRORS.get(answer.status, -310), answer.line)
         done_ns = time.monotonic_ns()
-        for _ in range(round(2 * TICK_S / POLL_S) + 1):  # the next query is to see what the order changed
+        # the next query is to see what the order changed
+        for _ in range(round(2 * TICK_S / POLL_S) + 1):
             if self._reader.seen is not None and self._reader.seen.host_ns > done_ns:
                 break
             await asyncio.sleep(POLL_S)
 
     async def reset(self, unit: Unit) -> None:
-        """`*RST`: the sky uncovered and without faults, standing still; the attitude and the ledger stay."""
+        """`*RST`: the sky uncovered and without faults, standing still; the attitude and the
+        ledger stay.
+        """
         self.status.completes = False
         seen = self._reader.seen
         for name in () if seen is None else [name for name, on in seen.operator.items() if on]:
             await self._order(Order(id=0, name=name, who=self._who, on=False))
         for name in [] if seen is None else seen.faults:
-            with contextlib.suppress(ScpiError):  # one of the faults' stream is not this run's to end
+            # one of the faults' stream is not this run's to end
+            with contextlib.suppress(ScpiError):
                 await self._order(Order(id=0, name="fault", who=self._who, on=False, fault=name))
         if self._server.sky is not None:
             self._server.sky.rate((0.0, 0.0, 0.0))

@@ -26,7 +26,9 @@ def usual(rng: np.random.Generator, k: int) -> float:
 
 
 class Run:
-    """A stream of 200 Hz through jump filter and clock, a frame every third packet; errors in ms of time shown."""
+    """A stream of 200 Hz through jump filter and clock, a frame every third packet; errors in ms
+    of time shown.
+    """
 
     def __init__(self, sender_ns: Callable[[int, int], int], delay: Delay = usual, count: int = 6000) -> None:
         rng = np.random.default_rng(1)
@@ -65,7 +67,9 @@ def test_a_one_way_stream_is_shown_late_by_its_minimum_delay_and_no_more(plain):
 
 @pytest.mark.parametrize("ppm", [100, -100, 1000, -1000])
 def test_a_drift_is_followed_and_stated(ppm):
-    """Within 5 us of the minimum delay for 100 ppm, which is 0.02 arcsec at 1 deg/s; and the drift to 1 ppm."""
+    """Within 5 us of the minimum delay for 100 ppm, which is 0.02 arcsec at 1 deg/s; and the
+    drift to 1 ppm.
+    """
     run = Run(lambda host, k: host + (host - HOST0_NS) * ppm // 1_000_000)
     assert np.abs(run.error_ms[600:] + MIN_DELAY_MS).max() < 5e-5 * abs(ppm)
     assert run.clock.summary().drift_ppm == pytest.approx(ppm, abs=1.0)
@@ -115,7 +119,9 @@ def test_jitter_of_5_ms_costs_a_tenth_of_a_millisecond():
 
 
 def test_where_it_fails_a_jump_smaller_than_the_limit_is_a_step_until_the_line_forgets():
-    """2 ms are under what a queue may do: the time shown is off by up to that, 7 arcsec at 1 deg/s."""
+    """2 ms are under what a queue may do: the time shown is off by up to that, 7 arcsec at 1
+    deg/s.
+    """
     run = Run(lambda host, k: host - (2 * NS_PER_MS if k > 3000 else 0))
     assert run.jumps.jumps == 0
     assert 1.5 < np.abs(run.error_ms[1100:1200]).max() < 2.1
@@ -123,7 +129,9 @@ def test_where_it_fails_a_jump_smaller_than_the_limit_is_a_step_until_the_line_f
 
 @pytest.mark.parametrize("speed", [0.5, 0.9, 0.99])
 def test_a_slow_clock_is_followed_in_small_steps_and_is_no_row_of_jumps(speed, plain):
-    """A step of 5 ms, and what a packet's period adds. Known after three seconds; before, it is behind by what it is slow."""
+    """A step of 5 ms, and what a packet's period adds. Known after three seconds; before, it is
+    behind by what it is slow.
+    """
     run = Run(lambda host, k: round((host - HOST0_NS) * speed))
     assert run.accepted == 6000
     assert run.jumps.jumps == 0
@@ -141,7 +149,9 @@ def test_a_fast_clock_is_known_to_be_one():
 def exchanged(
     clock: SenderClock, rng: np.random.Generator, ppm: float = 0.0, wire_ns: tuple[int, int] = (0, 0), count: int = 40
 ) -> None:
-    """Exchanges twice a second with a sender 7 s ahead; delays as a loopback's, and what the wire takes."""
+    """Exchanges twice a second with a sender 7 s ahead; delays as a loopback's, and what the
+    wire takes.
+    """
     for k in range(count):
         t1 = HOST0_NS + k * NS_PER_S // 2
         arrives = t1 + usual(rng, k) + wire_ns[0]
@@ -168,7 +178,9 @@ def test_exchanges_give_the_offset_itself_and_its_bound(rng, ppm):
 
 
 def test_a_slow_wire_s_longer_reply_is_allowed_for(rng):
-    """9600 baud: 22.9 ms there and 39.6 ms back; half of the difference, 8 ms, would be the error."""
+    """9600 baud: 22.9 ms there and 39.6 ms back; half of the difference, 8 ms, would be the
+    error.
+    """
     wire_ns = (22_900_000, 39_600_000)
     clock = SenderClock()
     exchanged(clock, rng, wire_ns=wire_ns)
@@ -186,7 +198,9 @@ def test_exchanges_that_stop_give_way_to_the_stream(rng):
 
 
 def test_a_correction_enters_without_a_step():
-    """After its first second, an offset that is found 20 ms smaller moves by no more than SLEW of the time that goes by."""
+    """After its first second, an offset that is found 20 ms smaller moves by no more than SLEW
+    of the time that goes by.
+    """
     clock = SenderClock()
     shown = []
     for k in range(1200):

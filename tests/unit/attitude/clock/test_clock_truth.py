@@ -1,6 +1,8 @@
-"""The summary's uncertainty against a simulated truth: the times that frames use are never farther from it than stated.
+"""The summary's uncertainty against a simulated truth: the times that frames use are never farther
+from it than stated.
 
-The true times of a one-way stream are late by the minimum delay, which such a stream cannot measure.
+The true times of a one-way stream are late by the minimum delay, which such a stream cannot
+measure.
 """
 
 from __future__ import annotations
@@ -21,18 +23,22 @@ PERIOD_NS = 5 * NS_PER_MS
 MIN_DELAY_NS = 50_000
 HOST0_NS = 10**12
 Q = np.array([1.0, 0.0, 0.0, 0.0])
-# The spread of a few arrivals, exponential with 0.05 ms, that the next quarter of a second has yet to show.
+# The spread of a few arrivals, exponential with 0.05 ms, that the next quarter of a second has yet
+# to show.
 ALLOWED_MS = 0.03
 # Until eight messages have shown it, or three for 100 ms have agreed on it, a jump cannot be known.
 IN_DOUBT_NS = LATE_FOR_NS + 10 * PERIOD_NS
 
 Times = Callable[[int], int]  # the sender's clock at a host time
-Reading = Callable[[int], tuple[int, int]]  # arrival to (when it is read, how long it may have waited)
+# arrival to (when it is read, how long it may have waited)
+Reading = Callable[[int], tuple[int, int]]
 
 
 @dataclass
 class Truth:
-    """One run through filter and clock as the receiver does it; at every second packet, error and uncertainty, ms."""
+    """One run through filter and clock as the receiver does it; at every second packet, error
+    and uncertainty, ms.
+    """
 
     times: Times
     reading: Reading = lambda arrival_ns: (arrival_ns, 0)
@@ -167,7 +173,9 @@ def test_messages_that_waited_before_the_start_do_not_mislead_the_clock(seed):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("timely", [True, False])
 def test_a_sender_that_restarts_is_followed_on_a_loaded_machine(timely, seed):
-    """It sends for half a second, before or after the frames begin; then its clock restarts, and each packet is later still."""
+    """It sends for half a second, before or after the frames begin; then its clock restarts, and
+    each packet is later still.
+    """
     rng = np.random.default_rng(seed)
     restart_ns, late_ns = HOST0_NS + NS_PER_S // 2, 0
 
@@ -196,7 +204,9 @@ def test_a_link_20_ms_slower_for_a_while_is_not_a_jump_and_costs_no_packet():
 @pytest.mark.parametrize("ppm", [30, -30])
 @pytest.mark.parametrize("silent_s", [600, 3600])
 def test_clocks_that_parted_in_a_long_silence_are_no_jump(ppm, silent_s):
-    """After two seconds no drift is known; an hour makes 108 ms of it. Half a second later it is within what is said."""
+    """After two seconds no drift is known; an hour makes 108 ms of it. Half a second later it is
+    within what is said.
+    """
     pause_ns = silent_s * NS_PER_S
 
     def read(arrival_ns: int) -> tuple[int, int]:
@@ -214,7 +224,9 @@ def test_clocks_that_parted_in_a_long_silence_are_no_jump(ppm, silent_s):
 
 
 def test_packets_queueing_on_a_slow_link_are_not_a_slow_clock_where_exchanges_show_it():
-    """A line that carries nine of ten packets: each is later than the one before, until it is full after 0.35 s."""
+    """A line that carries nine of ten packets: each is later than the one before, until it is
+    full after 0.35 s.
+    """
 
     def read(arrival_ns: int) -> tuple[int, int]:
         behind_ns = min(max(arrival_ns - HOST0_NS - 4 * NS_PER_S, 0) // 10, 350 * NS_PER_MS)

@@ -1,4 +1,6 @@
-"""Prediction that damps jitter: exact for a steady turn, never much worse than the rate, and better where jitter is fast."""
+"""Prediction that damps jitter: exact for a steady turn, never much worse than the rate, and
+better where jitter is fast.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ AUTO, RATE = Policy(250 * NS_PER_MS, 250 * NS_PER_MS, prediction="auto"), Policy
 
 
 def errors_arcsec(policy: Policy, samples: list[AttitudeSample], turn: FloatArray = TURN_RAD_S) -> list[float]:
-    """Of the attitude predicted just before each next sample is there, against a steady turn from START."""
+    """Of the attitude predicted just before each next sample is there, against a steady turn
+    from START.
+    """
     timeline, errors = Timeline(policy), []
     for sample in samples:
         timeline.add(sample)
@@ -78,7 +82,9 @@ def test_jitter_is_predicted_as_well_as_by_the_rate_or_by_the_newest_attitude(ra
 
 
 def test_a_slew_that_begins_is_followed_though_jitter_was_damped_before_it():
-    """5 deg/s^2 out of a vibration of 2 arcsec at 20 Hz: three sigma of jitter at most are held back, 20 ms long."""
+    """5 deg/s^2 out of a vibration of 2 arcsec at 20 Hz: three sigma of jitter at most are held
+    back, 20 ms long.
+    """
     times_s, step_s = np.arange(0, 3, 0.01), 0.01
     rate = np.radians(5.0) * np.clip(times_s - 2.0, 0, 0.5)
     rate_jitter = 2 / ARCSEC_PER_RAD * math.tau * 20 * np.cos(math.tau * 20 * times_s + 0.4)

@@ -1,4 +1,6 @@
-"""Whether packets' rates are those of their attitudes: what is wrong is named, and what is right is never called wrong."""
+"""Whether packets' rates are those of their attitudes: what is wrong is named, and what is right
+is never called wrong.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ OTHER_FRAME = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
 
 
 def moved(rates: FloatArray, step_s: float) -> FloatArray:
-    """The attitudes (n, 4) from START at rates (n, 3), cam, that change linearly from one to the next."""
+    """The attitudes (n, 4) from START at rates (n, 3), cam, that change linearly from one to the
+    next.
+    """
     steps = from_rotation_vectors(-(rates[1:] + rates[:-1]) / 2 * step_s)
     q = [START]
     for step in steps:
@@ -82,7 +86,8 @@ LINES = {
     ("last", "cam_to_icrs"): '{ scalar = "last", direction = "cam_to_icrs" }',
 }
 
-AXES = {"axes", "axes and signs", "signs", "another frame", "another frame, deg/s"}  # in noise these are one
+# in noise these are one
+AXES = {"axes", "axes and signs", "signs", "another frame", "another frame, deg/s"}
 
 
 def watched(stream: list[AttitudeSample], mode="use-quaternions") -> tuple[RateCheck, list[tuple[str, str]], float | None]:

@@ -31,7 +31,8 @@ def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
     truth = [propagate(START, TURN_RAD_S, k / 50) for k in range(len(stream))]
     off = [angle_between_rad(q, s.q_icrs_to_cam) for q, s in zip(truth, stream, strict=True)]
     said_arcsec = float(line.split("off by ")[1].split()[0])
-    # The norm takes one of four components back: 3/4 of the squares are left, which the estimate's three axes are.
+    # The norm takes one of four components back: 3/4 of the squares are left, which the estimate's
+    # three axes are.
     assert said_arcsec == pytest.approx(np.sqrt(np.mean(np.square(off))) * ARCSEC_PER_RAD, rel=0.15)
 
 

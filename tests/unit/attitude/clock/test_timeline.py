@@ -115,7 +115,9 @@ def swing_rate(t_s: float) -> np.ndarray:
 
 
 def integrated(step_s: float = 1e-3, seconds: float = 4.0) -> list[np.ndarray]:
-    """Attitudes each ms: the midpoint rule, 1e-10 rad off after 4 s (steps of 0.1 ms differ by less)."""
+    """Attitudes each ms: the midpoint rule, 1e-10 rad off after 4 s (steps of 0.1 ms differ by
+    less).
+    """
     q = START
     path = [q]
     for k in range(round(seconds / step_s)):
@@ -145,7 +147,9 @@ def worst_arcsec(timeline: Timeline) -> float:
 
 
 def test_rates_make_the_curve_between_samples_two_hundred_times_better():
-    """At 10 Hz SLERP cuts the corners by a T^2/8 (a = 0.036 rad/s2: 9.4 arcsec); the blend is 0.045 arcsec off."""
+    """At 10 Hz SLERP cuts the corners by a T^2/8 (a = 0.036 rad/s2: 9.4 arcsec); the blend is
+    0.045 arcsec off.
+    """
     slerped, blended = worst_arcsec(swinging(100, rate=False)), worst_arcsec(swinging(100, rate=True))
     assert 8.0 < slerped < 11.0
     assert blended < 0.06
@@ -157,7 +161,9 @@ def test_the_blend_s_error_falls_with_the_third_power_of_the_step_and_more():
 
 
 def test_the_blend_is_c2_at_its_samples():
-    """Rate and acceleration from both sides of a sample, by differences over 1 ms, agree to the differences' own error."""
+    """Rate and acceleration from both sides of a sample, by differences over 1 ms, agree to the
+    differences' own error.
+    """
     timeline = swinging(100, rate=True)
 
     def q(t_ms: float) -> np.ndarray:
@@ -169,8 +175,10 @@ def test_the_blend_is_c2_at_its_samples():
         before = [rate_between_rad_s(q(t_ms - k - 1), q(t_ms - k), 1e-3) for k in (0, 1)]
         after = [rate_between_rad_s(q(t_ms + k), q(t_ms + k + 1), 1e-3) for k in (0, 1)]
         left, right = (before[0] - before[1]) / 1e-3, (after[1] - after[0]) / 1e-3
-        assert np.abs(after[0] - before[0]).max() < 2e-4  # an acceleration of 0.06 rad/s2 over 1 ms, twice
-        assert np.abs(left - right).max() < 2e-2  # its change over 2 ms; a C1 curve is off by 0.1 and more
+        # an acceleration of 0.06 rad/s2 over 1 ms, twice
+        assert np.abs(after[0] - before[0]).max() < 2e-4
+        # its change over 2 ms; a C1 curve is off by 0.1 and more
+        assert np.abs(left - right).max() < 2e-2
 
 
 def test_a_log_backwards_is_the_same_curve():
@@ -202,7 +210,9 @@ def test_constant_rate_motion_with_rates_is_reproduced():
 
 
 def test_nothing_overshoots_across_a_gap():
-    """Two samples at rest but for a rate that each claims: over a gap longer than stale_after the way is the straight one."""
+    """Two samples at rest but for a rate that each claims: over a gap longer than stale_after
+    the way is the straight one.
+    """
     fast = np.array([0.0, 0.0, 2.0])
     timeline = filled(AttitudeSample(0, START, fast), AttitudeSample(S, START, fast), stale_after_ms=250)
     for t_ms in range(0, 1000, 10):
@@ -264,7 +274,8 @@ def test_a_rate_over_the_limit_is_refused_by_name_with_its_unit():
     assert refusal.reason == "rate"
     for word in ("max_rate_deg_s = 60", "rad/s", "60.06 deg/s"):
         assert word in refusal.detail
-    rounded = np.float32([0.0, 0.0, MAX_RATE_RAD_S]).astype(float)  # 60 deg/s itself, as a packet carries it
+    # 60 deg/s itself, as a packet carries it
+    rounded = np.float32([0.0, 0.0, MAX_RATE_RAD_S]).astype(float)
     assert limited().add(AttitudeSample(0, START, rounded)) is None
 
 
@@ -280,7 +291,8 @@ def orbiting(t_ms: float, **more) -> AttitudeSample:
     [
         (-5.0, 0.04),  # the first sample's, 5 ms away
         (0.0, 1e-12),
-        (4000.0, 1e-5),  # of a cubic: the jerk's derivative, 1e-8 km/s^4, times (10 s)^4 / 384, is 3e-7
+        # of a cubic: the jerk's derivative, 1e-8 km/s^4, times (10 s)^4 / 384, is 3e-7
+        (4000.0, 1e-5),
         (10_080.0, 3e-5),  # straight on: 8e-3 km/s^2 (80 ms)^2 / 2
         (10_100.0, 5e-5),
     ],

@@ -1,4 +1,6 @@
-"""CCSDS AEM: order, direction, frames and rates against SciPy and the standard's own figures, and what is refused."""
+"""CCSDS AEM: order, direction, frames and rates against SciPy and the standard's own figures,
+and what is refused.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,17 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
-# Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few roundings of 1.
+# Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few
+# roundings of 1.
 MATRIX_TOLERANCE = 1e-14
-# The reference derivative is a central difference over 2 h = 2e-4 s: h^2 rate^3 / 24 = 1e-9 1/s and rounding 1e-16 / h.
+# The reference derivative is a central difference over 2 h = 2e-4 s: h^2 rate^3 / 24 = 1e-9 1/s and
+# rounding 1e-16 / h.
 DIFFERENCE_S = 1e-4
 DERIVATIVE_TOLERANCE_RAD_S = 1e-8
 # 504.0-B-2 annex F prints its example to four digits.
 ANNEX_F_TOLERANCE = 1e-4
-# EME2000 against ICRF: the frame bias of the IAU 2000 precession-nutation, -16.6, -6.8 and -14.6 mas about x, y and z.
+# EME2000 against ICRF: the frame bias of the IAU 2000 precession-nutation, -16.6, -6.8 and -14.6
+# mas about x, y and z.
 FRAME_BIAS_MAS = 23.15
 FRAME_BIAS_TOLERANCE_MAS = 0.01
 
@@ -92,7 +97,9 @@ def camera(seconds=0.0):
 
 
 def second_from_first(frame_a, direction, seconds=0.0):
-    """The rotation whose quaternion a file has to hold, and whether its second frame is the camera."""
+    """The rotation whose quaternion a file has to hold, and whether its second frame is the
+    camera.
+    """
     to_cam = (frame_a == "ICRF") == (direction == "A2B")
     return (camera(seconds).inv() if to_cam else camera(seconds)), to_cam
 
@@ -329,7 +336,9 @@ def test_xml_that_is_written_states_all_that_it_means_and_holds_the_numbers(tmp_
 
 @pytest.mark.parametrize("form", ["aem", "xml"])
 def test_what_is_written_is_read_to_the_last_bit_but_one(tmp_path, form):
-    """The conjugate's conjugate is the quaternion itself; a rate goes through its derivative and back."""
+    """The conjugate's conjugate is the quaternion itself; a rate goes through its derivative and
+    back.
+    """
     write_log(tmp_path / f"a.{form}", turning_samples())
     for read_back, sample in zip(read_log(tmp_path / f"a.{form}"), turning_samples(), strict=True):
         assert (read_back.t_ns, read_back.discontinuity) == (sample.t_ns, sample.discontinuity)

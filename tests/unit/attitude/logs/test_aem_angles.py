@@ -1,4 +1,6 @@
-"""AEM with Euler angles and spins, against SciPy's rotations: each sequence, both directions, rates, both forms."""
+"""AEM with Euler angles and spins, against SciPy's rotations: each sequence, both directions,
+rates, both forms.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_
 
 # Angles are written with 17 digits; three turns of them are a few roundings of 1 rad.
 MATRIX_TOLERANCE = 2e-14
-# Rates of angles are central differences over 2 h = 2e-4 s: h^2 w^3 / 6 = 1e-8 here, more by the tangents of the angles.
+# Rates of angles are central differences over 2 h = 2e-4 s: h^2 w^3 / 6 = 1e-8 here, more by the
+# tangents of the angles.
 H_S = 1e-4
 RATE_TOLERANCE_RAD_S = 1e-6
 RATE_CAM_RAD_S = np.array([0.3, -1.1, 0.7])
@@ -30,7 +33,9 @@ def camera(seconds=0.0, first=None):
 
 
 def placed(frame_a, direction, rotation):
-    """Of the file's first frame's components into the second's, and whether the second is the camera."""
+    """Of the file's first frame's components into the second's, and whether the second is the
+    camera.
+    """
     to_cam = (frame_a == "ICRF") == (direction == "A2B")
     return (rotation.inv() if to_cam else rotation), to_cam
 
@@ -42,7 +47,9 @@ def keywords(version, frame_a, direction, names, **more):
 
 
 def angles_deg(rotation, names):
-    """Turns of the frame, one after another: SciPy's upper-case sequence of the rotation that carries the axes along."""
+    """Turns of the frame, one after another: SciPy's upper-case sequence of the rotation that
+    carries the axes along.
+    """
     return rotation.inv().as_euler(names, degrees=True)
 
 
@@ -100,7 +107,9 @@ def test_rates_whose_meaning_the_file_does_not_state_are_not_used_and_a_notice_s
 
 
 class SpinningBody:
-    """A body whose +z axis nutates about its angular momentum: turns ZXZ at constant rates from the momentum's frame."""
+    """A body whose +z axis nutates about its angular momentum: turns ZXZ at constant rates from
+    the momentum's frame.
+    """
 
     precession_rad_s, nutation_rad, spin_rad_s = 0.4, 0.3, -1.5
 

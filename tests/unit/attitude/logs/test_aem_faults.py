@@ -92,7 +92,9 @@ TURN_DEG_S = 3.0
 
 
 def turned(number, second):
-    """Of segment `number`, about z at a constant rate; each segment has an offset of its own, so that it can be told."""
+    """Of segment `number`, about z at a constant rate; each segment has an offset of its own, so
+    that it can be told.
+    """
     angle = np.radians(TURN_DEG_S * second + 40.0 * number) / 2
     return f"2024-01-01T00:00:{second:02d} 0 0 {float(np.sin(angle))!r} {float(np.cos(angle))!r}"
 
@@ -121,14 +123,16 @@ def useable(start, stop):
 @pytest.mark.parametrize(
     ("segments", "wanted"),
     [
-        # Without USEABLE times: the later segment from its beginning; and where it has ended, the earlier one again.
+        # Without USEABLE times: the later segment from its beginning; and where it has ended, the
+        # earlier one again.
         ([([0, 20, 40], {}), ([25, 45], {})], {24: 0, 25: 1, 26: 1, 44: 1}),
         ([([0, 20, 40], {}), ([25, 30], {})], {24: 0, 26: 1, 29: 1, 30.5: 0, 39: 0}),
         # By USEABLE times, between attitudes too: the earlier one goes on to its end there.
         ([([0, 20, 40], useable(0, 33)), ([30, 50], useable(33, 50))], {29: 0, 32: 0, 32.9: 0, 33.1: 1, 49: 1}),
         # Where only one segment has a time, it is taken whether it is useable there or not.
         ([([0, 20, 40], useable(5, 28)), ([30, 50], useable(35, 45))], {1: 0, 29: 0, 31: 1, 49: 1}),
-        # In the file's order they need not be; of two that begin together the later in the file is taken.
+        # In the file's order they need not be; of two that begin together the later in the file is
+        # taken.
         ([([30, 50], {}), ([0, 20, 40], {})], {29: 1, 31: 0, 49: 0}),
         ([([0, 20], {}), ([0, 20], {})], {1: 1, 19: 1}),
         # One attitude alone has no duration, and is left out within another segment.

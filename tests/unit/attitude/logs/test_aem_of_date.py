@@ -1,4 +1,6 @@
-"""AEM whose attitudes refer to a frame of date or to the Earth, against Astropy's frames and published precession."""
+"""AEM whose attitudes refer to a frame of date or to the Earth, against Astropy's frames and
+published precession.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,12 @@ from hilstar.basics.rotation import to_matrix
 from tests.support.sources.aem_messages import kvn, refusal
 
 ARCSEC = np.radians(1 / 3600)
-# Astropy ties TEME to the Earth by GMST of 1982 and the Earth by IAU 2006/2000A; hilstar by IAU 1980 from the stars. The models
-# of 1980 and 2000 differ by 0.02 arcsec in 2000 to 2030 (nutation), and UT1's definition by less.
+# Astropy ties TEME to the Earth by GMST of 1982 and the Earth by IAU 2006/2000A; hilstar by IAU
+# 1980 from the stars. The models of 1980 and 2000 differ by 0.02 arcsec in 2000 to 2030 (nutation),
+# and UT1's definition by less.
 TEME_TOLERANCE_RAD = 0.04 * ARCSEC
-# Pole offsets (0.4 mas), tides under a day and s': what `earth` leaves out; TETE in Astropy is of the same model.
+# Pole offsets (0.4 mas), tides under a day and s': what `earth` leaves out; TETE in Astropy is of
+# the same model.
 ITRF_TOLERANCE_RAD, TOD_TOLERANCE_RAD = 0.002 * ARCSEC, 0.0005 * ARCSEC
 # The offset of right ascension in the frame bias is published to 0.1 mas.
 MOD_TOLERANCE_RAD = 0.00015 * ARCSEC
@@ -41,7 +45,9 @@ def samples_of(tmp_path, text):
 
 
 def frame_from_gcrs(frame):
-    """The matrix of Astropy that turns components of the ICRS's axes at the Earth into those of a frame."""
+    """The matrix of Astropy that turns components of the ICRS's axes at the Earth into those of
+    a frame.
+    """
     axes = GCRS(CartesianRepresentation(np.eye(3) * FAR_KM * u.km), obstime=frame.obstime)
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
         return axes.transform_to(frame).cartesian.xyz.to_value(u.km) / FAR_KM
@@ -69,7 +75,8 @@ def test_frames_of_date_are_astropys(tmp_path, name, frame, tolerance_rad, date)
 
 @pytest.mark.parametrize("date", DATES)
 def test_the_mean_equator_of_date_is_that_of_the_published_precession(tmp_path, date):
-    # Capitaine, Wallace & Chapront 2003, A&A 412, 567, eq. 40; the frame bias of the IERS Conventions (2010), 5.3.2.
+    # Capitaine, Wallace & Chapront 2003, A&A 412, 567, eq. 40; the frame bias of the IERS
+    # Conventions (2010), 5.3.2.
     t = (Time(date, scale="utc").tt.jd - 2451545.0) / 36525.0
     zeta = np.polyval([-0.0000003173, -0.000005971, 0.01801828, 0.2988499, 2306.083227, 2.650545], t)
     z = np.polyval([-0.0000002904, -0.000028596, 0.01826837, 1.0927348, 2306.077181, -2.650545], t)

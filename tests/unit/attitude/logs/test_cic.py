@@ -1,4 +1,6 @@
-"""CNES's CIC AEM, as the tools around VTS write it: the same attitudes as a CCSDS AEM, and what is refused."""
+"""CNES's CIC AEM, as the tools around VTS write it: the same attitudes as a CCSDS AEM, and what
+is refused.
+"""
 
 from __future__ import annotations
 

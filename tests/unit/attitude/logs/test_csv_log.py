@@ -1,4 +1,6 @@
-"""CSV logs as loggers write them: cut off, with rows that do not hold, in other dialects and units, and what is refused."""
+"""CSV logs as loggers write them: cut off, with rows that do not hold, in other dialects and
+units, and what is refused.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A log's gaps by its own samples: what lies between them, against motion that is known at every moment."""
+"""A log's gaps by its own samples: what lies between them, against motion that is known at every
+moment.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from hilstar.server.send_log import log_samples
 
 S = 1_000_000_000
 START = from_radec_roll_deg(84, -1.2, 30)
-STREAM = Policy(max_extrapolation_ns=100_000_000, stale_after_ns=250_000_000)  # of a live stream, which a log ignores
+# of a live stream, which a log ignores
+STREAM = Policy(max_extrapolation_ns=100_000_000, stale_after_ns=250_000_000)
 
 
 def coning(spin_rad_s: float, nutation_rad_s: float, t_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +46,8 @@ def worst_arcsec(samples, spin=0.02, nutation=0.03, policy=STREAM) -> float:
     return float(np.degrees(max(errors)) * 3600)
 
 
-# The error of SLERP is a T^2 / 8, with a = spin x nutation; the blend's is of the next order, and measured here.
+# The error of SLERP is a T^2 / 8, with a = spin x nutation; the blend's is of the next order, and
+# measured here.
 @pytest.mark.parametrize(
     ("step_s", "spin", "nutation", "limit_arcsec"), [(0.5, 0.02, 0.03, 0.002), (4.0, 2e-3, 1e-3, 0.01), (4.0, 0.02, 0.03, 8.0)]
 )
@@ -102,7 +106,9 @@ def test_a_few_lost_samples_are_no_gap():
 
 
 def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
-    """A steady turn, five radians in the gap: its rates lead from the one side to the other to a degree."""
+    """A steady turn, five radians in the gap: its rates lead from the one side to the other to a
+    degree.
+    """
     times = [*np.arange(0, 10, 0.5), *np.arange(600, 610, 0.5)]
     samples = log(times, spin=0.008, nutation=0.0)
     assert log_joins(samples).told == []

@@ -64,7 +64,8 @@ def test_rates_of_another_unit_are_named_where_the_times_would_be_odd(tmp_path):
     said, _ = notices(written(tmp_path, "csv", 1.0, 0.02, rates=True, scale=1e3))
     assert "probably the rates are in mrad/s" in said
     said, _ = notices(written(tmp_path, "csv", 1e-3, 0.005, rates=True))
-    assert "the times are in ms, or the rates are in mrad/s" in said  # 5 s or 5 ms: both are a log's
+    # 5 s or 5 ms: both are a log's
+    assert "the times are in ms, or the rates are in mrad/s" in said
 
 
 @pytest.mark.parametrize("rates", [False, True])

@@ -21,7 +21,8 @@ FULL_HEAD = "t_s,qw,qx,qy,qz,rx,ry,rz,sequence,discontinuity\n"
 FORMS = ("csv", "jsonl", "json", "aem", "kvn", "xml", "mcap")
 FORMATS = ("csv", "jsonl", "kvn", "xml", "mcap")  # what the endings come down to
 AEM_FORMS = {"aem", "kvn", "xml"}
-# An AEM holds a rate as a quaternion derivative: there and back are 16 products summed by fours, each rounded to eps/2.
+# An AEM holds a rate as a quaternion derivative: there and back are 16 products summed by fours,
+# each rounded to eps/2.
 RATE_TOLERANCE = 16 * np.finfo(np.float64).eps
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
@@ -43,7 +44,9 @@ def random_samples(rng, count, every_rate=True):
 
 
 def as_aem_holds(samples):
-    """What is left of samples in an AEM: no sequence, and no rates in a block where one is missing."""
+    """What is left of samples in an AEM: no sequence, and no rates in a block where one is
+    missing.
+    """
     starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity] + [len(samples)]
     kept = []
     for begin, end in pairwise(starts):

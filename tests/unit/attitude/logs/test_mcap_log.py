@@ -32,7 +32,9 @@ def sample(t_ns, sequence=0, rate=None):
 
 
 def ledger(messages, chunk_size=1024 * 1024, finish=True):
-    """An MCAP file of attitude messages between those of another channel, as a live run writes it."""
+    """An MCAP file of attitude messages between those of another channel, as a live run writes
+    it.
+    """
     file = io.BytesIO()
     writer = Writer(file, chunk_size=chunk_size)
     writer.start(library="test")
@@ -70,7 +72,8 @@ def test_an_mcap_log_opens_in_the_library_as_json_with_a_schema(tmp_path):
 
 
 def test_the_schema_names_every_field_with_one_plain_type():
-    # Foxglove's reader throws for a type that is a list (foxglove/studio, packages/mcap-support/src/parseJsonSchema.ts).
+    # Foxglove's reader throws for a type that is a list (foxglove/studio,
+    # packages/mcap-support/src/parseJsonSchema.ts).
     properties = json.loads(ATTITUDE_SCHEMA)["properties"]
     assert list(properties) == list(json.loads(attitude_message(sample(0))))
     assert {p["type"] for p in properties.values()} <= {"integer", "number", "boolean", "string", "array"}

@@ -1,4 +1,6 @@
-"""STK's attitude files: each form against numbers by hand, AGI's own examples and SciPy, and what is refused."""
+"""STK's attitude files: each form against numbers by hand, AGI's own examples and SciPy, and
+what is refused.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,8 @@ def test_quaternions_are_the_conjugates_of_hilstars_scalar_last_or_first(log):
 def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(log):
     spun = log(AGI_SPIN, "AttitudeTimeQuatAngVels")
     about_z = turns(spun).as_rotvec()[:, 2]
-    assert about_z == pytest.approx(-np.radians([0, 60, 120]), abs=ROUNDING)  # components turn the other way
+    # components turn the other way
+    assert about_z == pytest.approx(-np.radians([0, 60, 120]), abs=ROUNDING)
     for sample in spun.samples:
         assert sample.rate_cam_rad_s == pytest.approx([0, 0, np.radians(6)], abs=ROUNDING)
     assert not spun.joins().misfits
@@ -71,7 +74,8 @@ def test_euler_angles_are_turns_of_the_axes_in_the_order_of_the_sequence(log):
         found = turns(log([f"0 {' '.join(map(str, angles))}"], "AttitudeTimeEulerAngles", Sequence=sequence))
         wanted = Rotation.from_euler(axes, angles, degrees=True).inv()
         assert (found[0] * wanted.inv()).magnitude() < ROUNDING
-    spun = turns(log(["0 60 0 0"], "AttitudeTimeEulerAngles", Sequence="313"))  # the second of AGI_SPIN
+    # the second of AGI_SPIN
+    spun = turns(log(["0 60 0 0"], "AttitudeTimeEulerAngles", Sequence="313"))
     assert spun[0].as_rotvec()[2] == pytest.approx(-np.radians(60), abs=ROUNDING)
 
 

@@ -1,4 +1,6 @@
-"""Zeros and NaN from before an estimator ran: left out at a log's beginning in every format, refused anywhere else."""
+"""Zeros and NaN from before an estimator ran: left out at a log's beginning in every format,
+refused anywhere else.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,8 @@ def unstamped_bag(folder, rows):
 
 
 WRITERS = [csv, json_lines, aem, cic, stk, mcap, bag, unstamped_bag]
-CASES = [(write, empty) for write in WRITERS for empty in (ZEROS, NAN) if (write, empty) != (mcap, NAN)]  # JSON has no NaN
+# JSON has no NaN
+CASES = [(write, empty) for write in WRITERS for empty in (ZEROS, NAN) if (write, empty) != (mcap, NAN)]
 
 
 @pytest.mark.parametrize(("write", "empty"), CASES)

@@ -1,4 +1,6 @@
-"""Who holds a tracker's TCP line, and which files are read: what is refused, let go, told, and taken again."""
+"""Who holds a tracker's TCP line, and which files are read: what is refused, let go, told, and
+taken again.
+"""
 
 from __future__ import annotations
 

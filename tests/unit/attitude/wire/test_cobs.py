@@ -71,9 +71,12 @@ def test_the_first_whole_frame_after_any_garbage_is_decoded(garbage):
 
 
 def test_nothing_is_accepted_that_the_crc_would_refuse_and_nothing_raises():
-    """Mutated frames, each followed by a good one: the good one always comes, the mutant only where its CRC is right."""
+    """Mutated frames, each followed by a good one: the good one always comes, the mutant only
+    where its CRC is right.
+    """
     rng = np.random.default_rng(4)
-    draws = rng.integers(0, 2**31, size=(MUTATED_FRAMES, 4, 4)).tolist()  # of each mutation: how, where, what, how long
+    # of each mutation: how, where, what, how long
+    draws = rng.integers(0, 2**31, size=(MUTATED_FRAMES, 4, 4)).tolist()
     counts = rng.integers(1, 5, size=MUTATED_FRAMES).tolist()
     noise = rng.bytes(100_100)
     decoder = StreamDecoder()

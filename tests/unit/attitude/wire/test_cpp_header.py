@@ -1,4 +1,6 @@
-"""The C++17 header against the vectors and against Python: as strict as compilers are, and without exceptions."""
+"""The C++17 header against the vectors and against Python: as strict as compilers are, and
+without exceptions.
+"""
 
 from __future__ import annotations
 

@@ -87,7 +87,9 @@ def driver(request, tmp_path_factory, sanitized) -> Path:
 
 
 def bits(vector: dict) -> list[int]:
-    """A vector's fields as the driver has them: each number's bits. No NaN: which of its bits are set says nothing."""
+    """A vector's fields as the driver has them: each number's bits. No NaN: which of its bits
+    are set says nothing.
+    """
     found: list[int] = []
     for name, value in vector["fields"].items():
         forms = {"q_icrs_to_cam": "<d", "rate_cam_rad_s": "<f"}
@@ -100,7 +102,9 @@ def bits(vector: dict) -> list[int]:
 
 
 def wire_level(message: bytes) -> int | None:
-    """The kind of what version, kind, length and CRC-32 say is a packet; an implementation of its own."""
+    """The kind of what version, kind, length and CRC-32 say is a packet; an implementation of
+    its own.
+    """
     if len(message) < 2 or message[0] != 1 or SIZES.get(message[1]) != len(message):
         return None
     return message[1] if struct.pack("<I", zlib.crc32(message[:-4])) == message[-4:] else None
@@ -197,7 +201,9 @@ def test_what_was_cut_in_two_before_the_first_delimiter_is_no_refusal(sanitized)
 
 
 def mutated(frames: list[bytes], rng: np.random.Generator) -> bytes:
-    """A frame with one to three of its bits, bytes or stretches wrong; sometimes with a new CRC over the wrong contents."""
+    """A frame with one to three of its bits, bytes or stretches wrong; sometimes with a new CRC
+    over the wrong contents.
+    """
     mutant = bytearray(frames[int(rng.integers(len(frames)))])
     if rng.random() < 0.3:
         message = bytearray(cobs.decode(bytes(mutant[:-1])))
@@ -219,7 +225,9 @@ def mutated(frames: list[bytes], rng: np.random.Generator) -> bytes:
 
 
 def test_c_takes_exactly_what_python_takes_of_mutated_frames(sanitized, rng):
-    """Each mutant, then a good frame: under the address and undefined-behaviour sanitizers, in one decoder from end to end."""
+    """Each mutant, then a good frame: under the address and undefined-behaviour sanitizers, in
+    one decoder from end to end.
+    """
     frames = [bytes.fromhex(vector["frame_hex"]) for vector in ACCEPTED]
     good = frame(TimeRequest(77, 78))
     streams = [mutated(frames, rng) + DELIMITER + good for _ in range(MUTATED_FRAMES)]

@@ -1,4 +1,6 @@
-"""What a flood may cost, at the smallest scale: the gate, a serial line of junk, and a line that takes nothing."""
+"""What a flood may cost, at the smallest scale: the gate, a serial line of junk, and a line that
+takes nothing.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,9 @@ class Line(SerialLink):
 
 
 def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go():
-    """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken: ages of seconds, no end."""
+    """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken:
+    ages of seconds, no end.
+    """
     with Line(flooded_messages(set())) as line:
         taken = [arrival.event.sequence for arrival in line.receive(0)]
         assert taken == list(range(2 * MAX_BURST, 3 * MAX_BURST))

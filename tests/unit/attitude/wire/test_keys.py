@@ -1,4 +1,6 @@
-"""CURVE keys: whose they are from the first byte on, and an allow-list that follows its directory."""
+"""CURVE keys: whose they are from the first byte on, and an allow-list that follows its
+directory.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from hilstar.basics.errors import InputError
 
 
 def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(tmp_path, monkeypatch):
-    """Seen at the moment when the file has just been written, by a user whose umask lets all read."""
+    """Seen at the moment when the file has just been written, by a user whose umask lets all
+    read.
+    """
     seen = []
     create = zmq.auth.create_certificates
 

@@ -20,7 +20,9 @@ ALL_ONES = 0xFFFFFFFF
 
 
 def crc_mpeg2(data: bytes) -> int:
-    """CRC-32/MPEG-2, bit by bit: polynomial 04C11DB7, most significant bit first, begun with ones, not inverted."""
+    """CRC-32/MPEG-2, bit by bit: polynomial 04C11DB7, most significant bit first, begun with
+    ones, not inverted.
+    """
     crc = ALL_ONES
     for byte in data:
         crc ^= byte << 24
@@ -31,7 +33,9 @@ def crc_mpeg2(data: bytes) -> int:
 
 
 def stm32_words(data: bytes) -> bytes:
-    """What an STM32's CRC unit sees of little-endian memory: 32-bit words, the most significant byte first."""
+    """What an STM32's CRC unit sees of little-endian memory: 32-bit words, the most significant
+    byte first.
+    """
     return b"".join(data[at : at + 4][::-1] for at in range(0, len(data), 4))
 
 

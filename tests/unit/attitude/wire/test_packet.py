@@ -45,7 +45,8 @@ def test_what_is_encoded_is_decoded(rng):
         got = decode(encode(sent))
         assert isinstance(got, AttitudeSample)
         assert (got.t_ns, got.sequence, got.discontinuity) == (sent.t_ns, sent.sequence, sent.discontinuity)
-        assert np.abs(got.q_icrs_to_cam - q).max() <= 2.3e-16  # at most one rounding of the division by the norm
+        # at most one rounding of the division by the norm
+        assert np.abs(got.q_icrs_to_cam - q).max() <= 2.3e-16
         assert (got.rate_cam_rad_s is None) == (rate is None)
         assert rate is None or np.array_equal(got.rate_cam_rad_s, rate)
 

@@ -1,4 +1,6 @@
-"""The generated files are those of protocol.toml, and the vectors are what Python itself reads and writes."""
+"""The generated files are those of protocol.toml, and the vectors are what Python itself reads
+and writes.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 ACCEPTED = [vector for vector in VECTORS if "refused" not in vector]
 REFUSED = [vector for vector in VECTORS if "refused" in vector]
-# Put together from the ICD alone, the CRC-32 at the end among them; nothing of this comes from hilstar or from the generator.
+# Put together from the ICD alone, the CRC-32 at the end among them; nothing of this comes from
+# hilstar or from the generator.
 FORMATS = {1: "<BBHIq4d3fI", 2: "<BBHIqI", 3: "<BBHIqqqI", 4: "<BBHIqqIIII", 5: "<BBHIq4d3fII"}
 SIZES = {1: 64, 2: 20, 3: 36, 4: 40, 5: 68}
 FIELDS = {
@@ -65,7 +68,9 @@ def same_bits(values: list, others: list) -> bool:
 
 
 def wire_fields(message: bytes) -> tuple[int, dict]:
-    """Kind and fields of a packet, its CRC and its fixed bytes checked: an implementation of the ICD of its own."""
+    """Kind and fields of a packet, its CRC and its fixed bytes checked: an implementation of the
+    ICD of its own.
+    """
     kind = message[1]
     version, _, *values, crc = struct.unpack(FORMATS[kind], message)
     assert version == 1

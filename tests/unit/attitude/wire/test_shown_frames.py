@@ -42,7 +42,8 @@ def test_a_frame_comes_back_as_it_was_shown(bits, channels, largest):
         lambda parts: parts[:2],
         lambda parts: [*parts, b""],
         lambda parts: [parts[0][:-1], *parts[1:]],
-        lambda parts: [parts[0].replace(b'"width":5', b'"width":4'), *parts[1:]],  # index 14 is outside
+        # index 14 is outside
+        lambda parts: [parts[0].replace(b'"width":5', b'"width":4'), *parts[1:]],
         lambda parts: [parts[0].replace(b"1.0,", b"1.1,"), *parts[1:]],
         lambda parts: [parts[0], parts[1][::-1], parts[2]],
         lambda parts: [parts[0], parts[1][:-1], parts[2]],
@@ -63,13 +64,16 @@ def test_lit_pixels_are_those_over_code_zero(kind, width, rng):
     assert np.array_equal(lit_pixels(levels), np.flatnonzero(levels))
 
 
-GREETING = bytes([0xFF, *7 * [0], 0x01, 0x7F, 3, 0]) + b"NULL".ljust(20, b"\0") + bytes(32)  # ZMTP 3.0 (RFC 23)
+# ZMTP 3.0 (RFC 23)
+GREETING = bytes([0xFF, *7 * [0], 0x01, 0x7F, 3, 0]) + b"NULL".ljust(20, b"\0") + bytes(32)
 READY = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB"
 FRAME = ShownFrame(HEAD, LIT, np.array([9, 9], dtype=np.uint8))
 
 
 class RawWatcher:
-    """A subscriber that sends what it likes: libzmq's own leaves out what it never subscribed to."""
+    """A subscriber that sends what it likes: libzmq's own leaves out what it never subscribed
+    to.
+    """
 
     def __init__(self, endpoint: str) -> None:
         self.socket = socket.create_connection(("127.0.0.1", int(endpoint.rpartition(":")[2])), PATIENCE_S)
@@ -104,7 +108,9 @@ def seen_by(watcher: FrameWatch, sender: FrameSender) -> None:
 
 
 def settled(sender: FrameSender) -> None:
-    """Wait until what was sent before has been read: a further watcher, which subscribes last, is seen, and leaves."""
+    """Wait until what was sent before has been read: a further watcher, which subscribes last,
+    is seen, and leaves.
+    """
     with closing(FrameWatch(sender.endpoint)) as last:
         seen_by(last, sender)
 

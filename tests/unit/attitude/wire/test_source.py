@@ -1,4 +1,6 @@
-"""A body's attitude and rate become the camera's, and the self-check's attitude points where it says."""
+"""A body's attitude and rate become the camera's, and the self-check's attitude points where it
+says.
+"""
 
 import re
 

@@ -1,4 +1,6 @@
-"""UDP's addresses, the times of its arrivals, and how little it answers: real sockets on loopback."""
+"""UDP's addresses, the times of its arrivals, and how little it answers: real sockets on
+loopback.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +82,9 @@ def test_an_arrival_has_the_kernel_s_stamp_on_the_host_s_clock_between_the_last_
 
 
 def test_no_address_gets_more_than_it_sent_but_for_statuses():
-    """An asker whose 20 bytes would each bring 36: of a hundred requests so many are answered as their bytes pay for."""
+    """An asker whose 20 bytes would each bring 36: of a hundred requests so many are answered as
+    their bytes pay for.
+    """
     with (
         UdpLink(ANYWHERE, AllowedSenders()) as link,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker,

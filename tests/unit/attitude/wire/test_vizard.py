@@ -1,4 +1,6 @@
-"""Basilisk's messages: what SciPy makes of the same parameters, rates by differences, and bytes that are none."""
+"""Basilisk's messages: what SciPy makes of the same parameters, rates by differences, and bytes
+that are none.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,9 @@ def turning(times_ns: list[int], max_rate_rad_s: float = 1.0) -> list[np.ndarray
 
 
 def test_a_rate_is_that_of_its_own_moment_and_the_shadow_switch_is_no_turn() -> None:
-    """A constant acceleration is followed exactly, which the last difference alone would miss by 0.01 * h / 2; steps vary."""
+    """A constant acceleration is followed exactly, which the last difference alone would miss by
+    0.01 * h / 2; steps vary.
+    """
     times_ns = [STEP_NS * k for k in (0, 1, 2, 4, 5, 9, 10, *range(11, 60))]
     rates = turning(times_ns)
     assert rates[:2] == [None, None]
@@ -365,7 +369,9 @@ NO_STATUS = Status(0, 0, 0, 0, 0, 0, 0)
 
 
 def test_each_request_has_one_answer_whatever_it_asks() -> None:
-    """Basilisk's words over a real socket, and some that are none; an image without an attitude is an empty one."""
+    """Basilisk's words over a real socket, and some that are none; an image without an attitude
+    is an empty one.
+    """
     notices = Notices()
     with (
         VizardLive("tcp://127.0.0.1:*", follower(), notices=notices) as link,

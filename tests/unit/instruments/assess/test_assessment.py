@@ -45,7 +45,9 @@ def planted() -> Planted:
 
 @pytest.fixture(scope="module")
 def by_file(tmp_path_factory: pytest.TempPathFactory, planted: Planted) -> tuple[dict[str, Any], Path, list[Figure]]:
-    """What the command says of the planted tracker's telemetry, its folder, and the figures that it drew."""
+    """What the command says of the planted tracker's telemetry, its folder, and the figures that
+    it drew.
+    """
     folder, drawn = tmp_path_factory.mktemp("assess"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(html_pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
@@ -118,7 +120,9 @@ def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(tmp_path: Path,
 
 
 def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path: Path) -> None:
-    """By the file of the PSF: lateral colour and coma in closed form, most of which a distortion takes, and colour besides."""
+    """By the file of the PSF: lateral colour and coma in closed form, most of which a distortion
+    takes, and colour besides.
+    """
     planted = plant(scan, SIZES, np.random.default_rng(11), seconds=60.0)
     write_glass(tmp_path / "psf.fits", glass_of(stack()))
     tracker = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "transmission": None}
@@ -132,7 +136,8 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"] > 0
     assert "glass without colour,roll," in (tmp_path / "out" / "budget.csv").read_text()
     assert glass["source"] == "PSF file" and "hold only attitudes" in (tmp_path / "out" / "budget.html").read_text()
-    # Answers that name their stars tell it by these, whatever the file says: here 0.3 px of distortion and 0.1 px a mag of B-V.
+    # Answers that name their stars tell it by these, whatever the file says: here 0.3 px of
+    # distortion and 0.1 px a mag of B-V.
     bench = bench_file_of(tmp_path / "bench.toml", bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
     stars, camera, rng = (
         bench_stars(bench.config, tmp_path),
@@ -155,7 +160,8 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     glass = budget(ledger)[0]["glass"]
     assert glass["source"] == "answers' stars" and glass["stars"] > 200
     px = glass["rms_px"]
-    assert 0.02 < px["without_both"] < 0.04  # the noise, and the planted attitudes' own error of 6 arcsec
+    # the noise, and the planted attitudes' own error of 6 arcsec
+    assert 0.02 < px["without_both"] < 0.04
     assert px["total"] > 1.3 * px["without_distortion"] > 2 * px["without_both"]
     assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"]
 
@@ -306,13 +312,17 @@ BENCH_60_HZ = bench_text({"monitor": {"refresh_hz": REFRESH_HZ}, "tracker": {"ex
 
 
 def turning(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Up to 1 deg/s across and 0.5 about the boresight: a frame that is missed is up to 60 arcsec off."""
+    """Up to 1 deg/s across and 0.5 about the boresight: a frame that is missed is up to 60
+    arcsec off.
+    """
     turn = 2 * np.pi * t_s
     return 84 + 10 * np.sin(turn / 63), 5 * np.sin(turn / 41 + 0.4), 6 * np.sin(turn / 75)
 
 
 def missing_run(folder: Path, missed: int, seed: int, seconds: float = 150.0, wild: int = 0) -> tuple[Path, Path, FloatArray]:
-    """A run that misses frames, and a tracker that answers exactly what was lit, with noise: ledger, telemetry, wild rows."""
+    """A run that misses frames, and a tracker that answers exactly what was lit, with noise:
+    ledger, telemetry, wild rows.
+    """
     rng = np.random.default_rng(seed)
     slots = np.arange(int(seconds * REFRESH_HZ))
     left_out: set[int] = set()
@@ -377,12 +387,15 @@ def test_a_run_that_missed_too_many_frames_for_a_budget_is_refused(tmp_path: Pat
 
 
 def own_answers(planted: Planted, share: float, seed: int = 6) -> list[AnswerRecord]:
-    """The planted answers as a ledger has them, a share of them overtaken by the next one or two."""
+    """The planted answers as a ledger has them, a share of them overtaken by the next one or
+    two.
+    """
     rng = np.random.default_rng(seed)
     records = []
     for tau_s, q in zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True):
         middle_ns = round((tau_s + 5) * 1e9)
-        overtaken = rng.random() < share and tau_s < planted.tau_s[-20]  # the ledger ends soon after its last frame
+        # the ledger ends soon after its last frame
+        overtaken = rng.random() < share and tau_s < planted.tau_s[-20]
         late_ns = 150_000_000 + bool(overtaken) * round(rng.uniform(0.11, 0.25) * 1e9)
         records.append(
             AnswerRecord(host_ns=middle_ns + late_ns, raw="", t_ns=middle_ns + 10**15, q=tuple(q), verdict="right",

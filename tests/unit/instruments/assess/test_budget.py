@@ -24,7 +24,8 @@ from tests.support.planted_tracker import (
     still,
 )
 
-# What the issue of the budget asks for; statistics alone would allow 1 % of noise (17 000 answers) and 3 % of pixel error.
+# What the issue of the budget asks for; statistics alone would allow 1 % of noise (17 000 answers)
+# and 3 % of pixel error.
 WITHIN, PIXEL_WITHIN = 0.10, 0.15
 DRIFT_PPM = 1.0
 ISSUE = Sizes()
@@ -62,7 +63,8 @@ def check_sizes(found: DecomposedRun, planted: Planted, sizes: Sizes) -> None:
         assert getattr(found.fov_arcsec, axis) == pytest.approx(field, rel=WITHIN)
         assert getattr(found.pixel_arcsec, axis) == pytest.approx(scale * sizes.pixel, rel=PIXEL_WITHIN)
         assert getattr(found.noise_arcsec, axis) == pytest.approx(scale * sizes.noise, rel=WITHIN)
-    # The run does not see whole periods: the field-of-view error has a mean of its own, a few tenths of its rms.
+    # The run does not see whole periods: the field-of-view error has a mean of its own, a few
+    # tenths of its rms.
     size = np.linalg.norm(planted.bias)
     np.testing.assert_allclose(found.bias_arcsec, planted.bias, atol=WITHIN * size)
     assert found.clock.drift * 1e6 == pytest.approx(sizes.drift_ppm, abs=DRIFT_PPM)
@@ -71,9 +73,12 @@ def check_sizes(found: DecomposedRun, planted: Planted, sizes: Sizes) -> None:
 
 
 def test_what_is_not_there_is_not_found() -> None:
-    """With noise alone the two parts that repeat are what 17 000 answers and 400 degrees of freedom leave by chance."""
+    """With noise alone the two parts that repeat are what 17 000 answers and 400 degrees of
+    freedom leave by chance.
+    """
     found = assessed(plant(scan, Sizes(fov=0.0, pixel=0.0, wild=0), np.random.default_rng(3)))
-    by_chance = 1.0 * (2 * 400) ** 0.25 / 17_000**0.5  # of an rms, where the variance is uncertain by sqrt(2 p) sigma^2 / n
+    # of an rms, where the variance is uncertain by sqrt(2 p) sigma^2 / n
+    by_chance = 1.0 * (2 * 400) ** 0.25 / 17_000**0.5
     assert found.fov_arcsec.cross == pytest.approx(0.0, abs=3 * by_chance)
     assert found.pixel_arcsec.cross == pytest.approx(0.0, abs=3 * by_chance)
     assert found.noise_arcsec.cross == pytest.approx(1.0, rel=0.03)
@@ -109,7 +114,8 @@ def test_cases_all_over_the_sky_have_a_bias_and_noise_and_no_place_that_repeats(
     reported[::50] = np.nan
     reported[7] = commanded[8]
     found = assess_cases(commanded, reported, SCALE, rng)
-    np.testing.assert_allclose(found.bias_arcsec, [3.0, -4.0, 30.0], atol=1.5)  # 4 sigma about the boresight
+    # 4 sigma about the boresight
+    np.testing.assert_allclose(found.bias_arcsec, [3.0, -4.0, 30.0], atol=1.5)
     assert found.noise_arcsec.roll == pytest.approx(8.0, rel=0.15)
     assert found.fov_arcsec.cross is None
     assert found.wrong.tolist() == [7]

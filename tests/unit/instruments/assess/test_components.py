@@ -8,8 +8,10 @@ import pytest
 from hilstar.instruments.assess.components import EDGES, components_of
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
-# From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star whose direction
-# is found to 0.01 px blurs a saw's jump by as much: 1 % of its power, which is 2 % of the noise for a saw of 1.5 of it.
+# From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star
+# whose direction
+# is found to 0.01 px blurs a saw's jump by as much: 1 % of its power, which is 2 % of the noise for
+# a saw of 1.5 of it.
 PIXEL_WITHIN, NOISE_WITHIN = 0.04, 0.05
 
 
@@ -33,7 +35,9 @@ def steps(place):
 @pytest.mark.parametrize("size", [0.6, 1.5])
 @pytest.mark.parametrize("shape", [saws, steps])
 def test_a_pixel_error_that_jumps_from_pixel_to_pixel_is_recovered_whole(shape, size) -> None:
-    """Five harmonics of a saw leave 33 % of its size to the noise, which was 12 % too large for a saw of 1.5 of it."""
+    """Five harmonics of a saw leave 33 % of its size to the noise, which was 12 % too large for
+    a saw of 1.5 of it.
+    """
     rng = np.random.default_rng(2)
     true = attitude(scan, np.arange(0.0, 600.0, 0.15))
     error = size * shape(star_px(true, true[0]))

@@ -1,4 +1,6 @@
-"""The alignment from quaternions: planted rotations, noise, wild ones, other conventions, and what no rotation explains."""
+"""The alignment from quaternions: planted rotations, noise, wild ones, other conventions, and
+what no rotation explains.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs
 CAMERA = monitor_camera((1920, 1080), 57.65, 350.0, normalise(np.array([1.0, 0.001, -0.002, 0.003])))
 PLANTED_ARCSEC = np.array([820.0, -310.0, 2400.0])
 NOISE_ARCSEC = np.array([5.0, 5.0, 40.0])
-# A mean of n is off by noise / sqrt(n); 1 in 10^4 is further off than four of these in any of three axes.
+# A mean of n is off by noise / sqrt(n); 1 in 10^4 is further off than four of these in any of three
+# axes.
 SIGMAS = 4.0
 EXACT_ARCSEC = 1e-6
 
@@ -82,7 +85,9 @@ def test_wild_ones_a_few_arcminutes_off_are_named_and_change_nothing(rng):
 
 
 def test_the_sigma_covers_the_error(rng):
-    """Of 100 sets the squared error over sigma is 1 on average, within the spread of a chi square of 300."""
+    """Of 100 sets the squared error over sigma is 1 on average, within the spread of a chi
+    square of 300.
+    """
     ratios = []
     for _ in range(100):
         commanded = commanded_of(rng, 25)
@@ -99,7 +104,9 @@ def test_one_attitude_determines_the_rotation_and_the_summary_says_what_it_canno
 
 
 def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
-    """Each of 40 attitudes has an error of its own, as a distorted screen gives it; each is taken five times."""
+    """Each of 40 attitudes has an error of its own, as a distorted screen gives it; each is
+    taken five times.
+    """
     attitudes = commanded_of(rng, 40)
     own = from_rotation_vectors(rng.normal(size=(40, 3)) * [30.0, 30.0, 100.0] / ARCSEC_PER_RAD)
     commanded = np.repeat(attitudes, 5, axis=0)

@@ -1,4 +1,6 @@
-"""First light on benches that are not ours: large screens, turned screens, wide pixels, wide stars, faint stars."""
+"""First light on benches that are not ours: large screens, turned screens, wide pixels, wide
+stars, faint stars.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,8 @@ LARGE_SCREEN = {
     "collimator": {"focal_length_mm": 500},
 }
 NOISE_PX = 0.02
-# A place's error is that of a fit of 11 numbers to 150 dots: 0.02 px / sqrt(150 * 6 / 11) is 0.002 px, 0.05 arcsec.
+# A place's error is that of a fit of 11 numbers to 150 dots: 0.02 px / sqrt(150 * 6 / 11) is 0.002
+# px, 0.05 arcsec.
 PLACES_SIGMAS = 4.0
 
 
@@ -85,7 +88,9 @@ def observed(plan, real, rng, first=0):
 
 @pytest.mark.parametrize("turn_deg", [37.0, -44.0])
 def test_dots_stand_where_the_tracker_sees_the_screen_and_the_fit_is_right(tmp_path, turn_deg):
-    """Dots over the whole screen were 11 where 12 are needed, and a turn of over 15 degrees was refused."""
+    """Dots over the whole screen were 11 where 12 are needed, and a turn of over 15 degrees was
+    refused.
+    """
     file, rng = large_screen(tmp_path), np.random.default_rng(0)
     real = true_geometry(file, turn_deg)
     first = plan_seen_dots(replace(real, monitor=replace(real.monitor, lens=None)), 8, 18, rng)
@@ -153,7 +158,9 @@ def dots_image(sigma_px, side_px, turn_deg, rng):
 
 @pytest.mark.parametrize(("sigma_px", "side_px", "turn_deg"), [(0.55, 12.6, 0.0), (0.55, 12.6, 30.0), (3.0, 1.0, 0.0)])
 def test_psf_and_pixel_are_fitted_together(sigma_px, side_px, turn_deg):
-    """A monitor pixel of 4.2 tracker px made of a PSF of 0.55 px "0.150, error 0.0": the end of the model."""
+    """A monitor pixel of 4.2 tracker px made of a PSF of 0.55 px "0.150, error 0.0": the end of
+    the model.
+    """
     image = dots_image(sigma_px, side_px, turn_deg, np.random.default_rng(3))
     found = sharpness(image, 1.005 * side_px, turn_deg)
     assert abs(found.psf_sigma_px - sigma_px) < 3 * found.psf_sigma_error_px < 0.1 * sigma_px
@@ -162,7 +169,9 @@ def test_psf_and_pixel_are_fitted_together(sigma_px, side_px, turn_deg):
 
 @pytest.mark.parametrize("turn_deg", [30.0, -20.0])
 def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
-    """A bench file that states the turn leaves orientation none to find, and a certificate has it from the geometry file."""
+    """A bench file that states the turn leaves orientation none to find, and a certificate has
+    it from the geometry file.
+    """
     turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
     monitor = monitor_camera((640, 480), 57.65, 30, turned)
     seen = SeenScreen(
@@ -177,7 +186,9 @@ def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
 
 
 def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
-    """Thirds of a pixel of 4.2 tracker px made its edges as soft as those of a PSF of 0.68 instead of 0.55."""
+    """Thirds of a pixel of 4.2 tracker px made its edges as soft as those of a PSF of 0.68
+    instead of 0.55.
+    """
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     geometry = BenchGeometry(monitor_camera((64, 64), 233.1, 500, turn), monitor_camera((256, 256), 5.5, 50, turn))
     light = np.zeros((64, 64))
@@ -292,7 +303,9 @@ def wide_star(spot, dn, noise_dn, rng):
 
 
 def test_the_noise_of_wide_stars_is_known_in_place_and_light():
-    """A window of 9 px lost 0.26 mag of stars of 2.5 px, and took their noise for an error of the geometry."""
+    """A window of 9 px lost 0.26 mag of stars of 2.5 px, and took their noise for an error of
+    the geometry.
+    """
     spot, rng, dn, noise_dn = StarSpot((4.0, 4.0), 2.0, 0.0), np.random.default_rng(4), 20_000.0, 3.0
     off_px, light = [], []
     for _ in range(60):
@@ -301,7 +314,8 @@ def test_the_noise_of_wide_stars_is_known_in_place_and_light():
         off_px.append((found.x_px[0] - x_px, found.y_px[0] - y_px))
         light.append(found.flux[0] / spot.window_share)
     noise_px = float(spot.place_noise_px(np.array([dn]), noise_dn)[0])
-    assert np.std(off_px) == pytest.approx(noise_px, rel=0.25)  # 120 offsets: 6.5 % of sigma, four times
+    # 120 offsets: 6.5 % of sigma, four times
+    assert np.std(off_px) == pytest.approx(noise_px, rel=0.25)
     noise_mag = float(spot.light_noise_mag(np.array([dn]), noise_dn)[0])
     assert np.std(light) / dn * 1.0857 == pytest.approx(noise_mag, rel=0.4)
     assert np.mean(light) == pytest.approx(dn, rel=4 * noise_mag / math.sqrt(60))
@@ -380,7 +394,9 @@ def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
 
 @pytest.mark.parametrize(("read_noise_e", "alike"), [(0.0, True), (5.0, True), (12.0, False)])
 def test_an_adc_rounds_alike_where_read_noise_is_under_its_steps(read_noise_e, alike):
-    """A session by a detector without read noise said that stray light or a cold monitor may be why levels were not smooth."""
+    """A session by a detector without read noise said that stray light or a cold monitor may be
+    why levels were not smooth.
+    """
     detector = DetectorSettings(read_noise_e=read_noise_e, gain_e_per_dn=24.0)
     light_dn = np.linspace(0.0, 1.0, 101)
     noise_dn = np.random.default_rng(2).normal(0, read_noise_e / 24.0, (20_000, 1))
@@ -406,7 +422,9 @@ def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
 
 
 def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
-    """Dots are seen through the collimator: with a blur that the file states, `focus` asked to turn the focus."""
+    """Dots are seen through the collimator: with a blur that the file states, `focus` asked to
+    turn the focus.
+    """
     (tmp_path / "bench.toml").write_text(bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}}))
     file = read_bench_file(tmp_path / "bench.toml")
     context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)

@@ -1,4 +1,6 @@
-"""The parts of first light: which way round, how sharp, what a step depends on, and images by a command."""
+"""The parts of first light: which way round, how sharp, what a step depends on, and images by a
+command.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ from tests.support.damage import NO_JSON
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 MOUNTINGS = [ScreenMounting(x, y, turn) for x in (False, True) for y in (False, True) for turn in (0, 90, 180, 270)]
 GEOMETRY = BenchGeometry(monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN))
-# The model of a dot and the image here are the same mathematics in two forms; the noise of 40 dots is what is left.
+# The model of a dot and the image here are the same mathematics in two forms; the noise of 40 dots
+# is what is left.
 SIGMA_PX = 0.02
 
 
@@ -69,7 +72,9 @@ def test_a_mounting_moves_a_pixel_as_its_matrix_says(mounting):
 
 
 def spots(figure, way):
-    """The figure as a tracker sees it `way` round: squares of light about the middle of its image."""
+    """The figure as a tracker sees it `way` round: squares of light about the middle of its
+    image.
+    """
     image = np.random.default_rng(1).normal(0, 1.0, (400, 400))
     ratio = GEOMETRY.tracker.focal_length_px / GEOMETRY.monitor.focal_length_px
     for x, y, sides in zip(figure.x_px, figure.y_px, (3, 2, 1), strict=True):
@@ -86,7 +91,8 @@ def test_the_figure_tells_each_way_round_and_the_mounting_that_mends_it(way):
     assert seen.way == way
     assert seen.scale == pytest.approx(1.0, abs=0.02)
     for mounting in MOUNTINGS:
-        # What the tracker sees is the optics' own matrix times the mounting's; the corrected one leaves the identity.
+        # What the tracker sees is the optics' own matrix times the mounting's; the corrected one
+        # leaves the identity.
         optics = np.array(way).reshape(2, 2) @ np.linalg.inv(mounting.matrix)
         assert np.allclose(optics @ corrected(mounting, way).matrix, np.eye(2))
 
@@ -102,7 +108,9 @@ def test_a_key_says_where_the_squares_of_its_way_round_are(key):
 
 
 def test_a_detector_that_is_clipped_at_zero_beyond_the_screen_s_glow_sees_the_figure():
-    """Six tenths of the image have no noise at all, as where an ADC without offset sees no screen."""
+    """Six tenths of the image have no noise at all, as where an ADC without offset sees no
+    screen.
+    """
     figure = figure_for(GEOMETRY)
     image = np.rint(spots(figure, UPRIGHT) + np.random.default_rng(2).normal(0, 1.5, (400, 400)))
     image[:, :60], image[:, 340:], image[:60], image[340:] = 0, 0, 0, 0
@@ -112,7 +120,9 @@ def test_a_detector_that_is_clipped_at_zero_beyond_the_screen_s_glow_sees_the_fi
 
 @pytest.mark.parametrize("sigma_px", [2.4, 3.5])
 def test_squares_are_told_apart_by_light_through_a_wide_psf(sigma_px):
-    """Of 2.4 px and more spots of squares of 1, 2 and 3 sides have nearly as many pixels above the noise."""
+    """Of 2.4 px and more spots of squares of 1, 2 and 3 sides have nearly as many pixels above
+    the noise.
+    """
     figure, noise = figure_for(GEOMETRY), np.random.default_rng(3).normal(0, 1.0, (400, 400))
     way = (0, -1, 1, 0)
     image = 6 * gaussian_filter(spots(figure, way), sigma_px) + noise
@@ -285,7 +295,9 @@ def test_what_failed_is_never_done_and_what_needs_it_is_skipped(counted, tmp_pat
 
 
 def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, monkeypatch):
-    """The third image fails until a file is there; then only it and what follows are taken, and afterwards nothing is."""
+    """The third image fails until a file is there; then only it and what follows are taken, and
+    afterwards nothing is.
+    """
     (tmp_path / "bench.toml").write_text(bench_text())
     (tmp_path / "s").mkdir()
     taken = []

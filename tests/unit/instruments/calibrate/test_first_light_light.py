@@ -1,4 +1,6 @@
-"""The light of first light: dots on lattices, the exposure that they need, and what is read of them and of stars."""
+"""The light of first light: dots on lattices, the exposure that they need, and what is read of
+them and of stars.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ def test_a_lattice_lights_as_many_pixels_as_it_says_and_only_in_its_square():
 
 
 def test_the_peak_of_a_lattice_is_that_of_its_light_drawn_pixel_by_pixel():
-    """One lit pixel's light, a square of RATIO px under a Gaussian, over a fine grid of places of the lattice."""
+    """One lit pixel's light, a square of RATIO px under a Gaussian, over a fine grid of places
+    of the lattice.
+    """
     x = np.arange(-60, 61)
     for period, share in zip((1, 2, 8), peak_shares((1, 2, 8), RATIO, SIGMA_PX), strict=True):
         largest = 0.0
@@ -68,12 +72,15 @@ def test_the_peak_of_a_lattice_is_that_of_its_light_drawn_pixel_by_pixel():
             edge = x[:, None] - place - inner
             along = (ndtr((edge + 0.5) / SIGMA_PX) - ndtr((edge - 0.5) / SIGMA_PX)).mean(axis=2).sum(axis=0)
             largest = max(largest, float(along[30:-30].max()) ** 2)
-        # The square counts as a Gaussian of its own variance there: 6 % of the peak at most, of a range used to half.
+        # The square counts as a Gaussian of its own variance there: 6 % of the peak at most, of a
+        # range used to half.
         assert share == pytest.approx(largest, rel=0.06)
 
 
 class Camera(ImageSource):
-    """A tracker whose image is uniform over the field: so much light for each lit pixel, by a response of its own."""
+    """A tracker whose image is uniform over the field: so much light for each lit pixel, by a
+    response of its own.
+    """
 
     identity = "camera"
 
@@ -217,7 +224,9 @@ def test_the_newest_image_of_the_virtual_bench_is_its_file(tmp_path):
 
 
 def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
-    """Three channels of their own powers and shares of white: a triple's light is right only when all six are."""
+    """Three channels of their own powers and shares of white: a triple's light is right only
+    when all six are.
+    """
     light = gamma_response(8, 2.35).light
     planted = {"r": 0.3 * light, "g": 0.5 * light**1.02, "b": 0.2 * light**0.97}
     head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
@@ -236,7 +245,9 @@ def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
 
 @pytest.mark.usefixtures("without_charts")
 def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp_path):
-    """Three powers, of a panel whose primaries the channels see as they do here: a channel's light is of one of them."""
+    """Three powers, of a panel whose primaries the channels see as they do here: a channel's
+    light is of one of them.
+    """
     nm, powers = np.arange(400.0, 701.0, 10.0), {"r": 2.1, "g": 2.35, "b": 2.5}
     peaks = {"r": 620, "g": 540, "b": 460}
     bumps = np.array([np.exp(-(((nm - peak) / 30) ** 2)) for peak in peaks.values()])
@@ -263,7 +274,9 @@ def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp
 
 @pytest.mark.usefixtures("without_charts")
 def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
-    """With 5 bits a turn of four frames leaves 0.012 mag between the stars, its first frame alone 0.036."""
+    """With 5 bits a turn of four frames leaves 0.012 mag between the stars, its first frame
+    alone 0.036.
+    """
     bench = {"monitor": {"bits": 5}, "render": {"quantisation": "temporal", "cycle_frames": 4}}
     truth = {"monitor": {"bits": 5}, "render": {"quantisation": "round", "flux_at_white_e_per_s": 2.5e6}}
     outcome = on_the_twin(tmp_path, scale, bench, truth)
@@ -287,9 +300,12 @@ def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(
 
 @pytest.mark.usefixtures("without_charts")
 def test_too_few_readings_of_a_response_that_needs_more_are_no_calibration(tmp_path):
-    """The example's S-curve by 12 levels: held out of the fit they are 0.1 mag off, and the bench file is left alone."""
+    """The example's S-curve by 12 levels: held out of the fit they are 0.1 mag off, and the
+    bench file is left alone.
+    """
     bench = {"monitor": {"bits": 8, "calibration": "lcd-example"}}
     outcome = on_the_twin(tmp_path, photometry, bench, bench, 30)
     assert (outcome.verdict, outcome.changes) == ("failed", ())
     assert "--patches" in outcome.line
-    assert "[uniformity]" in (tmp_path / "response.toml").read_text()  # which the tracker has not measured, and the bench has
+    # which the tracker has not measured, and the bench has
+    assert "[uniformity]" in (tmp_path / "response.toml").read_text()

@@ -1,4 +1,6 @@
-"""Light against place: an uneven screen is measured and evened out, and stars then scatter as their errors do."""
+"""Light against place: an uneven screen is measured and evened out, and stars then scatter as
+their errors do.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ SIZE_PX = (640, 480)
 Y, X = np.mgrid[-1:1:11j, -1:1:15j]
 VIGNETTING = (1 + 0.2 * (X**2 + Y**2)) ** -2.0  # half of the light in the corners of the screen
 PANEL = 1 + np.random.default_rng(4).normal(0, 0.05, (5, 7))
-# A dot is read to 0.004 mag, and a field of the map has ten dots or more; between the fields it is bilinear.
+# A dot is read to 0.004 mag, and a field of the map has ten dots or more; between the fields it is
+# bilinear.
 MAP_MAG = 0.005
 NOISE = "[tracker.detector]\nread_noise_e = 12.0\nprnu = 0.005\ngain_e_per_dn = 4.0\nbits = 14\n"
 
@@ -114,7 +117,9 @@ def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
 
 @pytest.mark.usefixtures("without_charts")
 def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
-    """By 8 bits, with the response measured after the map: both are in the file that the bench names."""
+    """By 8 bits, with the response measured after the map: both are in the file that the bench
+    names.
+    """
     folder = planted(tmp_path, VIGNETTING, "lcd-example")
     found = did(folder, uniformity)
     assert found.verdict == "done", found.line
@@ -162,7 +167,9 @@ def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
 
 @pytest.mark.parametrize("fall", [0.0, 0.004, 0.012, 0.05])
 def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
-    """Dots over a small part of a screen whose light falls towards its sides, down to less than their noise shows."""
+    """Dots over a small part of a screen whose light falls towards its sides, down to less than
+    their noise shows.
+    """
     x, y = (part.ravel() for part in np.meshgrid(np.arange(200, 440, 8), np.arange(150, 330, 8)))
     true = 1 - fall * ((x / 320 - 1) ** 2 + (y / 240 - 1) ** 2) - fall * (x / 320 - 1)
     sigmas = []

@@ -60,7 +60,8 @@ def errors(fit, curve):
 @pytest.mark.parametrize("black", [0.0, 1e-3])
 @pytest.mark.parametrize("name", CURVES)
 def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, bits, tmp_path):
-    """3 repeats do where a formula fits; a shape of its own has twice the free parameters, and is measured 6 times.
+    """3 repeats do where a formula fits; a shape of its own has twice the free parameters, and is
+    measured 6 times.
 
     Of 200 seeds, 96 to 100 % then meet the aim; ten are run here, of which one may miss it.
     """
@@ -88,7 +89,8 @@ def test_even_steps_of_code_do_where_the_light_is_a_power_law(tmp_path):
 def test_without_noise_nothing_is_lost(name, tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES[name], rng, black=1e-3, noise=0)
     fit = fit_channel(read_measurements(path), "w")
-    assert np.abs(errors(fit, CURVES[name])).max() < 1e-3  # sRGB's kink and the waves, between levels 8 % apart
+    # sRGB's kink and the waves, between levels 8 % apart
+    assert np.abs(errors(fit, CURVES[name])).max() < 1e-3
     assert fit.black / fit.white == pytest.approx(1e-3, rel=1e-3)
 
 
@@ -102,7 +104,8 @@ def test_the_stated_error_is_the_error(tmp_path):
         shown = true >= FAINTEST
         ratios.append((fit.light[:-1][shown] / true[shown] - 1) / fit.error[:-1][shown])
     rms = np.sqrt(np.mean(np.concatenate(ratios) ** 2))
-    # A seed has about 6 free parameters: 30 * 6 draws give the rms to 1 / sqrt(360) = 5 %; the smooth prior adds its bias.
+    # A seed has about 6 free parameters: 30 * 6 draws give the rms to 1 / sqrt(360) = 5 %; the
+    # smooth prior adds its bias.
     assert 0.75 < rms < 1.3
 
 
@@ -116,7 +119,8 @@ def test_a_held_out_residual_is_that_of_a_fit_without_the_level(tmp_path, rng):
         (tmp_path / "less.csv").write_text("\n".join(kept))
         without = fit_channel(read_measurements(tmp_path / "less.csv"), "w")
         left = (whole.levels.mean[place] - without.black) / (without.white * without.light[code]) - 1
-        # The stiffness and the noise are chosen anew without the level: a tenth of the noise of a level's mean.
+        # The stiffness and the noise are chosen anew without the level: a tenth of the noise of a
+        # level's mean.
         assert whole.residual[place - 1] == pytest.approx(left, abs=0.1 * NOISE)
 
 
@@ -148,7 +152,9 @@ def test_dn_are_divided_by_their_exposure(tmp_path, rng):
 
 
 def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
-    """5e-5 of white added to each reading: without its own term the noise of the faint levels would be far underrated."""
+    """5e-5 of white added to each reading: without its own term the noise of the faint levels
+    would be far underrated.
+    """
     worst = []
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -165,7 +171,8 @@ def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
     light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + NOISE * rng.standard_normal(len(codes)))
     path = write(tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)])
     fit = fit_channel(read_measurements(path), "w")
-    assert fit.noise_relative == pytest.approx(NOISE, rel=4 / np.sqrt(2 * 60))  # four sigma of a scatter of 60
+    # four sigma of a scatter of 60
+    assert fit.noise_relative == pytest.approx(NOISE, rel=4 / np.sqrt(2 * 60))
 
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
@@ -174,9 +181,11 @@ def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rn
     calibration = load_calibration(tmp_path / "monitor.toml", 8)
     assert calibration.who == 'a "b"\nc'
     assert calibration.sha256 == summary["sha256"]
-    assert calibration.response.black == pytest.approx(1e-3, rel=0.02)  # black is measured 25 times at 1 %
+    # black is measured 25 times at 1 %
+    assert calibration.response.black == pytest.approx(1e-3, rel=0.02)
     assert summary["black_level"]["unit"] == pytest.approx(0.25, rel=0.02)
-    assert summary["noise_relative"] == pytest.approx(NOISE, rel=0.3)  # some 60 repeats of bright levels: 9 %
+    # some 60 repeats of bright levels: 9 %
+    assert summary["noise_relative"] == pytest.approx(NOISE, rel=0.3)
     # A level's mean of three repeats to 0.58 %, seen from a response that is known better.
     assert 0.3 < summary["holdout"]["rms_percent"] < 0.9
     assert summary["holdout"]["max_mag"] == pytest.approx(summary["holdout"]["max_percent"] / 100 * 1.0857, rel=1e-4)
@@ -200,7 +209,8 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
         for p in plan_patches(PlanSettings(8, 24, channels="wrgb"), rng)
     ]
     summary = calibrate_photometric(write(tmp_path / "m.csv", rows), tmp_path / "monitor.toml")
-    assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
+    # four whites to 0.2 % each
+    assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)
     assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
     assert list(summary["crosstalk_percent"]) == [f"1e-{decade}" for decade in range(4)]
     for code, decade in ((255, "1e-0"), (90, "1e-1"), (31, "1e-2")):
@@ -221,7 +231,9 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
 
 
 def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng):
-    """As first light reads an OLED: too few repeats of bright levels, and black is its own noise."""
+    """As first light reads an OLED: too few repeats of bright levels, and black is its own
+    noise.
+    """
     times = {0: 5, 2: 2, 5: 2, 13: 2, 25: 2, 44: 1, 71: 1, 90: 1, 111: 1, 127: 3, 169: 1, 255: 4}
     codes = [code for code, count in times.items() for _ in range(count)]
     rows = [

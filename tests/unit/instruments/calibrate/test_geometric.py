@@ -1,4 +1,6 @@
-"""Geometric calibration against a truth of another family: rays traced by Snell's law through a tilted, decentred doublet."""
+"""Geometric calibration against a truth of another family: rays traced by Snell's law through a
+tilted, decentred doublet.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
 BENCH = TracedBench()
 TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38, (1023.5, 1023.5), np.eye(3))
 MANY, FEW = (20, 60, 0.02), (10, 25, 0.05)
-# The aims of a calibration with so many frames, dots and noise: arcsec rms and maximum over the whole screen.
+# The aims of a calibration with so many frames, dots and noise: arcsec rms and maximum over the
+# whole screen.
 AIM_ARCSEC = {MANY: (0.25, 1.0), FEW: (1.0, 4.0)}
 
 
@@ -33,7 +36,9 @@ def nominal_of(bench: TracedBench) -> Nominal:
 
 
 def two_poses(bench, plan: DotPlan, tracker: Camera, rng: np.random.Generator, *tilt_deg: float) -> Observed:
-    """What is seen in two poses: at rest, and turned by 90 degrees, `tilt_deg` (x, y) beside the boresight."""
+    """What is seen in two poses: at rest, and turned by 90 degrees, `tilt_deg` (x, y) beside the
+    boresight.
+    """
     turns = (np.eye(3), turned(*tilt_deg, 90.0))
     parts = [observed_dots(bench, plan, tracker, rng, pose_matrix=turn, pose=k) for k, turn in enumerate(turns)]
     return Observed(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("frame", "pose", "x_px", "y_px", "sigma_px")))
@@ -65,7 +70,8 @@ def test_stars_are_shown_where_they_should_be_all_over_the_screen(case, rng):
     assert np.sqrt((errors**2).mean()) < rms
     assert errors.max() < largest
     assert found.problem.noise_px == pytest.approx(noise_px, rel=0.15)
-    # What the file says of itself is true: 1 sigma within a factor of two, and at every place five sigmas at the most.
+    # What the file says of itself is true: 1 sigma within a factor of two, and at every place five
+    # sigmas at the most.
     assert 0.5 < np.sqrt((errors**2).mean()) / found.uncertainty.rms_arcsec < 2
     assert errors.max() < 5 * found.uncertainty.max_arcsec
 
@@ -81,7 +87,9 @@ def test_a_strong_lens_asks_for_the_field_and_gets_it(rng):
 
 @dataclass(frozen=True)
 class ThinPrisms:
-    """A bench whose wedged lens displaces by r^2 and r^4 (thin prisms: Weng et al. 1992), besides k1 and k2."""
+    """A bench whose wedged lens displaces by r^2 and r^4 (thin prisms: Weng et al. 1992),
+    besides k1 and k2.
+    """
 
     resolution_px: tuple[int, int] = BENCH.resolution_px
     focal_px: float = 6019.0
@@ -107,7 +115,8 @@ class ThinPrisms:
 
 
 def test_the_field_and_the_lens_are_fitted_together(rng):
-    # A lens that is fitted first leans over to the prisms: a field of degree 7 then leaves 0.23 arcsec rms, 2.2 maximum.
+    # A lens that is fitted first leans over to the prisms: a field of degree 7 then leaves 0.23
+    # arcsec rms, 2.2 maximum.
     bench = ThinPrisms()
     plan = plan_of(*MANY[:2])
     found = calibrate_geometry(plan, nominal_of(BENCH), observed_dots(bench, plan, TRACKER, rng), rng, tracker_known=True)
@@ -117,12 +126,14 @@ def test_the_field_and_the_lens_are_fitted_together(rng):
 
 
 def test_what_poses_do_not_tell_apart_does_not_run_away(rng):
-    # With the tracker's round terms as free as the others, k1 went to -0.8, and stars were 250 arcsec off (20 frames of 60).
+    # With the tracker's round terms as free as the others, k1 went to -0.8, and stars were 250
+    # arcsec off (20 frames of 60).
     bench, plan = ThinPrisms(), plan_of(*FEW[:2])
     real = replace(TRACKER, lens=Lens(tangential=(-2e-3, 3e-3)))
     found = calibrate_geometry(plan, nominal_of(BENCH), two_poses(bench, plan, real, rng, 0.0, 0.0), rng, tracker_known=False)
     assert np.sqrt((errors_arcsec(found, bench) ** 2).mean()) < 3.0
-    assert found.uncertainty.rms_arcsec > 10  # a tracker's own round distortion is still in what the file states
+    # a tracker's own round distortion is still in what the file states
+    assert found.uncertainty.rms_arcsec > 10
 
 
 @pytest.mark.parametrize("lens", [None, Lens(radial=(-0.02, 0.0, 0.0))], ids=["ideal", "flight model"])

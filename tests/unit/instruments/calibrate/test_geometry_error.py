@@ -1,4 +1,6 @@
-"""The stated error of a geometry holds the truth: of a lens that noise hides, of dots with errors of their own, of few dots."""
+"""The stated error of a geometry holds the truth: of a lens that noise hides, of dots with
+errors of their own, of few dots.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ SMALL_FIELD = {
     "collimator": {"focal_length_mm": 900},
 }
 SEEDS, FRAMES = 6, 12
-# The rms of six errors, each an rms over the field of a fit's few numbers, in their sigmas: over 1.5 comes once in a thousand.
+# The rms of six errors, each an rms over the field of a fit's few numbers, in their sigmas: over
+# 1.5 comes once in a thousand.
 MAX_RMS_SIGMAS = 1.5
 GRID = 9
 
@@ -79,7 +82,9 @@ def off_arcsec(geometry, seen):
 
 
 def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
-    """A tilt of 2.5 degrees: the covariance of a pinhole's four numbers alone is half of its error."""
+    """A tilt of 2.5 degrees: the covariance of a pinhole's four numbers alone is half of its
+    error.
+    """
     file, seen = planted(tmp_path, tilt_deg=2.5)
     off = [error_of(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS

@@ -149,7 +149,9 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
 
 
 def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
-    """Stated errors of 0.01 % and a scatter of 0.5 %: the errors grow by what the levels are off."""
+    """Stated errors of 0.01 % and a scatter of 0.5 %: the errors grow by what the levels are
+    off.
+    """
     rng = np.random.default_rng(1)
     codes = np.repeat(np.arange(0, 256, 15), 2)
     scatter = np.repeat(1 + 0.005 * rng.standard_normal(18), 2)

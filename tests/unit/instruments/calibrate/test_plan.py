@@ -29,7 +29,8 @@ def test_a_plan_is_random_reproducible_and_can_be_filled_in(tmp_path):
     codes = [int(row["code"]) for row in rows]
     assert [row["value"] for row in rows] == [""] * len(rows)
     assert codes.count(0) >= 20
-    assert max(np.diff(np.flatnonzero(np.array(codes) == 0))) <= 11  # black comes back within every eight patches and three
+    # black comes back within every eight patches and three
+    assert max(np.diff(np.flatnonzero(np.array(codes) == 0))) <= 11
     with pytest.raises(InputError, match="fill it in"):
         calibrate_photometric(tmp_path / "0.csv", tmp_path / "monitor.toml")
 
@@ -49,7 +50,8 @@ def test_patches_are_written_as_the_codes_of_frames_are(bits, code, stored, tmp_
     assert image.shape == (40, 60)
     assert image[20, 30] == stored
     assert image[0, 0] == 0
-    assert len(list((tmp_path / "patches").iterdir())) in (8, 9)  # half is a reference, and may be a level
+    # half is a reference, and may be a level
+    assert len(list((tmp_path / "patches").iterdir())) in (8, 9)
 
 
 def test_a_patch_of_one_primary_lights_that_primary(tmp_path):

@@ -1,4 +1,6 @@
-"""A sensor from its data sheet and from its own frames: what comes out is what went in, within the errors that are stated."""
+"""A sensor from its data sheet and from its own frames: what comes out is what went in, within
+the errors that are stated.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from tests.support.commands import run_hilstar_here
 
 SIZE_PX = (256, 200)
 SHAPE = (200, 256)
-# Nine quantities, errors of their own pixels: 4 sigmas are one of 16 000. Seeds are fixed, so this is a margin, not a flake.
+# Nine quantities, errors of their own pixels: 4 sigmas are one of 16 000. Seeds are fixed, so this
+# is a margin, not a flake.
 SIGMAS = 4.0
 LEVELS_E = (1500.0, 4000.0, 8000.0, 14_000.0, 20_000.0, 24_000.0, 27_000.0, 32_000.0, 40_000.0)
 SENSOR = DetectorSettings(
@@ -74,7 +77,9 @@ def test_frames_of_the_virtual_detector_give_its_settings_back(tmp_path):
 
 @pytest.mark.parametrize(("key", "in_extension"), [("EXPOSURE", False), ("EXPTIME", True), ("EXPOINUS", False)])
 def test_exposures_are_read_wherever_they_stand(tmp_path, key, in_extension):
-    """The same frames with their exposure under another keyword, or in a header that fpack's image has."""
+    """The same frames with their exposure under another keyword, or in a header that fpack's
+    image has.
+    """
     flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
     expected = measure_sensor(flats, darks)
     for path in (*flats, *darks):

@@ -1,4 +1,6 @@
-"""Warm-up from planted curves of white: when it is stable, the drift that remains, and how often the stated errors hold."""
+"""Warm-up from planted curves of white: when it is stable, the drift that remains, and how often
+the stated errors hold.
+"""
 
 import math
 
@@ -11,9 +13,11 @@ from hilstar.instruments.calibrate.warm_up import MAX_TAU, STABLE, WarmUp, judge
 from tests.support.fake_clock import FakeClock
 
 CHANGE, TAU_S = 0.04, 200.0
-STABLE_S = TAU_S * math.log(CHANGE * -math.expm1(-600 / TAU_S) / STABLE)  # its change in ten minutes is 0.2 % then
+# its change in ten minutes is 0.2 % then
+STABLE_S = TAU_S * math.log(CHANGE * -math.expm1(-600 / TAU_S) / STABLE)
 EVERY_S, READINGS = 10.0, 120
-TRIALS, HELD = 60, 0.86  # share of trials within two stated errors: 0.95 is expected, and 3 sigma of counting are 0.085
+# share of trials within two stated errors: 0.95 is expected, and 3 sigma of counting are 0.085
+TRIALS, HELD = 60, 0.86
 
 
 def planted(kind: str, noise: float, seed: int = 0, readings: int = READINGS) -> WarmUp:
@@ -113,7 +117,9 @@ def test_watching_ends_at_the_longest_time_and_refuses_a_dark_reading() -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_no_time_constant_is_one_that_ends_what_is_tried(seed: int) -> None:
-    """A curve that still bends at the end fits an exponential without end: that law is no finding."""
+    """A curve that still bends at the end fits an exponential without end: that law is no
+    finding.
+    """
     t_s = np.arange(60) * 10.0
     bent = 1 + 1e-5 * t_s - 2e-9 * t_s**2
     scattered = bent * (1 + 1e-4 * np.random.default_rng(seed).standard_normal(len(t_s)))

@@ -1,4 +1,6 @@
-"""The backlog: every missing case is handed out, a dead worker's once more and one by one, and the one that kills is named."""
+"""The backlog: every missing case is handed out, a dead worker's once more and one by one, and
+the one that kills is named.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ def test_a_thousand_workers_get_tasks_that_one_scheduler_keeps_up_with(tmp_path:
     this = backlog(tmp_path, 16_000, [])
     this.done(this.take(1000), 0.001)  # type: ignore[arg-type]
     task = this.take(1000)
-    assert task is not None and len(task) == 4  # 16 000 / (4 x 1000): not the whole of 20 s, so that all end together
+    # 16 000 / (4 x 1000): not the whole of 20 s, so that all end together
+    assert task is not None and len(task) == 4
 
 
 def test_the_case_that_kills_its_workers_is_named_and_the_others_are_run(tmp_path: Path) -> None:

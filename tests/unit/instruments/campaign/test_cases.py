@@ -1,4 +1,6 @@
-"""Cases: made again by other commands, the same whatever came before them, and the display's light against the sky's."""
+"""Cases: made again by other commands, the same whatever came before them, and the display's
+light against the sky's.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +103,8 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
     rows = [this.row(k, np.array([0.5, 0.0, 0.0, share])) for k, share in enumerate((0.25, 0.75))]
     this.close()
     straight, turned = (np.array([row[f"error_{axis}_arcsec"] for axis in "xyz"]) for row in rows)
-    # 10-bit codes of stars over 1.1 monitor pixels a tracker's: the twin's own tests hold them to 0.02 px, 3 arcsec here.
+    # 10-bit codes of stars over 1.1 monitor pixels a tracker's: the twin's own tests hold them to
+    # 0.02 px, 3 arcsec here.
     assert np.abs(straight[:2]).max() < 3
     assert np.abs(turned - straight)[0] == pytest.approx(300, abs=3) and abs(turned - straight)[1] < 3
     assert rows[0]["matched"] >= 5

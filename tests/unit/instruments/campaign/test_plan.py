@@ -1,4 +1,6 @@
-"""Plans: what is refused, in one line, and what a design and its parameters make of a case's number."""
+"""Plans: what is refused, in one line, and what a design and its parameters make of a case's
+number.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +98,8 @@ def test_values_are_those_of_the_plan_and_reach_the_bench(tmp_path: Path) -> Non
     assert len({maker.bench(case).sha256 for case in cases}) == 12
 
 
-# Of 4000 even directions: the mean of each component has a sigma of sqrt(1/3 / 4000) = 0.009, and five of them are allowed.
+# Of 4000 even directions: the mean of each component has a sigma of sqrt(1/3 / 4000) = 0.009, and
+# five of them are allowed.
 EVEN = 5 * math.sqrt(1 / 3 / 4000)
 
 
@@ -114,5 +117,6 @@ def test_attitudes_are_even_over_the_sky_and_within_the_field(tmp_path: Path) ->
     looks = np.array([to_matrix(maker.case(k, rng.random(4)).first.q_icrs_to_cam)[2] for k in range(500)])
     off_deg = np.degrees(np.arccos(np.clip(looks @ middle, -1, 1)))
     assert off_deg.max() <= 3.0 + 1e-6
-    # Even over a small cap: half of the cases are beyond radius / sqrt 2; 500 of them have a sigma of 0.022.
+    # Even over a small cap: half of the cases are beyond radius / sqrt 2; 500 of them have a sigma
+    # of 0.022.
     assert abs((off_deg > 3 / math.sqrt(2)).mean() - 0.5) < 5 * 0.5 / math.sqrt(500)

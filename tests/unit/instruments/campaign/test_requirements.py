@@ -1,4 +1,6 @@
-"""Requirements: planted violations are found, clean campaigns are not accused, and limits hold at their stated confidence."""
+"""Requirements: planted violations are found, clean campaigns are not accused, and limits hold
+at their stated confidence.
+"""
 
 from __future__ import annotations
 
@@ -47,11 +49,13 @@ def simulated(
     wrong: float = 0.0,
     slow: float = 0.0,
 ) -> Columns:
-    """The answers of n cases in a field: one sigma an axis of each part, arcsec, and shares of answers.
+    """The answers of n cases in a field: one sigma an axis of each part, arcsec, and shares of
+    answers.
 
     `slow` is the share of cases whose first attitude takes over 1 s.
     """
-    looks = rng.random((n, 3)) if n < RATES else np.full((1, 3), 0.5).repeat(n, axis=0)  # rates need no field
+    # rates need no field
+    looks = rng.random((n, 3)) if n < RATES else np.full((1, 3), 0.5).repeat(n, axis=0)
     q = (
         np.array([looking_q(FIELD, look) for look in looks])
         if n < RATES

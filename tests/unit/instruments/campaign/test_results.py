@@ -24,7 +24,9 @@ SHARE_OF_BIAS = 0.1  # 2000 cases tell a sigma to 2 %; the growth along `a` make
 
 @pytest.fixture
 def table(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """A table of cases with a bias, noise that grows with `a` and not with `b` or `word`, and forty wild answers."""
+    """A table of cases with a bias, noise that grows with `a` and not with `b` or `word`, and
+    forty wild answers.
+    """
     names = ("wrong", "solved", "frames")
     rows = []
     for case in range(CASES):
@@ -50,7 +52,8 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
 
 def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> None:
     found = write_results(table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1)
-    assert 0 < found["limit_arcsec"].cross < 1 < found["limit_arcsec"].roll < 100  # of its own stars, whatever was planted
+    # of its own stars, whatever was planted
+    assert 0 < found["limit_arcsec"].cross < 1 < found["limit_arcsec"].roll < 100
     assert np.all(np.abs(np.array(found["bias_arcsec"]) - BIAS_ARCSEC) < BIAS_LIMIT_ARCSEC)
     # The mean square of 1 + 2 a over a from 0 to 1.
     growth = np.sqrt(1 + COST + COST**2 / 3)

@@ -1,4 +1,6 @@
-"""Solvers: a real one solves from the pixels alone, and each way to fail is a reason in the case's row."""
+"""Solvers: a real one solves from the pixels alone, and each way to fail is a reason in the
+case's row.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from tests.support.campaigns import write_campaign
 from tests.support.waiting import PATIENCE_S, wait_for
 
 EXAMPLES = ROOT / "examples"
-# A dozen stars with centroids to 0.03 px of 134 arcsec: 4 / sqrt 12 arcsec an axis; five sigma, and the field's lever for roll.
+# A dozen stars with centroids to 0.03 px of 134 arcsec: 4 / sqrt 12 arcsec an axis; five sigma, and
+# the field's lever for roll.
 CROSS_LIMIT_ARCSEC = 5 * 4 / np.sqrt(12)
 ROLL_LIMIT_ARCSEC = 30 * CROSS_LIMIT_ARCSEC
 
@@ -61,7 +64,8 @@ def test_a_solver_finds_the_commanded_attitude_in_the_pixels(seen: tuple[Simulat
 def test_an_error_is_the_rotation_vector_from_the_commanded_to_the_reported_attitude() -> None:
     q, turn_arcsec = from_radec_roll_deg(10, 20, 30), np.array([3.0, -2.0, 70.0])
     reported = -multiply(from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD), q)
-    assert attitude_error_arcsec(q, reported) == pytest.approx(turn_arcsec, abs=1e-7)  # float64 on 1e6 arcsec
+    # float64 on 1e6 arcsec
+    assert attitude_error_arcsec(q, reported) == pytest.approx(turn_arcsec, abs=1e-7)
 
 
 def test_noise_alone_has_no_attitude_and_centroids_say_so(seen: tuple[Simulator, Exposure]) -> None:

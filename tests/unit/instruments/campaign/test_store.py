@@ -1,4 +1,6 @@
-"""The store: what a kill leaves behind is mended, rows come back in order, and the table's bytes are the rows' alone."""
+"""The store: what a kill leaves behind is mended, rows come back in order, and the table's bytes
+are the rows' alone.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Certificates: intervals that hold the truth, a budget that two ways agree on, and checks that catch what moved."""
+"""Certificates: intervals that hold the truth, a budget that two ways agree on, and checks that
+catch what moved.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ BENCHES = 40
 FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
 UNCHANGED = 20
 FEW = 8
-MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)  # of figures that go together in each of FEW benches
+# of figures that go together in each of FEW benches
+MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)
 LONGEST = 2.5  # stated over true errors, by the median of FEW benches
 DIRECTION = "[certify.tracker]\ndirection_expanded_arcsec = 0.0\n"
 
@@ -109,7 +112,8 @@ def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
     assert found.noise_variance == pytest.approx(1, abs=4 * math.sqrt(2 / len(x)))
     more = noise + math.sqrt(0.3) * SmoothField(80.0, rng)(x, y)
     found = in_place(x, y, more, terms)
-    # A field of 1000 x 800 px has some thirty places that far apart: their variance is known to a quarter.
+    # A field of 1000 x 800 px has some thirty places that far apart: their variance is known to a
+    # quarter.
     assert found.total == pytest.approx(0.3, rel=0.75)
     assert found.mean_length == pytest.approx(80, rel=0.3)
     # An oblique field fills half of its box.
@@ -118,7 +122,8 @@ def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
     assert found.mean_length == pytest.approx(80, rel=0.6)
 
 
-# Of seed 32: their dots are a whole number of tracker pixels apart, nearly, so that all have one phase in a pixel.
+# Of seed 32: their dots are a whole number of tracker pixels apart, nearly, so that all have one
+# phase in a pixel.
 IN_PHASE = (29, 66, 72, 85)
 
 
@@ -148,7 +153,9 @@ def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
 
 
 def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) -> None:
-    """White of a sparse lattice is ten times as noisy as other codes: its interval is its own, and theirs are not wider."""
+    """White of a sparse lattice is ten times as noisy as other codes: its interval is its own,
+    and theirs are not wider.
+    """
     path = tmp_path / "bench.toml"
     path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
     file = read_bench_file(path)
@@ -205,7 +212,9 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory: pytest.TempPathFactory):
-    """A planted bench, its readings at its certificate, and a function that checks it with other things planted."""
+    """A planted bench, its readings at its certificate, and a function that checks it with other
+    things planted.
+    """
     one = dataclasses.replace(drawn(np.random.default_rng(5)), reading_noise=0.002, dot_noise_px=0.02, drift_percent_per_h=0.0)
     folder = tmp_path_factory.mktemp("check")
     bench, truth = (read_bench_file(path) for path in plant(folder, one))

@@ -1,4 +1,6 @@
-"""Two skies compared star by star: right drivers pass, and each planted fault is named, and nothing else."""
+"""Two skies compared star by star: right drivers pass, and each planted fault is named, and
+nothing else.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,12 @@ from tests.support.benches import SMALL_BENCH
 
 ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
 FAULT_MAG, FAULT_PX = 0.01, 0.02  # the smallest that must be seen
-# What the comparison itself is off by, of a fault that it measures: what is second order in the shift is under 1e-5, and the
-# light of the GL image is float32, 2e-6 mag and px at the worst (the drivers' test below).
+# What the comparison itself is off by, of a fault that it measures: what is second order in the
+# shift is under 1e-5, and the light of the GL image is float32, 2e-6 mag and px at the worst (the
+# drivers' test below).
 MEASURED_MAG = MEASURED_PX = 1e-4
-# Two drivers: 2e-6 mag and 1.4e-6 px on all but stars cut by the edge or with a 100 times brighter neighbour. 20 times that.
+# Two drivers: 2e-6 mag and 1.4e-6 px on all but stars cut by the edge or with a 100 times brighter
+# neighbour. 20 times that.
 DRIVER_MAG = DRIVER_PX = 4e-5
 DRIVER_SHARE = 0.98  # of stars; the others within their own limits
 EDGE_PX = 6.0
@@ -67,7 +71,9 @@ SKIES = {"default": "", "faint stars": "[sky]\nfaintest_v_mag = 9.5\n", "wide": 
 
 @pytest.fixture(scope="module")
 def benches(tmp_path_factory):
-    """The benches of SKIES, each loaded once: no test changes one, and a Field has frames of its own."""
+    """The benches of SKIES, each loaded once: no test changes one, and a Field has frames of its
+    own.
+    """
     folder, opened = tmp_path_factory.mktemp("skies"), {}
     for name, more in SKIES.items():
         (folder / f"{name}.toml").write_text(SMALL_BENCH + more)
@@ -95,7 +101,9 @@ def test_an_unchanged_frame_is_the_same_sky(field):
 @pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize("ra_dec", [(84.057, -1.2), (101.29, -16.7), (56.7, 24.1), (266.0, -29.0)])
 def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
-    """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way with 680 stars in 320 x 240."""
+    """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way
+    with 680 stars in 320 x 240.
+    """
     bench = benches[sky]
     field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
     oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.psf)
@@ -156,7 +164,9 @@ def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(field):
 
 
 def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_is_named(field):
-    """Also by more than any star is wide, where every star is missing from its place and extra in another."""
+    """Also by more than any star is wide, where every star is missing from its place and extra
+    in another.
+    """
     odd = field.inside()[-1]
     for right, down in ((-0.75, 0.0), (0.31, -0.02), (11.3, -4.6)):
         field.x_px, field.y_px = field.x_px + right, field.y_px + down
@@ -169,8 +179,9 @@ def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_
         assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (0, 0, 0)
         (named,) = [star for star in found.differing if star.hip == (int(field.hip[odd]),)]
         assert named.flux_error_mag == pytest.approx(2.5 * np.log10(1 / 0.9), abs=MEASURED_MAG)
-        # Stars that share their light with a neighbour may be one star there and two here; in this dense field a star that
-        # moves by many widths may come to lie on another one's old place, too.
+        # Stars that share their light with a neighbour may be one star there and two here; in this
+        # dense field a star that moves by many widths may come to lie on another one's old place,
+        # too.
         assert len(found.differing) <= (0.05 if abs(right) < 1 else 0.3) * len(found.stars)
         assert found.common.line().startswith(f"all shifted by ({right:.2f}, {down:.2f}) px; ")
 
@@ -192,7 +203,8 @@ def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(field):
 
 
 def test_the_legend_counts_what_the_terminal_counts(field):
-    # Shifted as a whole, stars leave the image and come into it: they are common, and missing or extra all the same.
+    # Shifted as a whole, stars leave the image and come into it: they are common, and missing or
+    # extra all the same.
     field.x_px += 3.0
     found = compare(field.frame(), field.golden)
     assert found.common is not None
@@ -233,7 +245,9 @@ def grid(x_px, y_px, flux, sigma_px=(0.85, 0.85), size_px=(160, 120)):
 @pytest.mark.parametrize("apart_px", [2.6, 4.0])
 @pytest.mark.parametrize("ratio", [1.0, 0.01])
 def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
-    """The other's light in its window is no fault of the neighbour, 100 times fainter as that one may be."""
+    """The other's light in its window is no fault of the neighbour, 100 times fainter as that
+    one may be.
+    """
     x, y = np.array([60.2, 60.2 + apart_px, 120.4, 20.1, 130.3]), np.array([50.3, 50.1, 90.2, 99.7, 20.5])
     flux = np.array([1e6, 1e6 * ratio, 3e5, 3e5, 3e5])
     golden, truth = grid(x, y, flux), np.zeros(5, dtype=TRUTH_DTYPE)
@@ -248,7 +262,8 @@ def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
             (star,) = compare(frame, golden, truth=truth).bad
             assert star.hip == (k + 1,)
             assert (star.flux_error_mag, star.dx_px) == pytest.approx(error, abs=MEASURED_PX)
-            # Without a table a star that outshines its neighbour hides it; what that one does is still seen, and where.
+            # Without a table a star that outshines its neighbour hides it; what that one does is
+            # still seen, and where.
             bad = compare(frame, golden).bad
             assert bad and all(abs(star.x_px - x[k]) < 2 and abs(star.y_px - y[k]) < 2 for star in bad)
 
@@ -287,7 +302,9 @@ def test_a_wing_without_its_star_is_counted_and_its_light_still_looked_at():
 
 @pytest.mark.parametrize("sigma_px", [(0.4, 0.4), (0.55, 0.85), (3.0, 1.0), (10.0, 10.0)])
 def test_the_sigma_is_that_of_the_stars(sigma_px, rng):
-    """To what the light of neighbours a footprint away, 1e-6 of theirs, may do where one is 1000 times brighter."""
+    """To what the light of neighbours a footprint away, 1e-6 of theirs, may do where one is 1000
+    times brighter.
+    """
     x, y = (60 + 130 * axis.ravel() + rng.uniform(-5, 5, 9) for axis in np.mgrid[:3, :3])
     image = grid(x, y, 10 ** rng.uniform(3, 6, 9), sigma_px, (400, 400))
     assert star_psf(image.astype(float)).sigma_px == pytest.approx(sigma_px, rel=1e-3)

@@ -1,4 +1,6 @@
-"""Photographs confronted: real ones of ESA's star tracker camera, and planted ones by another renderer."""
+"""Photographs confronted: real ones of ESA's star tracker camera, and planted ones by another
+renderer.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ resolution_px = [1024, 768]
 quantum_efficiency = 0.5
 exposure_s = 0.2
 """
-# The issue's aims for this camera, which was measured apart: 16 DN a step, 2.64 e- a step, 5114 px by 40.33 arcsec/px.
+# The issue's aims for this camera, which was measured apart: 16 DN a step, 2.64 e- a step, 5114 px
+# by 40.33 arcsec/px.
 MAX_RMS_PX, MAX_RMS_MAG = 0.07, 0.11
 HELD_OUT = 1.3
 SIGMAS = 3.0
@@ -41,7 +44,9 @@ WRONG = Extras(false_stars=FALSE_STARS, trail_px=((60, 60), (200, 110)), cloud_m
 
 
 def confronted(bench: Path, images: list[Path], output: Path, *options: str, charts: bool = False) -> dict[str, Any]:
-    """What the command finds. The page's charts are a third of its time: raw, held-out and planted photographs have them."""
+    """What the command finds. The page's charts are a third of its time: raw, held-out and
+    planted photographs have them.
+    """
     with pytest.MonkeyPatch.context() as patch:
         if not charts:
             patch.setattr(page, "_charts", lambda *given: [])
@@ -69,7 +74,8 @@ def test_raw_frames_give_the_camera_that_was_measured_apart(raw: tuple[Path, dic
     camera = found["camera"]
     assert abs(206264.8 / camera["focal_length_px"] - 40.33) < 0.05  # arcsec a pixel
     assert 0.06 < camera["distortion"]["k1"] < 0.13
-    # 2.64 e- were measured with the pixels' response as if it were photon noise; it is 0.5 % here, and told apart
+    # 2.64 e- were measured with the pixels' response as if it were photon noise; it is 0.5 % here,
+    # and told apart
     assert abs(16 * camera["gain_e_per_dn"] - 2.64) < 0.2
     assert 0.004 < camera["fixed_pattern"]["response"] < 0.007
     assert camera["colour_term"] == pytest.approx(-0.22, abs=0.06)
@@ -103,7 +109,8 @@ def test_frame_and_simulate_take_the_tracker_file(raw: tuple[Path, dict[str, Any
     assert done.returncode == 0, done.stderr
     assert run_hilstar_here("frame", tracker, f"--quaternion={q}", "--preview", folder / "frame.png").returncode == 0
     levels = [float(np.median(np.asarray(Image.open(path)))) for path in (folder / "like.png", RAW[0])]
-    assert levels[0] == pytest.approx(levels[1], rel=0.35)  # two skies of 3161 and 2032 DN have one mean
+    # two skies of 3161 and 2032 DN have one mean
+    assert levels[0] == pytest.approx(levels[1], rel=0.35)
 
 
 def photographs(folder: Path, camera: Planted) -> list[Path]:
@@ -151,7 +158,8 @@ TIMES = ("20T20:00:00", "20T23:00:00", "21T01:00:00")  # of September 2020
 
 
 def test_a_site_tells_air_mass_and_extinction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilstar.instruments.confront.run.MEMORY_PX", 0)  # as where photographs are more than memory holds
+    # as where photographs are more than memory holds
+    monkeypatch.setattr("hilstar.instruments.confront.run.MEMORY_PX", 0)
     camera, rng, paths, wanted = Planted(), np.random.default_rng(8), [], []
     for time in TIMES:
         t_ns = np.datetime64(f"2020-09-{time}", "ns").astype(np.int64)
@@ -165,11 +173,13 @@ def test_a_site_tells_air_mass_and_extinction(tmp_path: Path, monkeypatch: pytes
     sigma = figures["sigma"]["extinction_beyond_table_mag_per_air_mass"]
     assert abs(figures["extinction_mag_per_air_mass"] - 0.25) < SIGMAS * sigma
     assert sigma < 0.03
-    assert abs(figures["focal_length_px"] - camera.focal_px) < SIGMAS * figures["sigma"]["focal_length_px"] + 0.3  # aberration
+    # aberration
+    assert abs(figures["focal_length_px"] - camera.focal_px) < SIGMAS * figures["sigma"]["focal_length_px"] + 0.3
     masses = [image["air_mass"] for image in found["images"]]
     assert masses == pytest.approx(wanted, abs=0.01)
     assert all(image["rms_px"] < MAX_RMS_PX for image in found["images"])
-    # 600 e- in 68.75 arcsec squared, where 6e6 are V = 0; a night sky of that V has more red light than such a star
+    # 600 e- in 68.75 arcsec squared, where 6e6 are V = 0; a night sky of that V has more red light
+    # than such a star
     assert 19.18 < found["images"][0]["sky_v_mag_arcsec2"] < 19.6
     done = run_hilstar_here("simulate", tmp_path / "out" / "tracker.toml", "--radec", "310,40,110", "-o", tmp_path / "a.fits")
     assert done.returncode == 0, done.stderr
@@ -280,7 +290,9 @@ def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path)
 
 
 def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(tmp_path: Path) -> None:
-    """The date that bodies need was left out; a gain that one photograph does not tell is the bench file's, or not written."""
+    """The date that bodies need was left out; a gain that one photograph does not tell is the
+    bench file's, or not written.
+    """
     more = '[sky]\nepoch_utc = "2020-09-20T20:00:00Z"\n[sky.bodies]\nmoon = true\n'
     image = photograph(Planted(), SKY.pointings[2], np.random.default_rng(9), NOTHING_WRONG)
     Image.fromarray(image).save(tmp_path / "one.png")

@@ -1,4 +1,6 @@
-"""The detector behind photographs: a gain that they do not tell is the bench file's, and the rest of the noise the pixels'."""
+"""The detector behind photographs: a gain that they do not tell is the bench file's, and the
+rest of the noise the pixels'.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ EVERY = np.zeros(SHAPE, dtype=bool)
 
 
 def photographs(rng, levels_e, prnu=PRNU):
-    """Photographs (n, height, width), DN, of one detector: each of a level, e-, or of an image of levels."""
+    """Photographs (n, height, width), DN, of one detector: each of a level, e-, or of an image
+    of levels.
+    """
     response = 1 + prnu * rng.standard_normal(SHAPE)
     for level_e in levels_e:
         charge_e = rng.poisson(np.broadcast_to(level_e, SHAPE) * response)
@@ -35,7 +39,9 @@ def fitted(images, bench=BENCH):
 
 @pytest.mark.parametrize("ramp_e", [0.0, 12_000.0])
 def test_one_photograph_does_not_tell_the_gain_from_the_response(rng, ramp_e):
-    """3 % of response was taken for shot noise: 0.65 e- a DN, where 17 is true; a gradient made it no better."""
+    """3 % of response was taken for shot noise: 0.65 e- a DN, where 17 is true; a gradient made
+    it no better.
+    """
     levels_e = SKY_E + ramp_e * np.linspace(-0.5, 0.5, SHAPE[1])
     pixels = fitted(photographs(rng, [levels_e]))
     assert pixels.gain_e_per_dn == GAIN
@@ -57,7 +63,9 @@ def test_several_photographs_of_one_level_tell_the_gain_with_its_sigma(rng):
 
 
 def test_columns_are_no_share_of_the_response(rng):
-    """A column's mean has its pixels' response in it: 1.5 DN of columns were stated, where there are none."""
+    """A column's mean has its pixels' response in it: 1.5 DN of columns were stated, where there
+    are none.
+    """
     pixels = fitted(photographs(rng, [SKY_E] * 4))
     assert pixels.pattern.rms[0] == pytest.approx(PRNU, rel=0.02)
     assert pixels.pattern.rms[2:] == (0.0, 0.0)

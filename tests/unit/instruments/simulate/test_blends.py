@@ -12,8 +12,9 @@ from hilstar.server.bench.bench_file import bench_file_of
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.stars import stars_at
 
-# The centroider's window is a Gaussian, whose centre of an unequal pair is not that of its light: measured 0.059 sigma at 1.4.
-# The square in which it counts light holds a pair's as well: measured 1e-5 mag.
+# The centroider's window is a Gaussian, whose centre of an unequal pair is not that of its light:
+# measured 0.059 sigma at 1.4. The square in which it counts light holds a pair's as well: measured
+# 1e-5 mag.
 CENTRE_SIGMAS, FLUX_MAG = 0.07, 1e-4
 # On 10 bits by `exact`: measured 0.002 px and 0.0004 mag, as for single stars.
 SHOWN_PX, SHOWN_MAG = 0.01, 0.005

@@ -1,4 +1,6 @@
-"""A display that brings the tracker's PSF: its stars on a bare detector against the virtual tracker's own exact image."""
+"""A display that brings the tracker's PSF: its stars on a bare detector against the virtual
+tracker's own exact image.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,11 @@ from tests.support.psfs import coma, sampled
 
 TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
 SMALL = {"points": 3, "wavelengths_nm": (450.0, 750.0)}
-# Monitor pixels to a tracker pixel, and a relay's blur, without which both grids beat: 0.01 px in a star's place.
+# Monitor pixels to a tracker pixel, and a relay's blur, without which both grids beat: 0.01 px in a
+# star's place.
 SCALE, RELAY_PX = 2.3, 0.8
-FLUX, CENTROID_PX, WIDENED = 1e-5, 3e-4, 0.03  # measured 9e-7, 8e-5 px; the monitor's pixel counts twice: drawn, and lit
+# measured 9e-7, 8e-5 px; the monitor's pixel counts twice: drawn, and lit
+FLUX, CENTROID_PX, WIDENED = 1e-5, 3e-4, 0.03
 CODES_PX = 0.01  # `exact` on 12 bits: measured 0.0034
 
 
@@ -53,7 +57,8 @@ def bench(tmp_path):
 
 
 def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
-    file, q = bench(relay_px=RELAY_PX), from_radec_roll_deg(90.2, 22.3, 56)  # a star alone in each ninth of the field
+    # a star alone in each ninth of the field
+    file, q = bench(relay_px=RELAY_PX), from_radec_roll_deg(90.2, 22.3, 56)
     camera = tracker_camera(file.config.tracker, file.folder)
     with Simulator(file) as simulator:
         exposure = simulator.expose(simulator.view(q, np.zeros(3)), None)
@@ -109,7 +114,8 @@ def test_both_backends_show_the_same_levels_by_place(bench):
             oracle.draw(sprites)
             shown.renderer.draw(sprites)
             off = shown.renderer.levels().astype(int) - oracle.levels()
-            assert np.abs(off).max() <= 1 and np.count_nonzero(off) < 10, quantisation  # float32 of light beside a threshold
+            # float32 of light beside a threshold
+            assert np.abs(off).max() <= 1 and np.count_nonzero(off) < 10, quantisation
             assert np.allclose(shown.renderer.linear(), oracle.linear(), rtol=1e-6, atol=1e-3)
             by_mean = replace(sprites, spectra=None)
             oracle.draw(by_mean)
@@ -133,7 +139,9 @@ def test_a_gaussian_and_one_image_are_scaled_to_the_display(bench, tmp_path):
 
 
 def test_the_least_that_the_tolerance_allows_is_drawn(bench):
-    """A glass that is nearly the same everywhere takes one PSF, and with more tolerance a Gaussian, and says so."""
+    """A glass that is nearly the same everywhere takes one PSF, and with more tolerance a
+    Gaussian, and says so.
+    """
     even = stack(3, wavelengths_nm=(600.0,))
     even = replace(even, images=np.tile(even.images[4], (9, 1, 1)), facts=np.tile([1.0, 0, 0, 0], (9, 1)))
     file = bench(glass=glass_of(even))

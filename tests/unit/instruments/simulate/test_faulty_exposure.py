@@ -24,7 +24,9 @@ from tests.support.benches import ORION_Q, SMALL_BENCH
 
 EXPOSURE_S = 0.1  # the bench's default
 LIGHT_SHARE = 2e-6  # float32, and a footprint's cut
-PLACE_PX = 2e-3  # of the display's places on the detector: float32 fractions, and the slower star of a frame's middle
+# of the display's places on the detector: float32 fractions, and the slower star of a frame's
+# middle
+PLACE_PX = 2e-3
 
 HEAD = "seed = 5\n"
 GHOST = """
@@ -167,7 +169,8 @@ def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
         stands = dn_of(pictures(away))
     spot = slice(528, 533), slice(478, 483)
     assert seen[spot].sum() > plain[spot].sum() + 0.5 * 4e4 / 24  # e-/DN of the default detector
-    assert np.abs(stands.astype(float) - plain).max() < 0.2 * plain.max()  # the same stars, with other noise
+    # the same stars, with other noise
+    assert np.abs(stands.astype(float) - plain).max() < 0.2 * plain.max()
 
 
 def dn_of(png):

@@ -1,4 +1,6 @@
-"""hilstar verify with a scenario: each fault as the twin's tracker sees it, and no fault a reason against the bench."""
+"""hilstar verify with a scenario: each fault as the twin's tracker sees it, and no fault a
+reason against the bench.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.scenario import parse_scenario
 from tests.support.benches import TWIN, bench_text
 
-# A 10-bit monitor with exact codes: the bench's own limits for its stars (verify's defaults are 0.05 mag and 0.1 px).
+# A 10-bit monitor with exact codes: the bench's own limits for its stars (verify's defaults are
+# 0.05 mag and 0.1 px).
 LIMIT_MAG, LIMIT_PX = 0.02, 0.02
 
 SCENARIO = """

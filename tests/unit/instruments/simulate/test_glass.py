@@ -1,4 +1,6 @@
-"""Stars' spectra through a glass, and where it acts: the virtual tracker, the display's twin, and benches that have none."""
+"""Stars' spectra through a glass, and where it acts: the virtual tracker, the display's twin,
+and benches that have none.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +128,9 @@ def test_smear_goes_along_with_it(bench):
 
 
 def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
-    """A monitor pixel of 0.4 tracker pixels has the centroid of the mean PSF of its place, and is dimmed as that is."""
+    """A monitor pixel of 0.4 tracker pixels has the centroid of the mean PSF of its place, and
+    is dimmed as that is.
+    """
     file = bench()
     tracker, psf = tracker_camera(file.config.tracker, file.folder), tracker_psf(file.config.tracker, file.folder)
     monitor = monitor_camera((320, 240), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
@@ -189,13 +193,16 @@ def test_what_the_file_does_not_cover_is_said(bench, caplog):
 
 @pytest.mark.parametrize("psf", ["glass", "gaussian"])
 def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
-    """To 6e-3 px between the points of its file (measured 4.6e-3); the Gaussian sees the light beside it."""
+    """To 6e-3 px between the points of its file (measured 4.6e-3); the Gaussian sees the light
+    beside it.
+    """
     file = bench() if psf == "glass" else None
     glass = tracker_psf(file.config.tracker, file.folder) if file else GaussianPsf((0.6, 0.7))
     rng = np.random.default_rng(3)
     places = rng.uniform(15, SIDE_PX - 15, (2, 40))
     shares = rng.dirichlet(np.ones(4), 40) if file else None
-    pixels = np.rint(places[1] + 0.2).astype(int), np.rint(places[0] - 0.2).astype(int)  # not always the nearest
+    # not always the nearest
+    pixels = np.rint(places[1] + 0.2).astype(int), np.rint(places[0] - 0.2).astype(int)
     offs = places[0] - pixels[1], places[1] - pixels[0]
     stamps = 1e5 * told_psf(glass, pixels, 17, shares)(*offs)
 
@@ -207,7 +214,8 @@ def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
     assert off_px(shares, image=stamps + rng.normal(0, 30, stamps.shape)).max() < 0.02
     assert np.isfinite(off_px(shares, image=np.zeros_like(stamps))).all()
     if file:
-        exact = np.stack([truth(x, y, own, 17) for x, y, own in zip(*places, shares, strict=True)])  # about the nearest pixel
+        # about the nearest pixel
+        exact = np.stack([truth(x, y, own, 17) for x, y, own in zip(*places, shares, strict=True)])
         pixels = tuple(np.floor(places[::-1] + 0.5).astype(int))
         offs = places[0] - pixels[1], places[1] - pixels[0]
         right, white = off_px(shares, image=exact), off_px(None, image=exact)
@@ -215,7 +223,9 @@ def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
 
 
 def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(bench):
-    """No noise: the right PSF finds stars to a DN's rounding, a wrong one does not, and a focus that is off costs more."""
+    """No noise: the right PSF finds stars to a DN's rounding, a wrong one does not, and a focus
+    that is off costs more.
+    """
     file = bench()
     rms = {}
     with Simulator(file) as tracker:
@@ -245,7 +255,9 @@ def test_a_told_psf_without_its_centroider_is_refused(tmp_path):
 
 
 def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path):
-    """Coma and lateral colour of 0.3 px in the corners: a window has stars beside their chief rays."""
+    """Coma and lateral colour of 0.3 px in the corners: a window has stars beside their chief
+    rays.
+    """
     found = {}
     for kind in ("window", "psf"):
         bench({"verify": {"centroider": kind, "centroid_px": 0.05, "flux_mag": 0.5}, "sky": {"faintest_v_mag": 4.5}})
@@ -258,7 +270,9 @@ def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path)
 
 
 def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
-    """Through the keys' own coefficients; the flight software knows nothing of it, so its attitude is off by the decentring."""
+    """Through the keys' own coefficients; the flight software knows nothing of it, so its
+    attitude is off by the decentring.
+    """
     still = bench()
     write_glass(still.folder / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
     warm = {"temperature_k": 303.0, "focus_um_per_k": 0.6, "focal_length_ppm_per_k": 20.0}

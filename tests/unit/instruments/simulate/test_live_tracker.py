@@ -1,4 +1,6 @@
-"""The tracker before a running display: what an exposure has of its frames, its clock, and the errors that are planted."""
+"""The tracker before a running display: what an exposure has of its frames, its clock, and the
+errors that are planted.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def watched(*frames):
 def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
     turned = from_rotation_vector(np.array([0.0, 0.0, 0.01]))
     kept = watched(frame(1, [3], [8]), frame(2, [3, 5], [4, 40], turned), frame(4, [], [], None))
-    exposed = kept.exposed(150, 550)  # half of frame 1, all of frame 2 and, as 3 never came, of its time too; and of 4
+    # half of frame 1, all of frame 2 and, as 3 never came, of its time too; and of 4
+    exposed = kept.exposed(150, 550)
     assert exposed.lit.tolist() == [3, 5]
     assert exposed.light_e_per_s[:, 0] == pytest.approx([8 / 8 + 4 / 2, 40 / 2])
     assert (exposed.frames, exposed.shown_share) == (3, pytest.approx(5 / 8))

@@ -1,4 +1,6 @@
-"""The virtual tracker's Bayer mosaic, as other programs read it, against quadrature that is not the package's."""
+"""The virtual tracker's Bayer mosaic, as other programs read it, against quadrature that is not
+the package's.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ from tests.unit.server.bench.test_channels import NM, PASSBANDS, integrals
 
 PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
 EXPOSURE_S, GAIN = 0.5, 4.0
-# Every second pixel samples a star of sigma 1.6 px to exp(-2 pi^2 1.6^2 / 4) = 3e-6 of its light, and a circle of 12 px holds
-# all of it. DN are rounded: half a DN in each of 113 pixels, mostly cancelled, of some 1e4 DN. Asked for: 1 %.
+# Every second pixel samples a star of sigma 1.6 px to exp(-2 pi^2 1.6^2 / 4) = 3e-6 of its light,
+# and a circle of 12 px holds all of it. DN are rounded: half a DN in each of 113 pixels, mostly
+# cancelled, of some 1e4 DN. Asked for: 1 %.
 SIGMA_PX, RADIUS_PX, OFF = 1.6, 12.0, 5e-3
 BRIGHTEST = 5
 
@@ -62,7 +65,8 @@ def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(f
         pattern, truth = header["BAYERPAT"].lower(), truth.copy()
     assert pattern == bayer
     inside = [row for row in truth if 20 < row["x_px"] < 1003 and 20 < row["y_px"] < 1003][:BRIGHTEST]
-    assert len(inside) == BRIGHTEST and np.ptp([row["bv"] for row in inside]) > 1.5  # Betelgeuse among blue stars
+    # Betelgeuse among blue stars
+    assert len(inside) == BRIGHTEST and np.ptp([row["bv"] for row in inside]) > 1.5
     for star in inside:
         wanted = np.array(integrals(star["temperature_k"])) * 10 ** (-0.4 * star["v_mag"])
         np.testing.assert_allclose([star[f"electrons_{c}_per_s"] for c in "rgb"], wanted, rtol=1e-3)
@@ -87,7 +91,8 @@ def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(f
         assert len({round(level, 6) for level in levels}) == 3
         for k, level in enumerate(levels):
             noise_dn = np.median(np.abs(exposure.dn[k // 2 :: 2, k % 2 :: 2] - np.median(exposure.dn[k // 2 :: 2, k % 2 :: 2])))
-            assert noise_dn * 1.4826 == pytest.approx(np.sqrt(level + 25.0) / GAIN, rel=0.35)  # a median of whole DN
+            # a median of whole DN
+            assert noise_dn * 1.4826 == pytest.approx(np.sqrt(level + 25.0) / GAIN, rel=0.35)
         given = given_image(exposure, simulator)
     assert given.dtype == np.uint16 and given.shape == exposure.dn.shape
     assert np.abs(given - luminance(exposure.dn)).max() <= 0.5

@@ -1,4 +1,6 @@
-"""The noise of a star and its bounds: against closed form, a maximum-likelihood fit, and simulated exposures."""
+"""The noise of a star and its bounds: against closed form, a maximum-likelihood fit, and
+simulated exposures.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # roundin
 NOISY = DetectorSettings(
     gain_e_per_dn=1.0, bits=16, offset_dn=200.0, read_noise_e=8.0, dark_e_per_s=60.0, dsnu_e_per_s=6.0, prnu=0.01
 )
-# A Gaussian integrated over pixels is nearly one of variance sigma^2 + 1/12 (a square is no Gaussian): 1e-3 at 2 px and more.
+# A Gaussian integrated over pixels is nearly one of variance sigma^2 + 1/12 (a square is no
+# Gaussian): 1e-3 at 2 px and more.
 CLOSED_FORM = 2e-3
 STARS = 1600
 ERROR = 1 / math.sqrt(2 * 2 * STARS)  # of an rms of x and y of so many stars
@@ -66,7 +69,8 @@ def test_the_photons_limit_is_sigma_over_the_root_of_their_number(sigma_px):
 
 @pytest.mark.parametrize("sigma_px", [2.0, 3.0])
 def test_the_background_s_limit_is_that_of_a_gaussian_in_even_noise(sigma_px):
-    # Winick 1986: var x = 8 pi sigma^4 V / N^2; var N = 4 pi sigma^2 V, the noise-equivalent area of King 1983.
+    # Winick 1986: var x = 8 pi sigma^4 V / N^2; var N = 4 pi sigma^2 V, the noise-equivalent area
+    # of King 1983.
     found = one(gaussian(sigma_px), 100.0, 10_000.0)
     wide2, variance = sigma_px**2 + 1 / 12, 10_000 + 0.3**2 / 12
     assert found["bound_px"][0] == pytest.approx(math.sqrt(8 * math.pi * variance) * wide2 / 100, rel=CLOSED_FORM)
@@ -80,7 +84,8 @@ def test_the_sources_add_up_to_the_total_each_as_table_4_1_has_it():
     pixels = found["effective_px"]
     for name, e2 in (("background_e", 40), ("dark_e", 60), ("read_e", 64), ("quantisation_e", 1 / 12), ("dsnu_e", 36)):
         np.testing.assert_allclose(found[name], np.sqrt(pixels * e2), rtol=1e-12)
-    # Shot noise is between that of all photons and, under the weights of even noise, sqrt(4/3) as much.
+    # Shot noise is between that of all photons and, under the weights of even noise, sqrt(4/3) as
+    # much.
     assert math.sqrt(3000) < found["shot_e"][0] < math.sqrt(4 / 3 * 3000)
     names = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
     np.testing.assert_allclose(sum(found[f"{name}_e"] ** 2 for name in names), found["total_e"] ** 2, rtol=1e-12)
@@ -89,7 +94,9 @@ def test_the_sources_add_up_to_the_total_each_as_table_4_1_has_it():
 
 
 def exposed(star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Frames [e-] of single stars (n, side, side) through the detector, and their places (2, n) from the middle."""
+    """Frames [e-] of single stars (n, side, side) through the detector, and their places (2, n)
+    from the middle.
+    """
     count, side = math.isqrt(STARS), star.side_px
     place = rng.uniform(-0.5, 0.5, (2, STARS))
     tiles = (star_e * star.stamps(*place) + sky_e).reshape(count, count, side, side).swapaxes(1, 2)
@@ -100,7 +107,9 @@ def exposed(star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generat
 
 
 def most_likely(star: NoisyStar, seen: FloatArray, start: FloatArray, star_e: float, sky_e: float) -> FloatArray:
-    """Places (2, n) by Fisher's scoring for x, y and flux, from the true place: the fit that the bound is of."""
+    """Places (2, n) by Fisher's scoring for x, y and flux, from the true place: the fit that the
+    bound is of.
+    """
     x, y, flux, step = *start.copy(), np.full(len(seen), star_e), 1e-3
     for _ in range(12):
         shares = star.stamps(x, y)
@@ -133,13 +142,16 @@ def test_the_most_likely_place_reaches_the_bound_and_nothing_beats_it(sigma_px, 
 
 
 def test_where_a_star_is_one_pixel_wide_at_low_signal_the_bound_is_no_bound():
-    # Its share of the middle pixel hardly changes with the place, and a fit that cannot leave the pixel does better.
+    # Its share of the middle pixel hardly changes with the place, and a fit that cannot leave the
+    # pixel does better.
     assert beyond_bound(0.25, 150.0) < 0.9
     assert beyond_bound(0.85, 150.0) > 1.15  # SNR 3.3: the fit wanders
 
 
 def test_the_variance_alone_tells_what_counts_do_but_for_single_electrons():
-    """Exact information of a Poisson count with normal read noise, times its variance: 1 where the variance is all."""
+    """Exact information of a Poisson count with normal read noise, times its variance: 1 where
+    the variance is all.
+    """
 
     def ratio(mean_e: float, read_e: float) -> float:
         from scipy.stats import norm, poisson
@@ -215,7 +227,8 @@ def test_a_star_with_coma_is_found_beside_its_chief_ray_which_is_no_error_of_its
     star = NoisyStar(SampledPsf(sampled(coma(0.6), 4, 8), per_px=4), NOISY, 1.0)
     found = measured_px(star, 10_000.0, 20.0, CentroidSettings(), np.random.default_rng(4))
     bound_px = one(star, 10_000.0, 20.0)["bound_px"][0]
-    assert 0.9 * bound_px < found.min() < 2 * bound_px  # the middle of its light is 0.45 px, forty bounds, off
+    # the middle of its light is 0.45 px, forty bounds, off
+    assert 0.9 * bound_px < found.min() < 2 * bound_px
 
 
 def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
@@ -238,7 +251,8 @@ def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
     assert across[-1] == pytest.approx(math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials))
     assert about[-1] == pytest.approx(z, rel=4 / math.sqrt(2 * trials))
     lost = np.stack([np.where(np.arange(count) < 2, (np.nan, 1e6) * (count // 2), sigma_px)] * 2)
-    assert np.isinf(nea_arcsec(turns, lost, np.ones(count))[:, :3]).all()  # stars without a place are none
+    # stars without a place are none
+    assert np.isinf(nea_arcsec(turns, lost, np.ones(count))[:, :3]).all()
     twice = nea_arcsec(turns[[0, 0]], np.full((2, 2), 0.1), np.ones(2))
     assert np.isfinite(twice[:, 1]).all() and twice[1, 1] > 1000 * about[1]
     assert np.isinf([across[0], about[0]]).all() and (np.diff(across[1:]) < 0).all()
@@ -293,7 +307,9 @@ def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(
 
 
 def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_they_do(tmp_path):
-    """Information adds up: the squares of the channels' SNR are that of all. Shares are Gaussians' of width 0.55 px."""
+    """Information adds up: the squares of the channels' SNR are that of all. Shares are
+    Gaussians' of width 0.55 px.
+    """
     nm, peaks = np.arange(400.0, 721.0, 20.0), {"r": 620.0, "g": 540.0, "b": 460.0}
     for name, peak in peaks.items():
         rows = "".join(f"{at:g},{math.exp(-(((at - peak) / 60) ** 2)):.6f}\n" for at in nm)

@@ -25,9 +25,11 @@ PSF_PX = (0.55, 0.6)
 SIDE = 24  # squares along a monitor pixel in the oracle
 # Each of a pixel's nine sprites is cut at 1e-6 of its light, and summed in float32, 6e-8 a sum.
 CUT = 2e-6
-# Nine Gaussians for a square have its variance and not its fourth moment: measured 1.3e-4 of the brightest pixel.
+# Nine Gaussians for a square have its variance and not its fourth moment: measured 1.3e-4 of the
+# brightest pixel.
 NINE_FOR_A_SQUARE = 2e-4
-# Newton's method inverts a lens to 1e-8 px of its own image; a monitor pixel is about a tracker pixel.
+# Newton's method inverts a lens to 1e-8 px of its own image; a monitor pixel is about a tracker
+# pixel.
 INVERSE_PX = 1e-7
 MARGIN_PX = 6.0
 
@@ -42,7 +44,9 @@ def geometry():
 
 
 def oracle(geometry: BenchGeometry, light: np.ndarray) -> np.ndarray:
-    """The tracker's image by NumPy alone: SIDE^2 points a lit pixel, each a Gaussian integrated over every tracker pixel."""
+    """The tracker's image by NumPy alone: SIDE^2 points a lit pixel, each a Gaussian integrated
+    over every tracker pixel.
+    """
     image = np.zeros(TRACKER_PX[::-1])
     steps = (np.arange(SIDE) + 0.5) / SIDE - 0.5
     turn = matrix_of(geometry)
@@ -151,7 +155,9 @@ def test_a_glow_is_the_same_in_bands_of_rows(geometry, monkeypatch):
 
 
 def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
-    """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the integral over its square."""
+    """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the
+    integral over its square.
+    """
     wide = replace(geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0])))
     x_px, y_px = (part.ravel() for part in np.meshgrid(np.arange(64.0), np.arange(48.0)))
     seen_x, seen_y = wide.to_tracker(x_px, y_px)

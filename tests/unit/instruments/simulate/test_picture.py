@@ -16,7 +16,8 @@ SEEN = 150  # a grey that discs of bright stars have, and noise has not
 def frame(rng, stars=(), size=200, across_dn=0, down_dn=0, body_dn=None):
     """A frame of noise about SKY_DN with stars (row, column, peak DN) of sigma 0.7 px, cut at FULL.
 
-    The sky grows by `across_dn` and `down_dn` from edge to edge; `body_dn` (height, width) is of a body's light.
+    The sky grows by `across_dn` and `down_dn` from edge to edge; `body_dn` (height, width) is of a
+    body's light.
     """
     rows, columns = np.mgrid[:size, :size]
     light = rng.normal(SKY_DN, NOISE_DN, (size, size))
@@ -38,7 +39,9 @@ def disc(row, column, radius, size=200):
 
 
 def test_a_gradient_of_stray_light_is_no_star(rng):
-    """A thousand times the noise from corner to corner, as Rosetta's camera has it: stars alone have discs."""
+    """A thousand times the noise from corner to corner, as Rosetta's camera has it: stars alone
+    have discs.
+    """
     stars = [(60, 50, 1500), (190, 190, 1500), (15, 180, 1500)]
     picture = picture_of(frame(rng, stars, across_dn=700, down_dn=500))
     _, count = label(picture > SEEN)

@@ -1,4 +1,6 @@
-"""Rolling shutters and frame-transfer smear: each row by brute force, stars and a scanning display in closed form."""
+"""Rolling shutters and frame-transfer smear: each row by brute force, stars and a scanning
+display in closed form.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ ROLLING = {"tracker.detector": {"shutter": "rolling", "row_time_us": 40.0}}
 
 
 def star(x, y, z=CAMERA.focal_length_px):
-    """A star of one electron per second at a pixel when the middle row is in the middle of its exposure."""
+    """A star of one electron per second at a pixel when the middle row is in the middle of its
+    exposure.
+    """
     at = np.array([[x - CAMERA.principal_point_px[0], y - CAMERA.principal_point_px[1], z]])
     return stars_at(at @ CAMERA.cam_to_image, np.ones(1))
 
@@ -69,7 +73,9 @@ def test_each_row_has_its_own_exposure(rate_deg_s, direction):
 
 
 def test_a_star_that_runs_with_the_rows_is_exposed_for_longer():
-    """Closed form: with v px/s down the rows and t s a row, light grows by 1 / (1 - v t), and y by y t v / (1 - v t)."""
+    """Closed form: with v px/s down the rows and t s a row, light grows by 1 / (1 - v t), and y
+    by y t v / (1 - v t).
+    """
     rate = np.radians(np.array([2.0, 0, 0]))
     # On the axis across the turn a star moves at f times the rate, but for 1 + tan^2.
     speed = np.sign(drawn_y(1e-3) - 59.5) * rate[0] * CAMERA.focal_length_px
@@ -110,7 +116,9 @@ def test_a_rolling_truth_is_where_the_light_is_and_a_still_one_is_global_bit_for
 
 
 def test_a_scanning_display_makes_the_stripes_of_the_closed_form(tmp_path):
-    """A screen lit for 4 ms of each 16.7, exposures of 2.4 refreshes: each row's glow by its own phase."""
+    """A screen lit for 4 ms of each 16.7, exposures of 2.4 refreshes: each row's glow by its own
+    phase.
+    """
     tables = {
         "tracker": {"resolution_px": [64, 480], "exposure_s": 0.04},
         "monitor": {"hold_ms": 4.0, "calibration": "lcd-example"},
@@ -147,7 +155,9 @@ def test_a_scanning_display_makes_the_stripes_of_the_closed_form(tmp_path):
 
 
 def test_a_moving_star_behind_a_rolling_shutter_sees_the_frames_of_its_own_rows(tmp_path):
-    """The light of the stars of a turning display adds up, and their streaks lie where the sky's do."""
+    """The light of the stars of a turning display adds up, and their streaks lie where the sky's
+    do.
+    """
     (tmp_path / "bench.toml").write_text(
         bench_text(TWIN, ROLLING, {"sky": {"faintest_v_mag": 3.5}, "render": {"motion": "on"}})
     )
@@ -184,7 +194,8 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
         seen = twin.detected_dn(twin.field(np.array(ORION_Q), 0), np.random.default_rng(1))
         rows, exposure_s = seen.shape[0], twin.config.tracker.exposure_s
         step_e = twin.config.tracker.detector.gain_e_per_dn
-    smeared_e = 3000 * rows * 5e-6 / exposure_s  # 60 e- that the mean background's smear would leave
+    # 60 e- that the mean background's smear would leave
+    smeared_e = 3000 * rows * 5e-6 / exposure_s
     assert abs(np.median(seen) * step_e) < 0.2 * smeared_e
 
 

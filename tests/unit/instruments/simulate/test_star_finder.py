@@ -19,7 +19,9 @@ BIAS_PX = {"moment": 1e-3, "window": 0.03, "wide": 0.03, "fit": 1e-3, "box3": 0.
 
 
 def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
-    """Window of 9 px, sigma 1: a neighbour at the window's edge brings half of its light, one 3 px past it a thousandth."""
+    """Window of 9 px, sigma 1: a neighbour at the window's edge brings half of its light, one 3
+    px past it a thousandth.
+    """
     place = [100.0, 104.5, 200.0, 207.5, 300.0, 307.5, np.nan]
     flux = [1.0, 1.0, 1.0, 1.0, 1.0, 1000.0, 1.0]
     assert crowded(np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))).tolist() == [
@@ -47,7 +49,9 @@ def test_nothing_measured_has_no_zero_point():
 
 @pytest.mark.parametrize("kind", FAMILY)
 def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(kind):
-    """One star where it should be, one 2 px aside, one cut by the image's edge; nothing at the fourth place."""
+    """One star where it should be, one 2 px aside, one cut by the image's edge; nothing at the
+    fourth place.
+    """
     finder = StarFinder(CentroidSettings(window_sigma_px=1.0), GaussianPsf((1.0, 1.0)), LocalBackground(0.0, 0.01), kind)
     x_px, y_px = np.array([20.3, 42.1, 0.4, 60.0]), np.array([21.8, 40.0, 30.2, 15.0])
     places = [(20.3, 21.8), (40.1, 40.0), (0.4, 30.2)]

@@ -60,7 +60,9 @@ def test_all_methods_see_the_same_fields_whatever_noise_they_draw(tmp_path):
 
 
 def test_a_whole_cycle_of_temporal_is_better_than_one_frame_of_it(tmp_path):
-    """Eight frames bring the step of light, so the errors of faint stars, down to an eighth; a half is asked for."""
+    """Eight frames bring the step of light, so the errors of faint stars, down to an eighth; a
+    half is asked for.
+    """
     errors = []
     for frames in (1, 8):
         path = bench_file(tmp_path, method="temporal", exposure_s=frames / 60)

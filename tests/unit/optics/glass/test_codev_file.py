@@ -1,4 +1,6 @@
-"""What a .seq file states, against an own trace; and that what is not known is refused by its line."""
+"""What a .seq file states, against an own trace; and that what is not known is refused by its
+line.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ def test_radii_without_rdm_are_refused():
 
 @pytest.mark.parametrize(("terms", "rms_um"), [([], 55.8), (["ASP", "A -7e-07; B 0.0; C 0.0"], 15.8)])
 def test_a_is_the_coefficient_of_the_fourth_power(terms, rms_um):
-    """The singlet's spot by an own ray trace: 55.8 um as a sphere, 15.8 um with A; A on r^2 would leave 55.3 um."""
+    """The singlet's spot by an own ray trace: 55.8 um as a sphere, 15.8 um with A; A on r^2
+    would leave 55.3 um.
+    """
     lens = read_codev(seq(surfaces=SINGLET, more={1: terms}))
     assert rms_radius_um(lens) == pytest.approx(rms_um, abs=RMS_TOLERANCE_UM)
 
@@ -187,7 +191,9 @@ def test_lines_go_on_and_comments_end_them():
 
 
 def test_a_fold_mirror_bends_the_axis():
-    """A flat mirror at 45 degrees with BEN: the axis behind it stands at a right angle, and the light runs along it."""
+    """A flat mirror at 45 degrees with BEN: the axis behind it stands at a right angle, and the
+    light runs along it.
+    """
     lines = [
         "RDM",
         "DIM M",

@@ -1,4 +1,6 @@
-"""Stars through a glass against brute force: flux, centroids and second moments over field, colour, focus and phase."""
+"""Stars through a glass against brute force: flux, centroids and second moments over field,
+colour, focus and phase.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
 from hilstar.optics.sprites import pack_sprites
 from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile, stack, truth
 
-# What is asked of the whole chain; measured here: 3e-7, 2e-4 px and 4e-3 at the points, 1.4e-3 px between them.
+# What is asked of the whole chain; measured here: 3e-7, 2e-4 px and 4e-3 at the points, 1.4e-3 px
+# between them.
 FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
 
@@ -78,7 +81,9 @@ def test_the_centroid_drifts_with_colour_as_the_glass_has_it(glass):
 
 
 def test_the_centroid_that_is_said_is_that_of_the_light_that_is_drawn(glass, rng):
-    """Pixels sample the light: of a Gaussian of s = 0.5 px they move the centroid by up to exp(-2 (pi s)^2) / pi, 2.3e-3 px."""
+    """Pixels sample the light: of a Gaussian of s = 0.5 px they move the centroid by up to
+    exp(-2 (pi s)^2) / pi, 2.3e-3 px.
+    """
     psf, size_px = glass_psf(glass, 0.0, MEAN), (SIDE_PX, SIDE_PX)
     x_px, y_px = np.array([100.3]), np.array([60.8])
     sprites = pack_sprites(x_px, y_px, np.array([1e4]), np.zeros(1, int), size_px, psf.footprint_px)
@@ -94,7 +99,8 @@ def test_beyond_the_field_the_nearest_point_is_taken(glass):
     psf = glass_psf(glass, 0.0, MEAN)
     beyond = psf.of_stars(np.array([-50.25]), np.array([400.25]), MEAN, np.ones(1))
     edge = psf.of_stars(np.array([0.0]), np.array([255.0]), MEAN, np.ones(1))
-    assert moments(beyond[0])[3:] == pytest.approx(moments(edge[0])[3:], rel=1e-2)  # another place in its pixel
+    # another place in its pixel
+    assert moments(beyond[0])[3:] == pytest.approx(moments(edge[0])[3:], rel=1e-2)
     assert beyond.sum() == pytest.approx(edge.sum(), rel=1e-6)
 
 
@@ -150,7 +156,9 @@ def test_a_field_without_stars_has_no_light(glass):
 
 
 def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
-    """The noise of 1e-4 of the light a pixel moves one image's centroid by 1e-4 sqrt(sum of x^2) over 15 x 15 px, 6.5e-3 px."""
+    """The noise of 1e-4 of the light a pixel moves one image's centroid by 1e-4 sqrt(sum of x^2)
+    over 15 x 15 px, 6.5e-3 px.
+    """
     plain = stack(integrated=True, per_px=1)
     noisy = replace(plain, images=plain.images + rng.normal(0, 1e-4, plain.images.shape))
     psf = glass_psf(glass_of(noisy), 0.0, MEAN)

@@ -1,4 +1,6 @@
-"""A lens's prescription against rays that optiland traces here, and against diffraction's own peak; needs optiland."""
+"""A lens's prescription against rays that optiland traces here, and against diffraction's own
+peak; needs optiland.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ from tests.support.lenses import SCHOTT, focal_length_mm, lit_share, rms_radius_
 SIZE, PITCH_UM = "101,81", 20.0
 # Measured: 0.002 px and 0.7 %; diffraction's wings beyond the stamp are what is left.
 CENTROID_PX, SECOND = 0.01, 0.03
-# A doublet and a tilted, decentred singlet with a conic and an asphere, before a tilted image. A surface: radius, thickness,
-# glass, conic and the coefficient of r^4; a break: shifts, turns about x, y and z, order flag, thickness.
+# A doublet and a tilted, decentred singlet with a conic and an asphere, before a tilted image. A
+# surface: radius, thickness, glass, conic and the coefficient of r^4; a break: shifts, turns about
+# x, y and z, order flag, thickness.
 TILTED = [
     (42.0, 6.0, "N-BK7", 0.0, -4e-7), (-34.0, 2.0, "N-F2", 0.0, 0.0), (-160.0, 8.0, "", 0.0, 0.0),
     (0.3, -0.25, 1.3, -0.9, 7.0, 0, 1.0),
@@ -67,7 +70,8 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
     save_optiland_file(lens, str(tmp_path / "lens.json"))
     result = made(tmp_path, "--pitch-um", PITCH_UM, "--resolution", SIZE, "--half-px", 5, "--oversampling", 8)
     assert result.returncode == 0, result.stderr
-    assert "focal_length_mm = 49.79" in result.stdout  # of its chief rays: its image plane is not the paraxial one
+    # of its chief rays: its image plane is not the paraxial one
+    assert "focal_length_mm = 49.79" in result.stdout
     glass = read_glass(tmp_path / "psf.fits")
     assert isinstance(glass, Glass)
     at = (np.arange(glass.basis.shape[1]) - glass.basis.shape[1] // 2) / glass.per_px
@@ -76,7 +80,8 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
     for point in (0, 12):
         for number, um in enumerate((0.48, 0.55, 0.65)):
             place = (glass.places_px[point] - [50, 40]) * PITCH_UM * 1e-3
-            field = np.rad2deg(np.arctan(place / 50)) / 20  # over so small a field angles are tangents
+            # over so small a field angles are tangents
+            field = np.rad2deg(np.arctan(place / 50)) / 20
             rays = lens.trace_generic(np.full(len(x), field[0]), np.full(len(x), field[1]), x, y, um)
             chief = lens.trace_generic(field[0], field[1], 0.0, 0.0, um)
             image = glass.images[point, number, 0]
@@ -117,7 +122,9 @@ def zemax(folder: Path) -> Path:
 
 
 def frames(parts):
-    """The rotation, origin and surface of each surface; Zemax turns about x, the new y, the newer z, or backwards."""
+    """The rotation, origin and surface of each surface; Zemax turns about x, the new y, the
+    newer z, or backwards.
+    """
     turn, origin = np.eye(3), np.zeros(3)
     for part in parts:
         if len(part) == 7:
@@ -167,7 +174,9 @@ def test_breaks_keep_zemax_s_order(tmp_path):
 
 
 def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
-    """Chief rays, centroids and widths over field, colour and focus; counted rays, for so wide a stamp."""
+    """Chief rays, centroids and widths over field, colour and focus; counted rays, for so wide a
+    stamp.
+    """
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     monkeypatch.setattr(prescription, "POINTS", 3)
     monkeypatch.setattr(prescription, "GEOMETRIC_RAYS", 120)
@@ -177,7 +186,8 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
     glass = read_glass(tmp_path / "psf.fits")
     focal_mm = float(" ".join(glass.history).split("focal length ")[1].split()[0])
     grid = np.array(np.meshgrid(*[(np.arange(120) + 0.5) / 60 - 1] * 2)).reshape(2, -1)
-    pupil = np.concatenate([np.zeros((2, 1)), grid[:, (grid**2).sum(axis=0) <= 1]], axis=1) * EPD_MM / 2  # the chief ray first
+    # the chief ray first
+    pupil = np.concatenate([np.zeros((2, 1)), grid[:, (grid**2).sum(axis=0) <= 1]], axis=1) * EPD_MM / 2
     start = np.concatenate([pupil, np.zeros((1, pupil.shape[1]))])
     zero = snell(start[:, :1], np.array([[0.0], [0.0], [1.0]]), 0.55)[0][:2]
     at = (np.arange(glass.basis.shape[1]) - glass.basis.shape[1] // 2) / glass.per_px
@@ -197,7 +207,8 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
                 for axis in (0, 1):
                     line, rays = image.sum(axis=axis), off_px[axis, 1:]
                     assert line @ at + lateral[axis] == pytest.approx(rays.mean(), abs=RAY_CENTROID_PX)
-                    shared = rays.var() + 1 / 8 / glass.per_px**2  # by the samples among which a ray is shared out
+                    # by the samples among which a ray is shared out
+                    shared = rays.var() + 1 / 8 / glass.per_px**2
                     assert line @ at**2 - (line @ at) ** 2 == pytest.approx(shared, rel=RMS, abs=0.02)
 
 
@@ -333,7 +344,9 @@ def test_a_file_is_refused_before_optiland_is_needed(tmp_path, monkeypatch):
 
 
 def test_vignetting_moves_the_lit_part_of_the_pupil(tmp_path, monkeypatch):
-    """VUY 0.4 at the field's edge cuts the upper fifth of the pupil's height: its middle is 0.4 / 2 of a radius lower."""
+    """VUY 0.4 at the field's edge cuts the upper fifth of the pupil's height: its middle is 0.4
+    / 2 of a radius lower.
+    """
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     (tmp_path / "lens.seq").write_bytes(seq("VUY 0 0.4"))
     lens = prescription._read(tmp_path / "lens.seq")

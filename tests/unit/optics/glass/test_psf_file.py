@@ -1,4 +1,6 @@
-"""The file of a glass: what is written is read, a small basis keeps what it says, and what is wrong is one line."""
+"""The file of a glass: what is written is read, a small basis keeps what it says, and what is
+wrong is one line.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ def test_the_basis_keeps_each_psf_to_its_tolerance_and_its_moments_exactly(toler
     found = glass_of(given, tolerance)
     images = given.images / given.images.sum(axis=(1, 2), keepdims=True)
     kept = found.images.reshape(images.shape)
-    by_pixels = uniform_filter(np.pad(kept - images, ((0, 0), (4, 4), (4, 4))), (0, 4, 4))  # 4 samples a pixel
+    # 4 samples a pixel
+    by_pixels = uniform_filter(np.pad(kept - images, ((0, 0), (4, 4), (4, 4))), (0, 4, 4))
     assert 0.5 * np.abs(by_pixels).sum(axis=(1, 2)).max() == pytest.approx(found.residual, abs=1e-5)
     assert found.residual <= max(tolerance, 1e-6)
     y, x = (np.indices(images.shape[1:]) - images.shape[1] // 2) / 4
@@ -144,4 +147,5 @@ def test_detail_finer_than_a_pixel_asks_for_no_component(rng):
         -0.5, 0.5, (len(given.images), 1, 1)
     )
     grained = replace(given, images=given.images * (1 + grain))
-    assert len(glass_of(grained).basis) < len(glass_of(given).basis) + 5  # by samples there would be 37
+    # by samples there would be 37
+    assert len(glass_of(grained).basis) < len(glass_of(given).basis) + 5

@@ -1,4 +1,6 @@
-"""What a .zmx file states, against an own trace; and that what is not known is refused by its line."""
+"""What a .zmx file states, against an own trace; and that what is not known is refused by its
+line.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from hilstar.basics.errors import InputError
 from hilstar.optics.glass.zemax_file import read_zemax
 from tests.support.lenses import focal_length_mm, lit_share, zmx
 
-FOCAL_MM = 100.0308  # of the doublet, by the own trace in `tests/support/lenses.py`; its maker states 100 mm
+# of the doublet, by the own trace in `tests/support/lenses.py`; its maker states 100 mm
+FOCAL_MM = 100.0308
 TOLERANCE_MM = 2e-4  # the file's five digits of focal length
 LIT_TOLERANCE = 6e-3  # a grid of 160 rays across counts areas to 5 parts in 1000
 

@@ -1,4 +1,6 @@
-"""Trackers' bytes to answers: each framing in closed form, however it is cut, and never by a damaged frame."""
+"""Trackers' bytes to answers: each framing in closed form, however it is cut, and never by a
+damaged frame.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +112,8 @@ def test_however_a_stream_is_cut_the_answers_are_the_same(name, rng):
     frames = [framed_as(body_of(seconds=k)) for k in range(20)]
     stream = b"\0" + b"".join(frame + rng.bytes(4 * (k % 3 == 0)) for k, frame in enumerate(frames))
     whole = [answer.t_ns for answer in answers(decoder_of(**keys).feed(0, stream))]
-    assert len(whole) >= 4  # garbage that looks like a header, or hides a delimiter, takes frames after it along
+    # garbage that looks like a header, or hides a delimiter, takes frames after it along
+    assert len(whole) >= 4
     bits, decoder = [], decoder_of(**keys)
     for byte in stream:
         bits += answers(decoder.feed(0, bytes([byte])))
@@ -119,7 +122,9 @@ def test_however_a_stream_is_cut_the_answers_are_the_same(name, rng):
 
 @pytest.mark.parametrize("name", FRAMINGS)
 def test_no_damaged_frame_is_taken_for_an_answer(name, rng):
-    """Some 100 000 mutated bytes of each framing: a wrong answer would need a CRC-16 that is right by chance, 1 in 65 536."""
+    """Some 100 000 mutated bytes of each framing: a wrong answer would need a CRC-16 that is
+    right by chance, 1 in 65 536.
+    """
     keys, framed_as = FRAMINGS[name]
     decoder, good, taken = decoder_of(**keys), framed_as(body_of()), 0
     for _ in range(2500):
@@ -131,12 +136,14 @@ def test_no_damaged_frame_is_taken_for_an_answer(name, rng):
             mutant[int(rng.integers(len(mutant))) :] = rng.bytes(int(rng.integers(20)))
         for found in answers(decoder.feed(0, bytes(mutant))):
             taken += 1
-            assert found.t_ns == 1_000_500_000_000  # the frame as it was, of changes that undid each other
+            # the frame as it was, of changes that undid each other
+            assert found.t_ns == 1_000_500_000_000
     kept: bytearray = decoder._cutter._kept  # type: ignore[union-attr]
     assert taken < 250
     assert len(kept) <= MAX_KEPT_BYTES
     late = decoder.feed(10**9, b"\0\xc0" + 60 * b"\0" + good * 3) + decoder.feed(2 * 10**9, good)
-    # What looks like a header waits for a pause; what stands before a delimiter goes with the garbage.
+    # What looks like a header waits for a pause; what stands before a delimiter goes with the
+    # garbage.
     assert [found.t_ns for found in answers(late)][-3:] == [1_000_500_000_000] * 3
 
 
@@ -236,7 +243,8 @@ def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(tmp
     module, _, _ = name.partition(":")
     with pytest.raises(InputError, match="stands in"):
         AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
-    (tmp_path / f"{module.partition('.')[0]}.py").write_text("")  # nor does a file of that name let it in
+    # nor does a file of that name let it in
+    (tmp_path / f"{module.partition('.')[0]}.py").write_text("")
     with pytest.raises(InputError, match="is the name of a module of Python or of hilstar"):
         AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
 

@@ -41,7 +41,8 @@ def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn
         frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
     lit = frames.over(round(1.0 * NS_PER_S), round(1.2 * NS_PER_S))
     truth = propagate(START, rate, 1.1)
-    # Frames stand for the time about their moment, and ends of the exposure cut two of them: within 0.01 of a frame's turn.
+    # Frames stand for the time about their moment, and ends of the exposure cut two of them: within
+    # 0.01 of a frame's turn.
     assert np.abs(residual_arcsec(truth, lit.q)).max() < 0.01 * 3600 / 60
     assert lit.rate_rad_s == pytest.approx(rate, rel=1e-3, abs=1e-7)
     assert lit.light_ns == round(1.1 * NS_PER_S) + 7
@@ -83,7 +84,9 @@ LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
 
 
 def judged(clock: str, seconds: float = 60.0, wild: float = 0.01, **rules) -> tuple[AnswerJudge, list]:
-    """A minute of a planted tracker: bias, noise, a clock that runs fast, late by LATENCY_S and more, and wild answers."""
+    """A minute of a planted tracker: bias, noise, a clock that runs fast, late by LATENCY_S and
+    more, and wild answers.
+    """
     rng = np.random.default_rng(3)
     frames = LitFrames(PERIOD_NS)
     judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock, **rules), frames)
@@ -111,7 +114,8 @@ def test_the_last_minutes_residual_is_the_planted_error(clock):
     wild = [is_wild for _, is_wild in found]
     assert [each.verdict == "wrong" for each, _ in found] == wild
     assert figures.wrong == sum(wild) > 0
-    # The mean of n answers within four of its sigmas, and of the rate (0.3 deg/s rms) times the time's 2 ms.
+    # The mean of n answers within four of its sigmas, and of the rate (0.3 deg/s rms) times the
+    # time's 2 ms.
     sigma = 4 * NOISE_ARCSEC / np.sqrt(600) + 1080 * 0.002
     assert np.abs(np.array(figures.mean_arcsec) - BIAS_ARCSEC).max() < sigma.max()
     assert np.array(figures.sigma3_arcsec) == pytest.approx(3 * NOISE_ARCSEC, rel=0.2)
@@ -187,7 +191,9 @@ OUTLIER_ARCSEC, OFF_ARCSEC, OFF_SHARE = 1000.0, 60.0, 0.3
 
 
 def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
-    """Half a minute of a turning tracker on its own clock, whose roll is ROLL_RATIO times as noisy as its cross axes."""
+    """Half a minute of a turning tracker on its own clock, whose roll is ROLL_RATIO times as
+    noisy as its cross axes.
+    """
     rng = np.random.default_rng(seed)
     frames = LitFrames(PERIOD_NS)
     judge = AnswerJudge(AnswerRules(EXPOSURE_S), frames)
@@ -213,7 +219,8 @@ def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
 def test_a_noisy_roll_and_odd_answers_leave_every_answer_judged_and_the_delay_found(kind, seed):
     judge, found = spoilt(kind, seed)
     assert {each.verdict for each in found} == {"right"}
-    # The noise of 300 answers at 0.3 deg/s leaves 0.1 ms; shortest arrivals of JITTER_S and answers that are off a few ms more.
+    # The noise of 300 answers at 0.3 deg/s leaves 0.1 ms; shortest arrivals of JITTER_S and answers
+    # that are off a few ms more.
     assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
     assert judge.times.sigma_s < 0.01
     assert all_finite(judge, found[-1].answer.host_ns)
@@ -230,7 +237,8 @@ def all_finite(judge: AnswerJudge, now_ns: int) -> bool:
     return all(map(math.isfinite, known)) and bool(np.isfinite(judge._rows).all())
 
 
-NEAR = st.tuples(*[st.floats(-4000.0, 4000.0)] * 3)  # arcsec from what was lit: right, and a little wrong
+# arcsec from what was lit: right, and a little wrong
+NEAR = st.tuples(*[st.floats(-4000.0, 4000.0)] * 3)
 ANY_Q = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
 ODD_NS = st.one_of(st.just(0), st.integers(-(10**9), 10**9), st.integers(-(2**62), 2**62))
 ONE = st.tuples(st.one_of(NEAR, ANY_Q), ODD_NS, st.booleans())
@@ -241,7 +249,9 @@ EXAMPLES = 100  # a fixed budget: three seconds
 @settings(max_examples=EXAMPLES, deadline=None, derandomize=True)
 @given(st.sampled_from(["own", "host", "unix"]), MANY, st.integers(0, 2**32))
 def test_no_finite_answers_in_any_order_end_the_judging(clock, many, seed):
-    """Attitudes near and far, stamps right, odd and wild, arrivals in order and shuffled: each answer is judged."""
+    """Attitudes near and far, stamps right, odd and wild, arrivals in order and shuffled: each
+    answer is judged.
+    """
     frames = lit_until(8.0)
     judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock), frames)
     arrivals_s = 0.5 + 0.11 * np.arange(len(many))
@@ -264,7 +274,8 @@ def test_a_fit_that_keeps_no_answer_or_is_not_finite_is_none():
     rate, error = rng.normal(0, 1000.0, (40, 3)), rng.normal(0, 2.0, (40, 3))
     assert fitted_delay(error, rate, 0.0).shift_s == pytest.approx(0.0, abs=1e-3)
     assert fitted_delay(error[:5], rate[:5], 0.0) is None
-    # Each axis has its own third of the rows far off: the medians hold, and no row is near in all three.
+    # Each axis has its own third of the rows far off: the medians hold, and no row is near in all
+    # three.
     apart = np.zeros((39, 3))
     apart[np.arange(39), np.arange(39) % 3] = 1e4
     assert fitted_delay(apart, np.zeros((39, 3)), 0.0) is None

@@ -1,4 +1,6 @@
-"""Whatever a tracker sends: nothing raises, nothing is kept, and what is made of it can be handed over and explained."""
+"""Whatever a tracker sends: nothing raises, nothing is kept, and what is made of it can be
+handed over and explained.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,9 @@ def test_memory_is_flat_under_babble(name, rng):
 @pytest.mark.parametrize("direction", ["icrs_to_cam", "cam_to_icrs"])
 @pytest.mark.parametrize("held", ["cam", "body"])
 def test_attitude_and_rate_are_the_camera_s_under_each_convention(scalar, direction, held, rng):
-    """By scipy, whose rotations act on vectors (v_cam = R v_icrs) and whose quaternions are scalar last."""
+    """By scipy, whose rotations act on vectors (v_cam = R v_icrs) and whose quaternions are
+    scalar last.
+    """
     mounting, rate_cam = Rotation.from_quat(np.roll(BODY_TO_CAM, -1)), np.array([0.1, -0.2, 0.3])
     icrs_to_cam = Rotation.random(random_state=int(rng.integers(99)))
     sent = mounting.inv() * icrs_to_cam if held == "body" else icrs_to_cam
@@ -141,7 +145,9 @@ def test_a_number_of_each_type_is_what_struct_says(kind):
 
 @pytest.mark.parametrize("checksum", ["sum8", "xor8", "none"])
 def test_a_weak_checksum_lets_through_what_the_page_says_that_it_does(checksum, rng):
-    """docs/answers.md: one in 256 of frames whose bytes are noise, and without a checksum all of them."""
+    """docs/answers.md: one in 256 of frames whose bytes are noise, and without a checksum all of
+    them.
+    """
     frames = decoder_of(framing="cobs", checksum=checksum, fields=CCSDS_FIELDS).frames
     passed = sum(frames.fault(rng.bytes(40)) == "" for _ in range(8000))
     assert passed == 8000 if checksum == "none" else 10 < passed < 60  # 31 +- 6

@@ -1,4 +1,6 @@
-"""One run has one bench: whatever becomes of the file once it has been read, the run keeps to what it read."""
+"""One run has one bench: whatever becomes of the file once it has been read, the run keeps to
+what it read.
+"""
 
 from __future__ import annotations
 

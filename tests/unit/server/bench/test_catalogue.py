@@ -1,4 +1,6 @@
-"""A bench's catalogue: magnitudes against published relations, neighbours, errors, and files as others read them."""
+"""A bench's catalogue: magnitudes against published relations, neighbours, errors, and files as
+others read them.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,12 @@ from hilstar.sky.synthetic import colours
 from hilstar.sky.table_reader import G_LESS_I, G_LESS_V, GAIA_RANGE_MAG
 from tests.support.benches import bench_text
 
-# Riello et al. 2021 (A&A 649, A3, table C.2) have 0.030 mag of scatter about G - V and 0.038 about G - I of BP - RP. Measured:
-# 0.010 and 0.029 mag by colour (median, 95 %), 0.015 and 0.033 by type, from V-I = 0 to 2.5.
+# Riello et al. 2021 (A&A 649, A3, table C.2) have 0.030 mag of scatter about G - V and 0.038 about
+# G - I of BP - RP. Measured: 0.010 and 0.029 mag by colour (median, 95 %), 0.015 and 0.033 by type,
+# from V-I = 0 to 2.5.
 G_MEDIAN_MAG, G_P95_MAG = 0.02, 0.045
-# B of Landolt-class ground photometry (source G): B-V has no part in cool stars' spectra. Measured: 0.043 and 0.119 mag.
+# B of Landolt-class ground photometry (source G): B-V has no part in cool stars' spectra. Measured:
+# 0.043 and 0.119 mag.
 B_MEDIAN_MAG, B_P95_MAG = 0.06, 0.15
 STEP_MAG = 1e-4
 DIFFERENCE_LIMIT = 0.01  # of the derivative's step, 0.01 mag over which rates bend
@@ -157,7 +161,9 @@ OTHER_SENSORS = ({"aperture_mm": 12, "quantum_efficiency": "kai-4021"}, {"apertu
 
 @pytest.mark.parametrize("tracker", OTHER_SENSORS, ids=["kai-4021", "own curve"])
 def test_instrument_magnitudes_are_those_of_own_quadrature(tmp_path, tracker):
-    """Electrons of Vega's spectrum and of AB 0 by trapezia every 0.01 nm, and what the columns have by them."""
+    """Electrons of Vega's spectrum and of AB 0 by trapezia every 0.01 nm, and what the columns
+    have by them.
+    """
     (tmp_path / "qe.csv").write_text("wavelength_nm,value\n420,0.1\n500,0.6\n640,0.75\n880,0.2\n")
     text = bench_text({"collimator": {"focal_length_mm": 350}, "tracker": tracker})
     (tmp_path / "bench.toml").write_text(text)
@@ -222,7 +228,8 @@ def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(bench, tm
     names = [name for name in wanted if name.startswith("sigma_") or name.endswith("correlation")]
     assert len(names) == 10
     for name in names:
-        if name != "sigma_instrument_mag":  # by colour: a table's stars have no type that draws them
+        # by colour: a table's stars have no type that draws them
+        if name != "sigma_instrument_mag":
             assert found[name].values[order] == pytest.approx(wanted[name].values[theirs], rel=1e-6, nan_ok=True), name
     assert found["spectral_type"].values[order].tolist() == wanted["spectral_type"].values[theirs].tolist()
     assert set(found["v_source"].values.tolist()) == {"U"}

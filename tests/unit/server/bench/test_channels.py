@@ -1,4 +1,6 @@
-"""A tracker of three channels against three trackers of one, and against quadrature that is not the package's."""
+"""A tracker of three channels against three trackers of one, and against quadrature that is not
+the package's.
+"""
 
 import json
 from contextlib import ExitStack
@@ -25,14 +27,16 @@ from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.commands import run_hilstar_here
 
-# A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near infrared, as silicon does.
+# A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near
+# infrared, as silicon does.
 NM = np.arange(350.0, 1001.0, 25.0)
 PASSBANDS = {
     "r": 0.6 * np.exp(-(((NM - 620) / 50) ** 2)) + 0.2 * (NM > 800),
     "g": 0.7 * np.exp(-(((NM - 540) / 55) ** 2)),
     "b": 0.5 * np.exp(-(((NM - 460) / 45) ** 2)),
 }
-# Products of two float32 factors and a sum of them in another order: a few steps of 6e-8, of the brightest pixel.
+# Products of two float32 factors and a sum of them in another order: a few steps of 6e-8, of the
+# brightest pixel.
 FLOAT32_STEPS = 1e-6
 QUADRATURE = 1e-3  # asked for; the table of the Planck curve is within 1e-6
 
@@ -127,7 +131,9 @@ def test_a_stars_electrons_by_channel_are_those_of_a_quadrature(curves):
 
 
 def integrals(temperature_k):
-    """Electrons per second in each channel of a star of V = 0: 3.631e-2 W/m2/m in the mean through V (Bessell 1998)."""
+    """Electrons per second in each channel of a star of V = 0: 3.631e-2 W/m2/m in the mean
+    through V (Bessell 1998).
+    """
     nm = np.arange(300.0, 1100.01, 0.5)
     power = nm**-5 / np.expm1(0.0143877688 / (nm * 1e-9 * temperature_k))
     glass, v = (load_curve(name, name)(nm) for name in ("n-bk7-10mm", "johnson-v"))

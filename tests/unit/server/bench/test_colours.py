@@ -1,4 +1,6 @@
-"""Primaries that are driven apart: a stripe panel by a twin of sub-pixels, files of primaries, and what is refused."""
+"""Primaries that are driven apart: a stripe panel by a twin of sub-pixels, files of primaries,
+and what is refused.
+"""
 
 import json
 import re
@@ -30,7 +32,8 @@ THIRD = 1 / 3
 STRIPES = {"rgb-stripe": [(-THIRD, 0), (0, 0), (THIRD, 0)], "vertical": [(0, -THIRD), (0, 0), (0, THIRD)]}
 CENTROID_PX = 0.005  # the issue's aim; measured 1e-4 with 16 bits
 CHANNEL_MAG = 0.02  # the issue's 2 %; measured 8e-4 at 95 % of stars
-UNCORRECTED_PX = 0.1  # at least: of a star that is red or blue alone a third, of one in three channels less
+# at least: of a star that is red or blue alone a third, of one in three channels less
+UNCORRECTED_PX = 0.1
 
 
 def bench_path(folder, *changes, channels="rgb", panel="oled"):
@@ -47,7 +50,9 @@ def bench_path(folder, *changes, channels="rgb", panel="oled"):
 
 
 def centroids(frame, bench, places):
-    """How far stars that stand alone are from their places (n, 2), by sub-pixels of sRGB's formula at `places`."""
+    """How far stars that stand alone are from their places (n, 2), by sub-pixels of sRGB's
+    formula at `places`.
+    """
     signal = frame.codes / (2.0**bench.config.monitor.bits - 1)
     light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4) * bench.colours.of_white
     rows, off = frame.truth, []
@@ -78,13 +83,16 @@ def test_all_light_of_a_star_has_one_centroid_whatever_its_colour(tmp_path, layo
 
 @pytest.mark.gpu
 def test_a_turned_screen_has_its_stripes_turned(tmp_path):
-    """Where pixels of the image go on the screen is Orientation's; a stripe's place goes the other way."""
+    """Where pixels of the image go on the screen is Orientation's; a stripe's place goes the
+    other way.
+    """
     keys = {"flip_x": True, "rotate_deg": 90, "bits": 12}
     with load(bench_path(tmp_path, {"monitor": keys, "monitor.primaries": {"layout": "rgb-stripe"}})) as bench:
         found = bench.colours.places_px
         off = centroids(bench.frame(ORION_Q), bench, found)
     assert np.abs(off).max() < CENTROID_PX
-    np.testing.assert_allclose(found, [(0, -THIRD), (0, 0), (0, THIRD)], atol=1e-12)  # (-1, 0) is flipped, then turned
+    # (-1, 0) is flipped, then turned
+    np.testing.assert_allclose(found, [(0, -THIRD), (0, 0), (0, THIRD)], atol=1e-12)
     assert Orientation(quarter_turns=2).in_image(1.0, 0.25) == (-1.0, -0.25)
 
 
@@ -126,7 +134,8 @@ def test_the_twin_sees_the_stars_electrons_at_their_places(tmp_path):
         assert shown.sum() == pytest.approx(sky.sum(), rel=0.005)
         middles = [[(image * at).sum() / image.sum() for at in (x, y)] for image in (shown, sky)]
         np.testing.assert_allclose(*middles, atol=CENTROID_PX)
-        # The tracker's software sees superpixels of the mosaic: a quarter of red, half of green and a quarter of blue.
+        # The tracker's software sees superpixels of the mosaic: a quarter of red, half of green and
+        # a quarter of blue.
         by_channel = np.array([one[0] for one in seen.by_channel])
         assert seen.shown_e.sum() == pytest.approx(by_channel.sum(axis=(1, 2)) @ [0.25, 0.5, 0.25], rel=0.01)
         np.testing.assert_array_equal(seen.pixels_e[1::2, 1::2], by_channel[2, 1::2, 1::2])
@@ -134,7 +143,8 @@ def test_the_twin_sees_the_stars_electrons_at_their_places(tmp_path):
     found = json.loads(run_hilstar_here("verify", path, "--fields", "2", "--json").stdout)
     assert list(found["channels_mag"]) == [f"quantum_efficiency_{name}" for name in "rgb"]
     assert all(0 < errors["p95"] < CHANNEL_MAG for errors in found["channels_mag"].values()) and found["stars"] > 5
-    assert found["estimator_floor"]["centroid_px"]["rms"] > 2 * found["centroid_error_px"]["rms"]  # the mosaic's own
+    # the mosaic's own
+    assert found["estimator_floor"]["centroid_px"]["rms"] > 2 * found["centroid_error_px"]["rms"]
     with load(path) as bench:
         frame = bench.frame(ORION_Q)
         lights = np.array(primary_lights(frame.levels, bench.panel))
@@ -146,7 +156,8 @@ def test_the_twin_sees_the_stars_electrons_at_their_places(tmp_path):
         tracker.take(shown)
         np.testing.assert_allclose(tracker._light(shown), lights.reshape(3, -1).T[lit])
         dn = tracker.expose(tracker.frames.exposed(0, 100_000_000))
-        assert dn[0::2, 0::2].astype(float).sum() != dn[1::2, 1::2].astype(float).sum()  # red and blue pixels
+        # red and blue pixels
+        assert dn[0::2, 0::2].astype(float).sum() != dn[1::2, 1::2].astype(float).sum()
 
 
 @pytest.mark.gpu
@@ -222,7 +233,9 @@ def test_a_ccss_has_its_primaries_among_its_samples(tmp_path):
 
 
 def test_chromaticities_become_gaussians_that_add_up_to_d65():
-    """Of the colour matching functions every 50 nm (CIE 15), by which Gaussians' places are judged here."""
+    """Of the colour matching functions every 50 nm (CIE 15), by which Gaussians' places are
+    judged here.
+    """
     known = {
         450: (0.3362, 0.0380, 1.7721),
         500: (0.0049, 0.3230, 0.2720),
@@ -254,13 +267,16 @@ def test_nearest_mixtures_are_those_of_scipy():
     whole = nearest_mixtures(parts.T @ parts, wanted @ parts, whole=True)
     heavy = np.vstack([parts, 1e5 * np.ones(3)])
     np.testing.assert_allclose(whole, [nnls(heavy, [*one, 1e5])[0] for one in wanted], atol=1e-6)
-    alike = np.ones((3, 3))  # primaries of one colour, which nothing tells apart, give the light all the same
+    # primaries of one colour, which nothing tells apart, give the light all the same
+    alike = np.ones((3, 3))
     np.testing.assert_allclose(nearest_mixtures(alike, np.full((1, 3), 2.0)).sum(), 2.0)
 
 
 @pytest.mark.gpu
 def test_a_star_redder_than_the_red_primary_is_named(tmp_path):
-    """The near infrared is light that no monitor has: a silicon sensor's stars are redder than the panel's red."""
+    """The near infrared is light that no monitor has: a silicon sensor's stars are redder than
+    the panel's red.
+    """
     with load(bench_path(tmp_path, channels="v")) as bench:
         rows = bench.frame(from_radec_roll_deg(86.5, 3.0, 0.0)).truth
         alnilam, betelgeuse = (rows[rows["hip"] == hip][0] for hip in (26311, 27989))

@@ -11,7 +11,8 @@ from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.config import read_config
 from tests.support.benches import ROOT, SMALL_BENCH
 
-# The bench file of the design's section 5, every key given (the values that choose between words: the first).
+# The bench file of the design's section 5, every key given (the values that choose between words:
+# the first).
 WHOLE = """
 [tracker]
 aperture_mm=30

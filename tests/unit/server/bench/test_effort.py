@@ -59,7 +59,9 @@ def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
 
 
 def test_no_part_owns_a_share_of_the_tolerance():
-    """Codes may take all of it but what the cheapest sprites need; half was theirs, a quarter each for edges and motion."""
+    """Codes may take all of it but what the cheapest sprites need; half was theirs, a quarter
+    each for edges and motion.
+    """
     sky = light(10, 6.0)
     alone = planned(settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky)
     tight = {"tolerance_mag": 1.05 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
@@ -70,7 +72,9 @@ def test_no_part_owns_a_share_of_the_tolerance():
 
 
 def test_the_cheapest_of_all_combinations_within_is_taken():
-    """By every combination of sprites and motions: none that is within takes less time than the one taken."""
+    """By every combination of sprites and motions: none that is within takes less time than the
+    one taken.
+    """
     asked = settings(tolerance_mag=0.05, tolerance_px=0.08)
     moving = replace(light(12, 6.0), turning=2 / 3, sky_share=0.1)
     taken = planned(asked, moving)
@@ -97,7 +101,9 @@ def test_a_scene_at_rest_asks_nothing_of_paths():
     [("auto", False, False), ("auto", True, True), ("on", False, True), ("off", True, False)],
 )
 def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small_bench_file):
-    """A frame without a path is where the middle row's first light has it: half of its light later it is halfway on."""
+    """A frame without a path is where the middle row's first light has it: half of its light
+    later it is halfway on.
+    """
     text = f'{SMALL_BENCH}[render]\nmotion = "{motion}"\nquantisation = "round"\n'
     config = bench_file_of(small_bench_file, text).config
     scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
@@ -116,7 +122,9 @@ def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
 
 
 def test_the_worst_error_is_of_all_magnitudes_that_the_catalogue_has():
-    """Of stars of half a step more than a whole number, and of none: `exact` leaves half a step of the first alone."""
+    """Of stars of half a step more than a whole number, and of none: `exact` leaves half a step
+    of the first alone.
+    """
     one_step = srgb_response(8).light[1]
     whole, half = (np.array([steps * one_step * 1e6]) for steps in (60.0, 60.5))
     errors = []
@@ -187,7 +195,9 @@ def test_the_light_outside_a_sprite_is_no_more_than_said(size):
 
 
 def test_small_sprites_give_the_codes_of_whole_ones_but_where_wings_meet(bench_with):
-    """What is left out lights no pixel by itself; added to another star's it may make up a step, never two."""
+    """What is left out lights no pixel by itself; added to another star's it may make up a step,
+    never two.
+    """
     bench = bench_with('[render]\neffort = "auto"\nquantisation = "round"\n')
     assert min(side.side_px for side in bench.renderer.target.sides) < bench.psf.footprint_px
     small = bench.draw(ORION).levels.astype(int)
@@ -238,7 +248,9 @@ def test_a_bench_over_its_tolerance_says_what_would_do(bench_with):
 
 @pytest.mark.parametrize("bits", [8, 10])
 def test_what_would_do_does(bits, tmp_path):
-    """Each key that is told is written to the file, whose own plan then has the errors that were told."""
+    """Each key that is told is written to the file, whose own plan then has the errors that were
+    told.
+    """
     limit = {"tolerance_mag": 0.01, "tolerance_px": 0.05} if bits == 8 else {"tolerance_mag": 0.005, "tolerance_px": 0.02}
     tables = {"monitor": {"bits": bits}, "render": limit}
     path = tmp_path / "bench.toml"
@@ -289,7 +301,9 @@ def test_a_run_has_the_effort_once(tmp_path, small_bench_file):
 
 
 def test_a_fixed_bench_keeps_its_hash_and_one_left_to_the_default_does_not(tmp_path, small_bench_file):
-    """The default of the tolerance was 0.02 mag and 0.02 px; no frame of a fixed bench changed with it."""
+    """The default of the tolerance was 0.02 mag and 0.02 px; no frame of a fixed bench changed
+    with it.
+    """
     text = small_bench_file.read_text()
 
     def hashed(render: str) -> str:
@@ -317,13 +331,16 @@ def test_a_file_that_says_nothing_gets_the_codes_that_its_tolerance_needs(small_
 
 
 def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_say_so():
-    """3000 stars on a screen that has the whole sky, at two refresh rates; 70 as wide as only NumPy takes them."""
+    """3000 stars on a screen that has the whole sky, at two refresh rates; 70 as wide as only
+    NumPy takes them.
+    """
     crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
     chosen = planned(settings(), crowded)
     assert chosen.quantisation == "round"
     assert "exact takes 9 ms of 16.7 (round 6)" in part(chosen, "codes").note
     assert planned(settings(), replace(crowded, refresh_hz=30.0)).quantisation == "exact"
-    assert planned(settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"  # `round` would be late, too
+    # `round` would be late, too
+    assert planned(settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"
     assert planned(settings(quantisation="exact"), crowded).quantisation == "exact"
     assert "9 ms of 16.7" in part(planned(settings(quantisation="exact"), crowded), "codes").note
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
@@ -369,7 +386,8 @@ def test_a_machine_that_holds_exact_takes_it_where_the_table_would_not():
     assert "takes 25 ms of 16.7 (round 2) for an average field at 1 deg/s here" in part(slow, "codes").note
     assert planned(settings(codes_ms=(2.0, 25.0)), few).quantisation == "round"
     assert "by [render] codes_ms" in part(planned(settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
-    assert not planned(settings(), light(16, 6.0)).by_cost  # `round` is within the tolerance, whatever it costs
+    # `round` is within the tolerance, whatever it costs
+    assert not planned(settings(), light(16, 6.0)).by_cost
     assert not planned(settings(quantisation="exact"), few).by_cost
 
 
@@ -388,7 +406,9 @@ def test_round_is_timed_only_where_exact_may_be_late():
 
 
 def test_frames_are_timed_for_no_longer_than_asked(small_bench_file):
-    """By a clock of which each look takes 30 ms: a frame is 30 ms, and there is time for two of them."""
+    """By a clock of which each look takes 30 ms: a frame is 30 ms, and there is time for two of
+    them.
+    """
     looks = []
 
     def now_ns() -> int:

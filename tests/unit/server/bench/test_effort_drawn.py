@@ -1,4 +1,6 @@
-"""What auto says of its codes holds for stars drawn anywhere on a screen, for panels and trackers of several kinds."""
+"""What auto says of its codes holds for stars drawn anywhere on a screen, for panels and
+trackers of several kinds.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,8 @@ bit_stealing = {stealing}
 [verify]
 centroider = "{centroider}"
 """
-# Bits, calibration, bit stealing, the tracker's pixel (11.5 um are as wide as the monitor's), its centroider, the tolerance,
-# and what is taken.
+# Bits, calibration, bit stealing, the tracker's pixel (11.5 um are as wide as the monitor's), its
+# centroider, the tolerance, and what is taken.
 KINDS = [
     (8, "srgb", "false", 13, "fit", 0.02, "exact"),
     (12, "srgb", "false", 13, "fit", 0.05, "round"),
@@ -51,13 +53,15 @@ KINDS = [
     (8, "lcd-example", "true", 13, "box5", 0.02, "round"),
     (16, "srgb", "false", 13, "fit", 0.02, "round"),
 ]
-# What is claimed of the worst star, against the largest of 500 at random: `exact` has its worst flux in one star of a
-# thousand (tests/authority/test_effort.py looks at more of them).
+# What is claimed of the worst star, against the largest of 500 at random: `exact` has its worst
+# flux in one star of a thousand (tests/authority/test_effort.py looks at more of them).
 MOST_MAG, MOST_PX = 6.0, 2.5
 
 
 def drawn_errors(bench, rng):
-    """The largest errors of stars at random, of any magnitude under white: flux, and place by the bench's centroider."""
+    """The largest errors of stars at random, of any magnitude under white: flux, and place by
+    the bench's centroider.
+    """
     x, y = np.meshgrid(np.arange(20, SIZE[0] - 20, STEP_PX), np.arange(20, SIZE[1] - 20, STEP_PX))
     whole = x.ravel(), y.ravel()
     x_px, y_px = (place + rng.uniform(-0.5, 0.5, place.size) for place in whole)

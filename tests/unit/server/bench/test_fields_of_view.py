@@ -99,7 +99,8 @@ def test_what_cannot_be_is_said(tmp_path, changes, words):
     assert re.search(words, warning), warning
 
 
-# A 27-inch monitor behind 500 mm before a narrow tracker, which sees 6 % of it: odd, and no length is in another unit.
+# A 27-inch monitor behind 500 mm before a narrow tracker, which sees 6 % of it: odd, and no length
+# is in another unit.
 NEWCOMER = [
     ("= 57.65\n", "= 233.1\n"),
     ("[1920, 1080]", "[2560, 1440]"),

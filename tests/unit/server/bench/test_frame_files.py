@@ -12,7 +12,9 @@ from hilstar.server.bench.frame_files import PREVIEW_BLUR_PX, PREVIEW_POWER, PRE
 
 
 def preview_by_filters(codes):
-    """For each radius, a maximum over a disc of all pixels bright enough for it: nine filters of the whole frame."""
+    """For each radius, a maximum over a disc of all pixels bright enough for it: nine filters of
+    the whole frame.
+    """
     signal = codes.astype(np.float32) / np.float32(codes.max())
     picture = np.zeros_like(signal)
     reach = np.arange(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
@@ -55,7 +57,9 @@ def test_a_preview_of_a_dark_frame_is_dark(tmp_path):
 @pytest.mark.parametrize("shape", [(3, 5), (4, 7, 3)])
 @pytest.mark.parametrize(("kind", "meant"), [(np.uint8, None), (np.uint16, 12)])
 def test_a_png_has_the_values_that_another_reader_finds(rng, shape, kind, meant):
-    """pypng, which reads colours of 16 bits too; the image is a view whose rows are not in memory's order."""
+    """pypng, which reads colours of 16 bits too; the image is a view whose rows are not in
+    memory's order.
+    """
     image = rng.integers(0, np.iinfo(kind).max, shape[1::-1] + shape[2:], kind).swapaxes(0, 1)
     width, height, rows, told = png.Reader(bytes=png_of(image, meant)).read()
     assert np.array_equal(np.vstack([*rows]).reshape(shape), image)

@@ -1,4 +1,6 @@
-"""A bench with a strongly bent lens: everything that is drawn is where the geometry file's formulas have it."""
+"""A bench with a strongly bent lens: everything that is drawn is where the geometry file's
+formulas have it.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,11 @@ PLACE_PX = 1e-6
 FIELDS = 20
 SIGMA_SUMS = 2e-5  # of the brightest pixel: float32 sums and the sprites' cut
 PATH_STEPS = 400
-# The time of a row is found to a 500th of the scan-out, and the star's speed times that is the limit.
+# The time of a row is found to a 500th of the scan-out, and the star's speed times that is the
+# limit.
 PATH_LIMIT = {(0.3, -0.5, 0.2): 0.2, (1.0, 0.8, -1.9): 1.0}
-# Two moments, each within half a step of 1.2 scan-outs in 600, in one of hold; and at 130 deg/s how a path bends in that time.
+# Two moments, each within half a step of 1.2 scan-outs in 600, in one of hold; and at 130 deg/s how
+# a path bends in that time.
 SHARE_LIMIT = {(0.3, -0.5, 0.2): 3e-3, (1.0, 0.8, -1.9): 1e-2}
 
 
@@ -80,7 +84,9 @@ def test_light_truth_and_clipping_are_at_the_bent_places(bench, folder, rng):
 
 
 def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder, rng):
-    """A code's light over a star's own pixels has its centroid, as far as the monitor's steps let it."""
+    """A code's light over a star's own pixels has its centroid, as far as the monitor's steps
+    let it.
+    """
     offs = []
     for _ in range(6):
         q = attitude(rng)
@@ -105,7 +111,9 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
 
 @pytest.mark.parametrize("rate", [(0.3, -0.5, 0.2), (1.0, 0.8, -1.9)], ids=["slew", "spin"])
 def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folder, rng, rate):
-    """Each star's light on the screen, and its centroid, by small steps of time; none is lost that only cuts a corner."""
+    """Each star's light on the screen, and its centroid, by small steps of time; none is lost
+    that only cuts a corner.
+    """
     q, rate = attitude(rng), np.array(rate)
     found = bench.light(bench.view(q, rate))
     scan = bench.scan
@@ -119,7 +127,9 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
     times = np.linspace(-0.6, 0.6, 601) * scan.scanout_s
 
     def met(after_s):
-        """When the panel, `after_s` after it lit the middle row, writes each star's row, from that moment on."""
+        """When the panel, `after_s` after it lit the middle row, writes each star's row, from
+        that moment on.
+        """
         # The row of each star at each time; the panel is there where the two agree.
         found_s, rows = np.zeros(len(near)), np.array([at(t + after_s)[1] for t in times])
         with np.errstate(invalid="ignore"):
@@ -156,7 +166,9 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
 
 
 def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_drawn(bench):
-    """The lens ends with the farthest corner, and a path between two places beyond it can still cross that corner."""
+    """The lens ends with the farthest corner, and a path between two places beyond it can still
+    cross that corner.
+    """
     star, hold_s, camera = 100, 1 / 60, bench.camera
     corners = np.array([[3.0, 3.0], [1916.0, 3.0], [3.0, 1076.0], [1916.0, 1076.0]])
     corner = corners[np.argmax(np.hypot(*camera.tangents(*corners.T)))]
@@ -199,7 +211,9 @@ def test_a_budget_counts_arcseconds_where_a_pixel_is_widest(bench, folder):
 
 
 def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_path, rng):
-    """Codes times the pixels' own light, down to 0.43 of the brightest, add up to the star where the lens has it."""
+    """Codes times the pixels' own light, down to 0.43 of the brightest, add up to the star where
+    the lens has it.
+    """
     light = np.linspace(0, 1, 1024) ** 2.2
     (tmp_path / "r.csv").write_text("code,w\n" + "\n".join(f"{code},{value!r}" for code, value in enumerate(light.tolist())))
     (tmp_path / "u.csv").write_text("0.8,1.0\n1.0,0.9\n")
@@ -212,7 +226,8 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
     (tmp_path / "bench.toml").write_text(text)
     wrong = []
     with load(tmp_path / "bench.toml") as bench:
-        # The grid's numbers stand for the middles of the screen's quarters, beyond which its slope goes on; the brightest is 1.
+        # The grid's numbers stand for the middles of the screen's quarters, beyond which its slope
+        # goes on; the brightest is 1.
         s, t = ((np.arange(size) - (size / 4 - 0.5)) / (size / 2) for size in SIZE)
         across = np.outer(1 - t, 0.8 + 0.2 * s) + np.outer(t, 1.0 - 0.1 * s)
         across /= across.max()

@@ -1,4 +1,6 @@
-"""The reference of the bench file: nothing is missing in it, and its defaults are those that are used."""
+"""The reference of the bench file: nothing is missing in it, and its defaults are those that are
+used.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ def rows() -> dict[tuple[str, str], tuple[str, str, str]]:
         if heading := re.match(r"## `\[(.*)\]`$", line):
             table = heading[1]
         elif row := re.match(r"\| `(\w+)` \| (.*?) \| (.*?) \| (.*) \|$", line):
-            found.setdefault((table, row[1]), (row[2], row[3], row[4]))  # the notes below may have tables too
+            # the notes below may have tables too
+            found.setdefault((table, row[1]), (row[2], row[3], row[4]))
     return found
 
 
@@ -63,7 +66,8 @@ def test_a_default_in_the_reference_is_the_one_that_is_used(tmp_path, rows):
     count = 0
     optional = {field.name for field in msgspec.structs.fields(BenchConfig) if field.default is None}
     for (table, key), (_, default, _) in rows.items():
-        if table.partition(".")[0] in optional:  # a file without the table is not one with its defaults
+        # a file without the table is not one with its defaults
+        if table.partition(".")[0] in optional:
             continue
         # No background and one of 0 electrons are one light, but two settings.
         if (shown := re.fullmatch(r"`([^`]*)`", default)) and key != "electrons_per_px":

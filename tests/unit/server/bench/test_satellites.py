@@ -1,4 +1,6 @@
-"""Satellites in a bench's frames and its virtual tracker: names, streaks and light in the truth, and what is said of them."""
+"""Satellites in a bench's frames and its virtual tracker: names, streaks and light in the truth,
+and what is said of them.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def bench_file(tmp_path, rng) -> Path:
 
 
 def brightest(bench: Bench, t_ns: int) -> tuple[str, tuple[float, float], float]:
-    """The name of a bright and fast satellite at a moment, its right ascension and declination, and its rate."""
+    """The name of a bright and fast satellite at a moment, its right ascension and declination,
+    and its rate.
+    """
     seen = bench.moving.passing(Cone(NORTH, np.pi, 0.0), t_ns)
     now = np.zeros(len(seen))
     rates = seen.rates_e_per_s(np.arange(len(seen)), now, now)
@@ -68,7 +72,8 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(bench_file)
         assert (row["hip"], row["drawn"]) == (0, True)
         assert row["electrons_per_s"] == pytest.approx(rate, rel=1e-4)
         middle = [(size - 1) / 2 for size in bench.camera.resolution_px]
-        assert (row["x_px"], row["y_px"]) == pytest.approx(middle, abs=0.1)  # 200 arcsec a px; 10 by the velocity since
+        # 200 arcsec a px; 10 by the velocity since
+        assert (row["x_px"], row["y_px"]) == pytest.approx(middle, abs=0.1)
         assert len(np.unique(shot.truth["name"][shot.truth["hip"] == 0])) == (shot.truth["hip"] == 0).sum()
         wide = shot.linear[int(row["y_px"]) - 12 : int(row["y_px"]) + 13, int(row["x_px"]) - 12 : int(row["x_px"]) + 13]
         assert wide.sum() >= 0.999 * row["electrons_per_s"]
@@ -90,7 +95,9 @@ def fast_moment(bench: Bench) -> int:
 
 
 def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streaks(bench_file):
-    """In the virtual tracker, over half a second; at rest it is the other way round, with the same light."""
+    """In the virtual tracker, over half a second; at rest it is the other way round, with the
+    same light.
+    """
     with load(bench_file) as bench, Simulator(read_bench_file(bench_file)) as tracker:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
@@ -114,7 +121,9 @@ SIZE_M = 20_000
 
 
 def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
-    """Against the same one as a point: the same light, half of it dark, its width that of its size and distance."""
+    """Against the same one as a point: the same light, half of it dark, its width that of its
+    size and distance.
+    """
     with load(bench_file) as bench:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
@@ -137,7 +146,8 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
         assert width_px > 3
         near = lit[80:160, 120:200]  # 320 x 240
         seen = np.argwhere(near > 0.05 * near.max())
-        assert np.abs(np.ptp(seen, axis=0) - width_px).min() < 3  # of 24, along the terminator, blurred
+        # of 24, along the terminator, blurred
+        assert np.abs(np.ptp(seen, axis=0) - width_px).min() < 3
         assert (row["x_px"], row["y_px"]) == pytest.approx((as_point["x_px"], as_point["y_px"]), abs=1.5)
     with Simulator(read_bench_file(bench_file)) as tracker:
         found = tracker.expose(tracker.view(q, np.zeros(3), t_ns), None)
@@ -169,7 +179,8 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
     assert run_hilstar_here("verify", bench_file, "--fields", "1", "--json").returncode == 0
     budget = run_hilstar_here("budget", bench_file, "--json")
     assert budget.returncode == 0, budget.stderr
-    assert json.loads(budget.stdout)["clips_v_mag"] < 3  # by stars: of satellites elsewhere no magnitude is known
+    # by stars: of satellites elsewhere no magnitude is known
+    assert json.loads(budget.stdout)["clips_v_mag"] < 3
 
 
 @pytest.mark.parametrize(
@@ -217,7 +228,9 @@ def test_the_bench_s_hash_covers_both_files(bench_file):
 
 
 def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_sees(bench_file):
-    """Frame by frame, each with the satellite's path while it is held; the small screen covers a part of the detector."""
+    """Frame by frame, each with the satellite's path while it is held; the small screen covers a
+    part of the detector.
+    """
     with load(bench_file) as bench:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)

@@ -1,4 +1,6 @@
-"""The star of a bench against that of the sky: the limit, what would bring it within that, and who says so."""
+"""The star of a bench against that of the sky: the limit, what would bring it within that, and
+who says so.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import run_hilstar_here
 
 SHIPPED = sorted([*(ROOT / "configs").glob("*.toml"), *(ROOT / "examples").glob("*bench.toml")])
-# A 27-inch office monitor behind 500 mm before a tracker of 50 mm: a monitor pixel is 4.2 of the tracker's.
+# A 27-inch office monitor behind 500 mm before a tracker of 50 mm: a monitor pixel is 4.2 of the
+# tracker's.
 WIDE = {
     "tracker": {"focal_length_mm": 50, "pixel_pitch_um": 5.5, "resolution_px": [2048, 2048]},
     "monitor": {"resolution_px": [2560, 1440], "pixel_pitch_um": 233.1},
@@ -89,7 +92,8 @@ def test_a_display_that_draws_the_trackers_psf_is_wider_by_its_own_pixels_alone(
 
 
 def test_a_monitor_pixel_of_many_tracker_pixels_is_summed_up_in_coarser_squares(tmp_path):
-    at = 60 * (57.65 / 60) / (13 / 70)  # the collimator, mm, at which a monitor pixel is one of the tracker's
+    # the collimator, mm, at which a monitor pixel is one of the tracker's
+    at = 60 * (57.65 / 60) / (13 / 70)
     below, above = (
         size(tmp_path, {"collimator": {"focal_length_mm": at / FINEST * step}, "tracker": {"resolution_px": [64, 64]}})
         for step in (1.001, 0.999)
@@ -99,7 +103,8 @@ def test_a_monitor_pixel_of_many_tracker_pixels_is_summed_up_in_coarser_squares(
 
 
 def test_each_command_states_the_star_and_warns_once(tmp_path):
-    few = {"tracker": {"resolution_px": [512, 512]}, "monitor": {"resolution_px": [640, 480]}}  # as wide, and quicker
+    # as wide, and quicker
+    few = {"tracker": {"resolution_px": [512, 512]}, "monitor": {"resolution_px": [640, 480]}}
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, WIDE, few))
     line = "star 4.0 px sigma, of the sky 0.55; brightest pixel 3.9 mag fainter; 199.2 px share it, of the sky 4.5"
     drawn = ("frame", "bench.toml", "--radec", "84.057,-1.2,0", "-o", "o.fits")

@@ -38,7 +38,9 @@ def test_each_star_has_its_own_variability_and_companion():
 
 
 def test_a_written_table_has_the_errors_of_its_epoch():
-    """Mizar in CDS I/239: 0.49 and 0.51 mas of place, 0.48 and 0.48 mas a year; a body and a star of a table have no errors."""
+    """Mizar in CDS I/239: 0.49 and 0.51 mas of place, 0.48 and 0.48 mas a year; a body and a
+    star of a table have no errors.
+    """
     catalog = load_catalog().brighter_than(3.5)
     ones, mizar = np.ones(len(catalog)), catalog.hip == 65378
     stars = make_stars(catalog, unit_vectors_icrs(catalog, 2026.0), ones, ones)
@@ -47,7 +49,8 @@ def test_a_written_table_has_the_errors_of_its_epoch():
     assert np.isnan([truth["sigma_pos_mas"], truth["sigma_mag"]]).all()
     at_start = with_errors(truth, catalog, 1991.25)[row]
     assert at_start["sigma_pos_mas"] == pytest.approx(np.hypot(0.49, 0.51) / np.sqrt(2), abs=5e-5)
-    assert at_start["sigma_mag"] == pytest.approx(np.hypot(0.0088, 0.004), abs=5e-5)  # of V from Hp, and its scatter about Hp
+    # of V from Hp, and its scatter about Hp
+    assert at_start["sigma_mag"] == pytest.approx(np.hypot(0.0088, 0.004), abs=5e-5)
     # 34.75 years of 0.48 mas a year; the correlations of place and motion take 0.1 from it.
     assert with_errors(truth, catalog, 2026.0)["sigma_pos_mas"][row] == pytest.approx(0.48 * 34.75, abs=0.12)
     truth["hip"][~row] = 0

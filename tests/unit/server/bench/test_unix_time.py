@@ -18,7 +18,8 @@ from tests.support.skies import STATION_TLE, moving_sky, utc_ns
 ARCSEC = np.pi / (180 * 3600)
 DAY_NS = 86_400 * 10**9
 MOON = {"sky": {"epoch_utc": "unix"}, "sky.bodies": {"moon": True}, "spacecraft": {"orbit": "geocentre"}}
-# Cubics of three hours are within 0.1 mas; the start's and another observer's aberration add 2e-9 of their 20 arcsec.
+# Cubics of three hours are within 0.1 mas; the start's and another observer's aberration add 2e-9
+# of their 20 arcsec.
 LIMIT_ARCSEC = 5e-3
 LEAP = "2017-01-01T00:00:00"  # a second after 2016-12-31T23:59:60
 
@@ -31,7 +32,9 @@ def bench_file(tmp_path) -> Path:
 
 
 def moon(sky, t_ns: int) -> np.ndarray:
-    """From the Earth, km, geometric but for light time: no aberration, which is that of the start of each sky."""
+    """From the Earth, km, geometric but for light time: no aberration, which is that of the
+    start of each sky.
+    """
     return sky._seen_from(sky._moment(t_ns, None, None)).seen_km[-1]
 
 
@@ -45,7 +48,9 @@ def test_before_and_after_a_leap_second_the_moon_is_where_its_utc_has_it(bench_f
 
 
 def test_a_second_that_unix_time_leaves_out_moves_the_moon_on(bench_file):
-    """Half a second before it and half a second after: two seconds; counted on from 1970 it would be late by 29."""
+    """Half a second before it and half a second after: two seconds; counted on from 1970 it
+    would be late by 29.
+    """
     file = dated(read_bench_file(bench_file), None, utc_ns(LEAP) - DAY_NS)
     sky, zero = bench_moving(file.config, file.folder), utc_ns(LEAP)
     half = 500_000_000
@@ -59,7 +64,8 @@ def test_a_second_that_unix_time_leaves_out_moves_the_moon_on(bench_file):
     counted = moving_sky("1970-01-01T00:00:00Z", ("Moon",))
     a, b = moon(sky, zero + half), moon(counted, zero + half)
     late_s = np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)) / ARCSEC / plain
-    assert late_s == pytest.approx(29, abs=0.01)  # TAI - UTC was 8.000 s in 1970 and is 37 s from 2017 on (IERS)
+    # TAI - UTC was 8.000 s in 1970 and is 37 s from 2017 on (IERS)
+    assert late_s == pytest.approx(29, abs=0.01)
 
 
 def test_satellites_are_where_sgp4_has_them_at_that_utc(tmp_path, rng):

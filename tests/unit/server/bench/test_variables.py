@@ -1,4 +1,6 @@
-"""[sky] variables = "phase": the light of a table's variable stars at a date, and the mean of all others."""
+"""[sky] variables = "phase": the light of a table's variable stars at a date, and the mean of
+all others.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import bench_stars
 from tests.support.benches import bench_text
 
-# JD 2461000.5 is 2025-11-21T00:00:00 UTC. The second star is at its faintest then, the third a quarter of its period later.
+# JD 2461000.5 is 2025-11-21T00:00:00 UTC. The second star is at its faintest then, the third a
+# quarter of its period later.
 TABLE = """ra,dec,v_mag,bv_mag,epoch_jyear,epoch_jd,period_d,amplitude_mag
 10,0,5.0,0.6,2000,2461000.5,10,0.4
 20,0,5.0,0.6,2000,2460995.5,10,0.4

@@ -1,4 +1,6 @@
-"""FITS keywords of a bent image, as Astropy reads them from the file, against the geometry file's own formulas."""
+"""FITS keywords of a bent image, as Astropy reads them from the file, against the geometry
+file's own formulas.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,8 @@ def test_a_fits_file_of_a_bent_sky_is_read_within_what_it_says(bench, folder, tm
     plain = WCS({key: header[key] for key in header if not key.startswith(("A_", "B_", "AP_", "BP_", "LENS"))})
     plain.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     x_px, y_px = plain.all_world2pix(ra_deg, dec_deg, 0)
-    assert np.hypot(x_px - true[:, 0], y_px - true[:, 1]).max() > 5  # what the polynomials are worth
+    # what the polynomials are worth
+    assert np.hypot(x_px - true[:, 0], y_px - true[:, 1]).max() > 5
 
 
 def _polynomial(header, name, at):

@@ -1,4 +1,6 @@
-"""The page's colours can be told apart and read: contrast by WCAG 2.2, and for who sees two colours (Viénot 1999)."""
+"""The page's colours can be told apart and read: contrast by WCAG 2.2, and for who sees two
+colours (Viénot 1999).
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,15 @@ SEEN = [
     *((ink, "panel") for ink in ("series-1", "series-2", "series-3", "ok", "warn", "bad", "edge")),
     *((ink, "sky-ground") for ink in ("sky-field", "sky-star", "sky-moving")),
 ]
-# Linear sRGB as a protanope and a deuteranope see it: Viénot, Brettel and Mollon 1999, as normalised for sRGB by DaltonLens.
+# Linear sRGB as a protanope and a deuteranope see it: Viénot, Brettel and Mollon 1999, as
+# normalised for sRGB by DaltonLens.
 DICHROMATS = {
     "protan": [[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]],
     "deutan": [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]],
     "all cones": np.eye(3).tolist(),
 }
-TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])  # sRGB, IEC 61966-2-1
+# sRGB, IEC 61966-2-1
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
 def themes() -> dict[str, dict[str, np.ndarray]]:

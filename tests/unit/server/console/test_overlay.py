@@ -1,4 +1,6 @@
-"""What is drawn over a picture lies where the picture's own stars are, and lines of the grid are where their labels say."""
+"""What is drawn over a picture lies where the picture's own stars are, and lines of the grid are
+where their labels say.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
 
 
 def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(bench):
-    """1024 pixels of 13 um at 70 mm, on a screen with 57.65 um at 60 mm: 1024 * 13 / 70 * 60 / 57.65 px."""
+    """1024 pixels of 13 um at 70 mm, on a screen with 57.65 um at 60 mm: 1024 * 13 / 70 * 60 /
+    57.65 px.
+    """
     outline = np.array(overlay_of(bench).truth(0, np.array(ORION_Q)).tracker_px)
     wanted_px = 1024 * 13 / 70 * 60 / 57.65
     assert np.ptp(outline, axis=0) == pytest.approx([wanted_px, wanted_px], abs=2 * ROUNDED_PX)

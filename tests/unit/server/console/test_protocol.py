@@ -1,4 +1,6 @@
-"""What the page and its server say to each other: one definition, from which the page's constants are made."""
+"""What the page and its server say to each other: one definition, from which the page's
+constants are made.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A run's page: one file that needs no other, and figures that keep each extreme however long the run was."""
+"""A run's page: one file that needs no other, and figures that keep each extreme however long
+the run was.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Pictures in a report are the codes that the run showed, or it says in a line why there are none."""
+"""Pictures in a report are the codes that the run showed, or it says in a line why there are
+none.
+"""
 
 from __future__ import annotations
 

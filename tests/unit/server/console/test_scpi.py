@@ -1,4 +1,6 @@
-"""SCPI as lines in and units out: forms, headers after headers, standard errors, and whatever bytes come."""
+"""SCPI as lines in and units out: forms, headers after headers, standard errors, and whatever
+bytes come.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from hilstar.server.console.scpi import (
 from hilstar.server.console.server.scpi import BARE, COMMANDS, HEADERS, QUERIES
 
 LINES = 6000
-CPU_S = 0.1  # a line of 4096 bytes takes a millisecond; 0.9 s where digits were tried in every split
+# a line of 4096 bytes takes a millisecond; 0.9 s where digits were tried in every split
+CPU_S = 0.1
 
 
 def units(line: str) -> list[Unit]:
@@ -33,7 +36,9 @@ def patterns(line: str) -> list[str]:
 
 
 def error_of(line: str) -> int:
-    """The error of a line, read as a server reads it: units up to the first that is wrong, and their parameters."""
+    """The error of a line, read as a server reads it: units up to the first that is wrong, and
+    their parameters.
+    """
     with pytest.raises(ScpiError) as raised:
         for unit in HEADERS.units(line):
             for parameter in scpi.count(unit, 4 if unit.pattern == "SKY:ATTitude" else 1):

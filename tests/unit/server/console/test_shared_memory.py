@@ -1,4 +1,6 @@
-"""The memory between a run and its page: whole records only, whoever is faster, and none of it left behind."""
+"""The memory between a run and its page: whole records only, whoever is faster, and none of it
+left behind.
+"""
 
 from __future__ import annotations
 
@@ -82,4 +84,5 @@ def test_a_board_is_seen_by_whoever_has_its_descriptor():
     memory.pictures.end(picture.nbytes, 0)
     found = other.pictures.last()
     assert found is not None and found[1] == picture.tobytes()
-    assert FRAMES >= 60 and EVENTS >= 100  # a page that comes back has a second of frames and the newest events
+    # a page that comes back has a second of frames and the newest events
+    assert FRAMES >= 60 and EVENTS >= 100

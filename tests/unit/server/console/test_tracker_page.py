@@ -1,4 +1,6 @@
-"""A tracker's answers on the operator's page: at once, over the picture, in /metrics and in the terminal's status."""
+"""A tracker's answers on the operator's page: at once, over the picture, in /metrics and in the
+terminal's status.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +100,8 @@ def test_the_reported_field_and_centroids_lie_over_the_picture_where_the_tracker
     plain = marks.answer([0.0, 0.0, 0.0], q, q, star_px.tolist())
     assert np.array(plain.field_px) == pytest.approx(np.array(outline), abs=0.011)
     assert plain.centroids_px[1] == pytest.approx(marks.monitor.boresight_px, abs=0.011)
-    # Turned by a about y, the tracker takes stars at +x for its middle: where it stands in the shown sky, x + f a.
+    # Turned by a about y, the tracker takes stars at +x for its middle: where it stands in the
+    # shown sky, x + f a.
     turned = marks.answer([0.0, 3600.0, 0.0], q, q, [])
     focal_px = 60 / 0.05765
     shift = np.array(turned.field_px).mean(axis=0) - np.array(outline).mean(axis=0)

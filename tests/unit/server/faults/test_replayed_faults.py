@@ -113,7 +113,8 @@ def test_a_scenario_is_replayed_from_its_ledger_code_for_code(bench, log, tmp_pa
     _again, same, _ = played(bench, tmp_path / "run.mcap", tmp_path / "again.mcap")
     assert codes.keys() == same.keys()
     assert all(np.array_equal(codes[number], same[number]) for number in codes)
-    _third, last, told = played(bench, tmp_path / "again.mcap")  # the ledger of a replay has the faults too
+    # the ledger of a replay has the faults too
+    _third, last, told = played(bench, tmp_path / "again.mcap")
     assert all(np.array_equal(codes[number], last[number]) for number in codes)
     assert told.faults["recorded"] == summary.faults["started"]
 

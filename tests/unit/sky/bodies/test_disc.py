@@ -1,4 +1,6 @@
-"""A body's face: its light by rays of another's making, its sum by closed forms, and where a sky has it."""
+"""A body's face: its light by rays of another's making, its sum by closed forms, and where a sky
+has it.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,14 @@ from tests.support.ray_traced.bodies import Body, lambert, lunar_lambert, traced
 from tests.support.skies import moving_sky
 
 UTC = "2026-11-21T00:00:00Z"
-FAR = 1e6  # radii: a closed form of a far sphere is off by the angle of one, which at 178 degrees is 3e-5 of a crescent
+# radii: a closed form of a far sphere is off by the angle of one, which at 178 degrees is 3e-5 of a
+# crescent
+FAR = 1e6
 CLOSED_LIMIT = 1e-4  # the quadrature itself: measured 3e-5
 MEAN_LIMIT = 5e-3  # three sigma of the mean over RAYS random ones
 RAYS = 100_000
-AIR_LIMIT = 0.02  # of the air's transmission: heights above a stretched sphere, not above the spheroid
+# of the air's transmission: heights above a stretched sphere, not above the spheroid
+AIR_LIMIT = 0.02
 
 
 def disc(phase_deg: float, distance: float, law="lambert", share=1.0, polar=1.0, air=None) -> Disc:
@@ -85,7 +90,8 @@ def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():
     found = moving.discs(np.array([1.0, 0.0, 0.0]), np.pi)
     assert [one.name for one in found] == ["Moon", "Venus", "Sun", "Mercury", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune"]
     moon, sun = found[0], found[2]
-    assert 2 * np.degrees(sun.radius_rad) == pytest.approx(0.5394, abs=1e-3)  # 1942 arcsec at 0.988 au
+    # 1942 arcsec at 0.988 au
+    assert 2 * np.degrees(sun.radius_rad) == pytest.approx(0.5394, abs=1e-3)
     assert not moving.discs(-moon.direction, 0.1, 0.1)
     assert [one.name for one in moving.discs(moon.direction, 1e-3, np.radians(0.1))] == ["Moon"]
     # Ten days before full: what is lit is the Sun's side.

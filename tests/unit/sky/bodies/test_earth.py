@@ -1,4 +1,6 @@
-"""The Earth from an orbit: its limb by rays that are aberrated one by one, its light from afar and near, and nobody's place."""
+"""The Earth from an orbit: its limb by rays that are aberrated one by one, its light from afar
+and near, and nobody's place.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,14 @@ from tests.support.skies import ALL_BODIES, STATION_TLE, STATION_UTC, moving_sky
 from tests.support.stars import stars_at
 
 ARCSEC = np.pi / (180 * 3600)
-# The spheroid's limb is aberrated as a circle: its flattening, 1/298, of a low orbit's 5.3 arcsec; measured 0.01.
+# The spheroid's limb is aberrated as a circle: its flattening, 1/298, of a low orbit's 5.3 arcsec;
+# measured 0.01.
 LIMB_ARCSEC = 0.02
-AFAR_MAG = 0.004  # a spheroid's face seen from the equator against the closed form of a sphere of the same outline
-SMALL_TURN = 1e-4  # of a disc's light: its law is integrated with 5 arcsec of aberration or without, four times of a crescent's
+# a spheroid's face seen from the equator against the closed form of a sphere of the same outline
+AFAR_MAG = 0.004
+# of a disc's light: its law is integrated with 5 arcsec of aberration or without, four times of a
+# crescent's
+SMALL_TURN = 1e-4
 EARTH_KM_S = np.array([-12.0, 24.0, 10.4])  # about the barycentre, some date's
 SUN_KM = KM_PER_AU * np.array([0.6, 0.8, 0.0])
 NAMES = (*ALL_BODIES, "Earth")
@@ -47,7 +53,8 @@ def test_each_ray_of_the_limb_is_where_its_own_light_time_and_aberration_have_it
     left_km = touch_km - EARTH_KM_S * (np.linalg.norm(touch_km, axis=1) / LIGHT_KM_S)[:, None]
     seen = aberrate(left_km / np.linalg.norm(left_km, axis=1, keepdims=True), EARTH_KM_S + velocity)
     assert np.abs(outline(disc, seen)).max() < LIMB_ARCSEC
-    if radius_km < 7000:  # the middle alone, moved by its own aberration, would be off by arcseconds
+    # the middle alone, moved by its own aberration, would be off by arcseconds
+    if radius_km < 7000:
         middle = aberrate(towards[None], velocity)[0]
         assert np.degrees(np.arccos(middle @ disc.direction)) * 3600 > 3.0
 
@@ -67,7 +74,8 @@ def test_its_night_side_is_dark_and_its_day_side_near_is_brighter_than_all_of_it
     v_mag, rate = earth_light(earth_disc(-6778.0 * towards, SUN_KM, np.zeros(3), 1.0), 1.0)
     assert (v_mag, rate) == (pytest.approx(DARK_V_MAG), 0.0)
     day, _ = earth_light(earth_disc(6778.0 * towards, SUN_KM, np.zeros(3), 1.0), 1.0)
-    # Ground of normal albedo 0.65 under the Sun at the zenith, which fills half the sky: 0.65 of sunlight, and less at the rim
+    # Ground of normal albedo 0.65 under the Sun at the zenith, which fills half the sky: 0.65 of
+    # sunlight, and less at the rim
     assert -27.0 < day < -25.5
 
 
@@ -102,7 +110,8 @@ def test_a_source_s_place_and_velocity_give_the_sky_of_the_same_orbit(t_ns):
     here = by_file.seen(by_file.among(eye), t_ns)
     both = np.arange(3, len(here))
     off = np.linalg.norm(here.directions(both) - there.directions(both), axis=1)
-    assert off.max() / ARCSEC < 1e-3  # aberrated in two steps, the orbit's own first; second orders of 8 km/s
+    # aberrated in two steps, the orbit's own first; second orders of 8 km/s
+    assert off.max() / ARCSEC < 1e-3
     assert here.v_mag[both] == pytest.approx(there.v_mag[both], abs=1e-9)
     axis = np.array([0.0, 0.0, 1.0])
     mine = by_source.discs(axis, np.pi, 0.0, t_ns, velocity, place)
@@ -115,7 +124,9 @@ def test_a_source_s_place_and_velocity_give_the_sky_of_the_same_orbit(t_ns):
 
 
 def test_the_earth_as_a_disc_and_as_a_point_is_at_one_place_though_stars_are_aberrated():
-    """Stars turn by 10 arcsec in half an orbit; what is beside the Earth's limb does, the Earth's own middle by its cosine."""
+    """Stars turn by 10 arcsec in half an orbit; what is beside the Earth's limb does, the
+    Earth's own middle by its cosine.
+    """
     orbit = TleOrbit(STATION_TLE, "station.tle")
     moving = moving_sky(STATION_UTC, ("Earth",), orbit)
     stars = moving.among(stars_at(np.eye(3), np.ones(3)))

@@ -18,8 +18,10 @@ ARCSEC = np.pi / (180 * 3600)
 UTC = "2026-11-21T00:00:00Z"
 HOUR_NS = 3600 * 10**9
 GEOCENTRE_ARCSEC = 0.022  # UNSEEN_KM_S is 20.6 mas; measured without it: 0.1 mas
-ORBIT_ARCSEC = 0.024  # UNSEEN_KM_S again, and `TleOrbit.step_s`: 5e-3 arcsec/s^2 (2 s)^2 / 8 = 2.5 mas
-MAGNITUDE_MAG = 0.003  # a minute of the Moon's phase, 0.07 deg by parallax in a low orbit, at 0.03 to 0.04 mag a degree
+# UNSEEN_KM_S again, and `TleOrbit.step_s`: 5e-3 arcsec/s^2 (2 s)^2 / 8 = 2.5 mas
+ORBIT_ARCSEC = 0.024
+# a minute of the Moon's phase, 0.07 deg by parallax in a low orbit, at 0.03 to 0.04 mag a degree
+MAGNITUDE_MAG = 0.003
 
 
 def sky_of(names: tuple[str, ...] = ALL_BODIES, utc: str = UTC, **more) -> tuple[object, Stars]:

@@ -1,4 +1,6 @@
-"""An OEM's orbit against SGP4, which wrote it, between its epochs and in every time scale; and what is refused."""
+"""An OEM's orbit against SGP4, which wrote it, between its epochs and in every time scale; and
+what is refused.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,10 @@ from hilstar.sky.bodies.orbit import OemOrbit
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)
-# SGP4's velocity is the derivative of its place within 2e-5 km/s (measured), which makes 4e-4 km of a place between epochs; the
-# polynomial itself (h = 60 s: (9/16 h^2)^4 r n^8 / 8! = 1e-11 km) is held to its degree below. A second's error is 7.5 km.
-# No full hour is crossed, where the axes of TleOrbit turn by 0.2 m.
+# SGP4's velocity is the derivative of its place within 2e-5 km/s (measured), which makes 4e-4 km of
+# a place between epochs; the polynomial itself (h = 60 s: (9/16 h^2)^4 r n^8 / 8! = 1e-11 km) is
+# held to its degree below. A second's error is 7.5 km. No full hour is crossed, where the axes of
+# TleOrbit turn by 0.2 m.
 PLACE_KM = 1e-3
 VELOCITY_KM_S = 1e-4
 NS = 10**9
@@ -64,7 +67,9 @@ def test_beyond_its_epochs_the_last_place_is_held_and_told_once(caplog):
 
 @pytest.mark.parametrize("seconds", [-1, 11])
 def test_an_orbit_of_seconds_is_told_where_it_ends(caplog, seconds):
-    """Stars are placed for START_NS, where frames are shown from the start: no two minutes about it go untold."""
+    """Stars are placed for START_NS, where frames are shown from the start: no two minutes about
+    it go untold.
+    """
     with caplog.at_level(logging.WARNING):
         station(oem(segment([0, 5, 10]))).state(START_NS + seconds * NS)
     assert len(caplog.records) == 1 and "is held" in caplog.text

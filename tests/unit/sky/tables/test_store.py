@@ -120,4 +120,5 @@ def test_two_processes_at_once_both_have_the_catalogue(table):
     assert counts == [b"2"] * 2
     (path,) = stored(table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))
-    assert choose_catalog(TableChoice(table)).v_mag.tolist() == [1.0, 2.0]  # what they left is whole
+    # what they left is whole
+    assert choose_catalog(TableChoice(table)).v_mag.tolist() == [1.0, 2.0]

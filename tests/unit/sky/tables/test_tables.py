@@ -29,7 +29,9 @@ def read(path, **choice):
 
 
 def gaia_table() -> Table:
-    """Five stars with the columns of gaiadr3.gaia_source; the fourth has no BP, the last no place."""
+    """Five stars with the columns of gaiadr3.gaia_source; the fourth has no BP, the last no
+    place.
+    """
     return Table(
         {
             "source_id": np.array([5, 4_295_806_720, 2**62 + 1, 7, 8]),

@@ -1,4 +1,6 @@
-"""Catalogues as texts: VizieR's own, any encoding and dialect, and what without a unit may be another one."""
+"""Catalogues as texts: VizieR's own, any encoding and dialect, and what without a unit may be
+another one.
+"""
 
 from __future__ import annotations
 

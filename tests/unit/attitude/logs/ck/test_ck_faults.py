@@ -1,4 +1,6 @@
-"""SPICE CK: files that are damaged, kernels that are missing, and choices that are open, each refused in one line."""
+"""SPICE CK: files that are damaged, kernels that are missing, and choices that are open, each
+refused in one line.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def refusal(path, kernels=("leap.tls", "clock.tsc"), body=None):
 
 
 def words(at, *values):
-    """An edit that puts doubles at a word (from 0); at a negative one, counted from the end of the segment."""
+    """An edit that puts doubles at a word (from 0); at a negative one, counted from the end of
+    the segment.
+    """
 
     def edit(raw):
         where = at if at >= 0 else len(segment(raw)) + DATA_WORD + at
@@ -73,7 +77,8 @@ def cut(count):
         (cut(3 * RECORD_BYTES + 999), "segment 1 has the words 385 to"),
         (bytes_at(88, b"VAX-GFLT"), "VAX-GFLT"),
         (bytes_at(8, struct.pack("<2i", 99, 9999)), "is another kind of DAF than a CK"),
-        (words(RECORD_BYTES // WORD_BYTES, 2.0), "has more than 100000 segments"),  # a list that goes round for ever
+        # a list that goes round for ever
+        (words(RECORD_BYTES // WORD_BYTES, 2.0), "has more than 100000 segments"),
         (words(RECORD_BYTES // WORD_BYTES, 1e15), "SPICE refuses it (Attempt to read descriptor record"),
         (words(RECORD_BYTES // WORD_BYTES + 2, 0.0), "contains no segment"),
         (words(RECORD_BYTES // WORD_BYTES + 2, 1e9), "segment 2 is of type 0; types 1 to 6 are read"),
@@ -101,7 +106,9 @@ def test_a_quaternion_that_is_none_is_refused_and_not_taken_for_an_attitude(tmp_
 
 
 def test_a_file_on_which_spice_aborts_ends_a_process_of_its_own_and_is_one_line(tmp_path, raw):
-    """CSPICE ends its process on some damaged files: a segment of type 6 whose counts it believes."""
+    """CSPICE ends its process on some damaged files: a segment of type 6 whose counts it
+    believes.
+    """
     path = tmp_path / "a.bc"
     with ck.new_ck(path) as handle:
         ck.write_type_6(handle, ck.Motion(np.random.default_rng(1)), [TIMES])

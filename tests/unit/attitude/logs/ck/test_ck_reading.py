@@ -1,4 +1,6 @@
-"""SPICE CK: attitudes and rates of every type of segment against SciPy's motion and against SPICE, in frames of all kinds."""
+"""SPICE CK: attitudes and rates of every type of segment against SciPy's motion and against
+SPICE, in frames of all kinds.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,26 @@ from tests.support.sources import spice_kernels as ck
 MAS = np.radians(1.0 / 3_600_000)
 # A quaternion of 16 digits twice through a matrix: a few roundings of 1 are 1e-15 rad, 2e-7 mas.
 READ_BACK_RAD = 1e-5 * MAS
-# Read back through the clock: a double of ephemeris time near 6e8 s is even to 2^-23 s, and ticks of 2^-16 s are exact in it.
+# Read back through the clock: a double of ephemeris time near 6e8 s is even to 2^-23 s, and ticks
+# of 2^-16 s are exact in it.
 J2000_NS = 946_728_000 * NS_PER_S
-# What is read holds the rate as it was written, turned once (1e-16); the motion's own rate is good to 1e-13.
+# What is read holds the rate as it was written, turned once (1e-16); the motion's own rate is good
+# to 1e-13.
 RATE_RAD_S = 1e-12
-# A rate by difference over h = step / 16 of an interpolating segment: its pieces join with a kink in the rate of 1e-4 rad/s.
+# A rate by difference over h = step / 16 of an interpolating segment: its pieces join with a kink
+# in the rate of 1e-4 rad/s.
 DIFFERENCE_RAD_S = 1e-3
-# Between samples, 1 mas is the target, and a time off by 2^-23 s is 1.8 mas at this motion's 0.075 rad/s, twice.
+# Between samples, 1 mas is the target, and a time off by 2^-23 s is 1.8 mas at this motion's 0.075
+# rad/s, twice.
 BETWEEN_RAD = 4.7 * MAS
 ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
 TIMES = np.arange(0.0, 6.0, 0.25)
 
 
 def read(path, body=None, kernels=("leap.tls", "clock.tsc")):
-    """What the process of its own would answer, in this one; the kernels that are loaded do not stay."""
+    """What the process of its own would answer, in this one; the kernels that are loaded do not
+    stay.
+    """
     with spiceypy.KernelPool([]):
         return answer(path, [path.parent / name for name in kernels], body)
 
@@ -122,7 +130,8 @@ def test_the_ecliptic_is_turned_by_the_obliquity(folder, motion):
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
         icrs_to_body = (ecliptic_to_icrs * motion.turn(second)).inv().as_matrix()
         assert angle_between_rad(q, from_matrix(icrs_to_body)) < READ_BACK_RAD
-        assert rate == pytest.approx(motion.rate(second), abs=RATE_RAD_S)  # of a frame that does not turn, in the body
+        # of a frame that does not turn, in the body
+        assert rate == pytest.approx(motion.rate(second), abs=RATE_RAD_S)
 
 
 @pytest.mark.parametrize("reference", ["FK4", "GALACTIC", "PROBE_TABLE", "IAU_EARTH"])

@@ -71,7 +71,8 @@ def messages(truth, kind, frame="icrs"):
 def assert_is_truth(log, truth):
     q = Rotation.from_quat([sample.q_icrs_to_cam for sample in log.samples], scalar_first=True)
     star = np.array([0.3, -0.4, 0.5])
-    assert q.apply(star) == pytest.approx(truth.inv().apply(star), abs=ROUNDING)  # the message turns body into reference
+    # the message turns body into reference
+    assert q.apply(star) == pytest.approx(truth.inv().apply(star), abs=ROUNDING)
     assert [sample.t_ns for sample in log.samples] == [START_NS + i * STEP_NS for i in range(len(truth))]
 
 

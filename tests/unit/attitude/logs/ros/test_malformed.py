@@ -37,7 +37,9 @@ WHOLE = {
 
 @pytest.mark.parametrize("kind", WHOLE)
 def test_a_damaged_bag_is_refused_in_one_line_or_read(tmp_path, kind):
-    """Bytes changed, cut or doubled at random: nothing but a refusal, and every attitude that is given is one that was sent."""
+    """Bytes changed, cut or doubled at random: nothing but a refusal, and every attitude that is
+    given is one that was sent.
+    """
     rng = np.random.default_rng(11)
     whole = WHOLE[kind](tmp_path)
     data = whole.read_bytes()
@@ -115,7 +117,8 @@ def test_without_rosbags_one_line_says_what_to_install(tmp_path, monkeypatch):
 
     from hilstar.basics.errors import MachineError
 
-    monkeypatch.setitem(sys.modules, "rosbags", None)  # as Python has it where a package is not installed
+    # as Python has it where a package is not installed
+    monkeypatch.setitem(sys.modules, "rosbags", None)
     for kind in ("ROS 1", "db3", "MCAP"):
         (tmp_path / kind).mkdir()
         with pytest.raises(MachineError, match=r"a ROS bag; reading it needs rosbags: pip install 'hilstar\[ros\]'"):

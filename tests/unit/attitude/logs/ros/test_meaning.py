@@ -1,4 +1,6 @@
-"""What a bag means: topics, frames, tf, rates, times; what it does not say is stated or refused, never guessed."""
+"""What a bag means: topics, frames, tf, rates, times; what it does not say is stated or refused,
+never guessed.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ MAKE = Make("jazzy")
 PLACE = (48.1, 11.6, 500.0)
 # A chain of four products of unit quaternions in float64.
 ROUNDING = 1e-14
-# The motion of one step of 10 ms is a rotation about one axis; a rate of 0.4 rad/s is then exact but for rounding over 10 ms.
+# The motion of one step of 10 ms is a rotation about one axis; a rate of 0.4 rad/s is then exact
+# but for rounding over 10 ms.
 RATE_ROUNDING = 1e-9
 
 
@@ -85,7 +88,9 @@ def test_what_is_stated_against_the_frames_own_name_is_refused(bag):
 
 @pytest.mark.parametrize(("stated", "turn"), [("enu", q_icrs_to_enu), ("ned", q_icrs_to_ned)])
 def test_a_level_frame_turns_with_the_earth(bag, stated, turn):
-    """The truth is a body in the ICRS; the bag has its orientation in the level frame of each moment."""
+    """The truth is a body in the ICRS; the bag has its orientation in the level frame of each
+    moment.
+    """
     truth, times = rotations(5), START_NS + 10**8 * np.arange(5)
     level = Rotation.from_quat(turn(times, PLACE[0], PLACE[1]), scalar_first=True)
     log = open_log(bag(poses("map", level * truth.inv())), Stated(reference=stated, place=PLACE))
@@ -135,7 +140,9 @@ def test_the_self_check_of_a_bag_points_where_it_says(bag, reference):
 
 
 def spinning(kind, frame, rate, earths, count=4):
-    """A body that turns at a constant rate (body components) in the stars' frame, as recorded in a frame that turns too."""
+    """A body that turns at a constant rate (body components) in the stars' frame, as recorded in
+    a frame that turns too.
+    """
     times = START_NS + 10**7 * np.arange(count)
     begin = rotations(1)[0]
     for i, t_ns in enumerate(times.tolist()):
@@ -268,7 +275,9 @@ def test_a_type_whose_inner_type_has_other_fields_is_refused(tmp_path):
 
 
 def recorded_in_turn(sent):
-    """Messages whose recorder's clock is right, whatever their stamps say: rosbags gives them in its order."""
+    """Messages whose recorder's clock is right, whatever their stamps say: rosbags gives them in
+    its order.
+    """
     return [(topic, kind, START_NS + k * 10**8, message) for k, (topic, kind, _, message) in enumerate(sent)]
 
 

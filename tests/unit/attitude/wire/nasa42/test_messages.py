@@ -1,4 +1,6 @@
-"""42's messages: what the real program sent, by its own report; random attitudes by SciPy; and what is wrong."""
+"""42's messages: what the real program sent, by its own report; random attitudes by SciPy; and
+what is wrong.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.nasa42 import BEGIN_NS, STREAM_2024, STREAM_2025, message, report
 
-# 42 writes thirteen significant digits: four components off by 5e-13 turn a unit vector by 2e-12 at most.
+# 42 writes thirteen significant digits: four components off by 5e-13 turn a unit vector by 2e-12 at
+# most.
 DIGITS = 2e-12
 REPORT_DIGITS = 5e-7  # its report has seven
 # Over 0.1 s the rate of a body that nutates is not its mean rate: here by 1.1e-7 rad/s, of 0.068.
@@ -49,7 +52,9 @@ def rotation(q) -> Rotation:
 
 
 def test_the_recorded_attitudes_turn_42_s_vectors_of_n_into_its_own_of_b():
-    """svn and svb are the Sun's direction in N and in B, of 42's own report: neither direction nor scalar order is assumed."""
+    """svn and svb are the Sun's direction in N and in B, of 42's own report: neither direction
+    nor scalar order is assumed.
+    """
     by_time = report()
     samples = recorded()
     assert len(samples) == 61
@@ -63,7 +68,8 @@ def test_the_recorded_rates_are_how_the_recorded_attitudes_turn():
     for before, after in pairwise(recorded()):
         turn = rotation(after.q_icrs_to_cam) * rotation(before.q_icrs_to_cam).inv()
         mean = (before.rate_cam_rad_s + after.rate_cam_rad_s) / 2
-        assert -turn.as_rotvec() / PERIOD_S == pytest.approx(mean, abs=NUTATION_RAD_S)  # vectors turn the other way
+        # vectors turn the other way
+        assert -turn.as_rotvec() / PERIOD_S == pytest.approx(mean, abs=NUTATION_RAD_S)
 
 
 def test_a_stream_of_the_form_until_2025_is_read():

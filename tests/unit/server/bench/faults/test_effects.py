@@ -59,7 +59,8 @@ def test_a_false_star_lies_where_a_real_star_of_its_place_would(bench, plain):
     assert [(row["hip"], row["name"]) for row in rows] == [(0, "fault 0")]
     assert abs(rows["x_px"][0] - star["x_px"]) < PX and abs(rows["y_px"][0] - star["y_px"]) < PX
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
-    assert light(frame) - light(plain) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)  # of 47e6 in float32
+    # of 47e6 in float32
+    assert light(frame) - light(plain) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
 
 
 def test_magnitude_and_electrons_are_one_light(bench):

@@ -94,7 +94,8 @@ def test_the_stream_asks_for_faults_of_its_own_now_or_later():
     schedule.at(0)
     schedule.ask(star("now", for_s=0.02), "stream")
     schedule.ask(blank("later", at_s=0.04, for_s=0.01), "stream")
-    schedule.ask(blank("past", at_s=0.001, for_s=0.01), "stream")  # a time that has passed means now
+    # a time that has passed means now
+    schedule.ask(blank("past", at_s=0.001, for_s=0.01), "stream")
     assert frames(schedule, 5, 1) == [
         [("now", 1.0), ("past", 1.0)],
         [("now", 1.0)],

@@ -1,4 +1,6 @@
-"""A satellite's light: phase, shadow, what is behind the Earth, and flashes, each against a sum over many places or times."""
+"""A satellite's light: phase, shadow, what is behind the Earth, and flashes, each against a sum
+over many places or times.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from hilstar.sky.bodies.satellites import (
 )
 
 SUN = np.array([0.6, -0.72, -0.35]) * KM_PER_AU
-SUN_POINTS = 4000  # a sunflower of points: the share of a disc that an edge cuts off is right to 2e-3 or so
+# a sunflower of points: the share of a disc that an edge cuts off is right to 2e-3 or so
+SUN_POINTS = 4000
 SHARE_LIMIT = 4e-3
 INTEGRAL_LIMIT = 1e-4  # of 200 000 steps over flashes of 1/40 of the time
 
@@ -41,7 +44,9 @@ def ray_traced_share(place: np.ndarray) -> float:
 
 @pytest.mark.parametrize("distance_km", [6800.0, 20_000.0, 42_164.0, 2e6])
 def test_the_shadow_dims_as_rays_to_points_of_the_sun_do(distance_km):
-    """From full light through the penumbra into the umbra, over the equator's side and over a pole; far off, a ring is left."""
+    """From full light through the penumbra into the umbra, over the equator's side and over a
+    pole; far off, a ring is left.
+    """
     down = -SUN / np.linalg.norm(SUN)
     for side in (np.cross(down, [0.0, 0.0, 1.0]), np.cross(np.cross(down, [0.0, 0.0, 1.0]), down)):
         side = side / np.linalg.norm(side)
@@ -63,7 +68,9 @@ def test_a_penumbra_has_light_and_an_umbra_none():
 
 
 def test_the_phase_law_is_that_of_a_diffuse_sphere():
-    """The light of all its places that the Sun lights and the observer sees, over that at 90 degrees."""
+    """The light of all its places that the Sun lights and the observer sees, over that at 90
+    degrees.
+    """
     rng = np.random.default_rng(7)
     normal = rng.normal(size=(400_000, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -91,7 +98,8 @@ def test_the_earth_hides_what_is_behind_it():
     places = np.array(
         [[-7000.0, 0, 0], [-7000.0, 31_100, 0], [9000.0, 0, 0], [0, 15_450.0, 0], [0, 0, 15_450.0], [0, 0, 15_400.0]]
     )
-    # From 7000 km tangents to the equator are 15 477 km from the centre at a right angle, those over the poles 15 425 km.
+    # From 7000 km tangents to the equator are 15 477 km from the centre at a right angle, those
+    # over the poles 15 425 km.
     assert in_front(np.repeat(observer, 6, axis=0), places).tolist() == [0, 1, 1, 0, 1, 0]
     assert in_front(np.zeros((6, 3)), places).tolist() == [1] * 6
 

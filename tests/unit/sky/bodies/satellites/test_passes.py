@@ -1,4 +1,6 @@
-"""Satellites near an axis: none is missed, all of it depends on the moment alone, and what cannot be placed is said once."""
+"""Satellites near an axis: none is missed, all of it depends on the moment alone, and what
+cannot be placed is said once.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ START = utc_ns(STATION_UTC)
 NORTH = np.array([0.0, 0.0, 1.0])
 EVERYWHERE = Cone(NORTH, np.pi, 0.0)
 S_NS = 10**9
-# Measured over three days: 0.24 m in low orbits (the first two kinds of `some_orbits`), 3.2 m in the others
+# Measured over three days: 0.24 m in low orbits (the first two kinds of `some_orbits`), 3.2 m in
+# the others
 LOW_KM, ANY_KM = 4e-4, 5e-3
 
 
@@ -36,7 +39,9 @@ def test_between_sgp4s_moments_cubics_are_within_half_a_metre_in_low_orbits(rng)
 
 
 def test_whatever_turns_and_jumps_come_none_in_view_is_missed(rng):
-    """Against a look at all of them at each moment; slow turns, jumps of attitude and of time, short and long exposures."""
+    """Against a look at all of them at each moment; slow turns, jumps of attitude and of time,
+    short and long exposures.
+    """
     text = some_orbits(rng, 400)
     sky, of_all, t_ns, axis = satellite_sky(text), satellite_sky(text), 0, NORTH
     found = 0
@@ -142,4 +147,5 @@ def test_an_observer_whose_state_comes_with_the_frame_sees_the_same(rng):
     assert np.array_equal(ours.index, theirs.index)
     which, middle = np.arange(len(ours)), np.zeros(len(ours))
     assert np.array_equal(ours.rates_e_per_s(which, middle, middle), theirs.rates_e_per_s(which, middle, middle))
-    assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)  # none behind the Earth
+    # none behind the Earth
+    assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)

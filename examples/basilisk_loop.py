@@ -83,15 +83,27 @@ class Plant:
         craft.hub.sigma_BNInit = [[part] for part in sigma_bn(q_start)]
         torque = extForceTorque.ExtForceTorque()
         craft.addDynamicEffector(torque)
-        target, error, control = inertial3D.inertial3D(), attTrackingError.attTrackingError(), mrpFeedback.mrpFeedback()
+        target, error, control = (
+            inertial3D.inertial3D(),
+            attTrackingError.attTrackingError(),
+            mrpFeedback.mrpFeedback(),
+        )
         target.sigma_R0N = sigma_bn(q_target)
-        self._navigation = messaging.NavAttMsg().write(messaging.NavAttMsgPayload(sigma_BN=sigma_bn(q_start)))
+        self._navigation = messaging.NavAttMsg().write(
+            messaging.NavAttMsgPayload(sigma_BN=sigma_bn(q_start))
+        )
         error.attNavInMsg.subscribeTo(self._navigation)
         error.attRefInMsg.subscribeTo(target.attRefOutMsg)
         middle = INERTIA_KG_M2[1]
-        control.K, control.P, control.Ki = 4 * middle * BANDWIDTH_RAD_S**2, 2 * DAMPING * middle * BANDWIDTH_RAD_S, -1.0
+        control.K, control.P, control.Ki = (
+            4 * middle * BANDWIDTH_RAD_S**2,
+            2 * DAMPING * middle * BANDWIDTH_RAD_S,
+            -1.0,
+        )
         control.guidInMsg.subscribeTo(error.attGuidOutMsg)
-        inertia = messaging.VehicleConfigMsgPayload(ISCPntB_B=np.diag(INERTIA_KG_M2).ravel().tolist())
+        inertia = messaging.VehicleConfigMsgPayload(
+            ISCPntB_B=np.diag(INERTIA_KG_M2).ravel().tolist()
+        )
         self._inertia = messaging.VehicleConfigMsg().write(inertia)
         control.vehConfigInMsg.subscribeTo(self._inertia)
         torque.cmdTorqueInMsg.subscribeTo(control.cmdTorqueOutMsg)
@@ -111,7 +123,9 @@ class Plant:
 
     def navigate(self, q_icrs_to_cam: Array, rate_rad_s: Array) -> None:
         """Tell the controller where the tracker says it points."""
-        said = messaging.NavAttMsgPayload(sigma_BN=sigma_bn(q_icrs_to_cam), omega_BN_B=rate_rad_s.tolist())
+        said = messaging.NavAttMsgPayload(
+            sigma_BN=sigma_bn(q_icrs_to_cam), omega_BN_B=rate_rad_s.tolist()
+        )
         self._navigation.write(said)
 
 
@@ -126,13 +140,34 @@ def newest(answers: socket.socket) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def display_and_tracker(bench: Path, seconds: float, attitudes: int, answers: int) -> Iterator[None]:
+def display_and_tracker(
+    bench: Path, seconds: float, attitudes: int, answers: int
+) -> Iterator[None]:
     """The two commands, until the loop is over; attitudes come and answers go by UDP ports."""
     text = f'{BENCH.read_text()}\n[attitude]\nsource = "udp"\nbind = "127.0.0.1:{attitudes}"\n'
     bench.write_text(text)
     frames = f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    shown = [*HILSTAR, "serve", str(bench), "--headless", "--duration", str(seconds + 30), "--frames", frames]
-    looks = [*HILSTAR, "tracker", str(bench), "--watch", frames, "--answer", f"udp://127.0.0.1:{answers}", "--format", "json"]
+    shown = [
+        *HILSTAR,
+        "serve",
+        str(bench),
+        "--headless",
+        "--duration",
+        str(seconds + 30),
+        "--frames",
+        frames,
+    ]
+    looks = [
+        *HILSTAR,
+        "tracker",
+        str(bench),
+        "--watch",
+        frames,
+        "--answer",
+        f"udp://127.0.0.1:{answers}",
+        "--format",
+        "json",
+    ]
     with contextlib.ExitStack() as running:
         for command in (shown, looks):
             process = running.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL))
@@ -146,7 +181,10 @@ def run(slew_deg: float = 2.0, seconds: float = 25.0) -> dict[str, Any]:
     plant = Plant(q_start, q_target)
     errors: list[Array] = []
     ages_s: list[float] = []
-    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as answers:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as answers,
+    ):
         answers.bind(("127.0.0.1", 0))
         answers.setblocking(False)
         attitudes, bench = free_port(socket.SOCK_DGRAM), Path(folder) / "bench.toml"
@@ -183,7 +221,9 @@ def rest(sender: Sender, q: Array, answers: socket.socket) -> None:
     until_s = time.monotonic() + WAITS_S
     while newest(answers) is None:
         if time.monotonic() > until_s:
-            raise SystemExit("the tracker does not answer; run hilstar serve and hilstar tracker by hand to see why")
+            raise SystemExit(
+                "the tracker does not answer; run hilstar serve and hilstar tracker by hand to see why"
+            )
         sender.send(q, np.zeros(3))
         time.sleep(STEP_S)
 

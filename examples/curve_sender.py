@@ -30,11 +30,15 @@ def attitude(t_ns: int, since_start_s: float, sequence: int) -> bytes:
     w, z = math.cos(half_rad), math.sin(half_rad)
     # the turn times (0.5, 0.5, -0.5, 0.5)
     q = (0.5 * (w - z), 0.5 * (w + z), 0.5 * (z - w), 0.5 * (w + z))
-    body = struct.pack("<BBHIq4d3f", 1, 1, FLAG_RATE_VALID, sequence, t_ns, *q, 0.0, 0.0, RATE_CAM_RAD_S)
+    body = struct.pack(
+        "<BBHIq4d3f", 1, 1, FLAG_RATE_VALID, sequence, t_ns, *q, 0.0, 0.0, RATE_CAM_RAD_S
+    )
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-def open_socket(context: zmq.Context[zmq.Socket[bytes]], endpoint: str, keys: Path) -> zmq.Socket[bytes] | None:
+def open_socket(
+    context: zmq.Context[zmq.Socket[bytes]], endpoint: str, keys: Path
+) -> zmq.Socket[bytes] | None:
     """A PUB socket with a subscriber; None where hilstar is not there, or did not let this sender
     in.
 
@@ -42,7 +46,9 @@ def open_socket(context: zmq.Context[zmq.Socket[bytes]], endpoint: str, keys: Pa
     """
     socket = context.socket(zmq.XPUB)
     socket.linger = 1000
-    socket.curve_publickey, socket.curve_secretkey = zmq.auth.load_certificate(keys / "client.key_secret")
+    socket.curve_publickey, socket.curve_secretkey = zmq.auth.load_certificate(
+        keys / "client.key_secret"
+    )
     socket.curve_serverkey, _ = zmq.auth.load_certificate(keys / "server.key")
     socket.connect(endpoint)
     if socket.poll(WAIT_MS):
@@ -68,7 +74,10 @@ def main(endpoint: str, keys: str, seconds: str = "10") -> int:
     with zmq.Context() as context:
         socket = open_socket(context, endpoint, Path(keys))
         if socket is None:
-            print(f"{endpoint}: nobody listens; start hilstar, and put client.key into its allowed_clients", file=sys.stderr)
+            print(
+                f"{endpoint}: nobody listens; start hilstar, and put client.key into its allowed_clients",
+                file=sys.stderr,
+            )
             return 1
         with socket:
             print(f"{send(socket, float(seconds))} attitudes sent")

@@ -20,9 +20,36 @@ light = dn - np.median(dn)
 light[light < 5 * max(1.4826 * np.median(np.abs(light)), 0.5)] = 0.0
 stretched = np.clip(light / max(np.percentile(light, 99.97), 1.0) * 255, 0, 255)
 Image.fromarray(stretched.astype(np.uint8)).save(picture + ".8.png")
-words = ["./lost", "pipeline", "--png", picture + ".8.png", "--fov", fov_deg, "--database", "stars.dat"]
-words += ["--centroid-algo", "cog", "--centroid-filter-brightest", "20", "--star-id-algo", "py", "--angular-tolerance", "0.05"]
-words += ["--false-stars", "1000", "--max-mismatch-prob", "0.0001", "--attitude-algo", "dqm", "--print-attitude", "-"]
+words = [
+    "./lost",
+    "pipeline",
+    "--png",
+    picture + ".8.png",
+    "--fov",
+    fov_deg,
+    "--database",
+    "stars.dat",
+]
+words += [
+    "--centroid-algo",
+    "cog",
+    "--centroid-filter-brightest",
+    "20",
+    "--star-id-algo",
+    "py",
+    "--angular-tolerance",
+    "0.05",
+]
+words += [
+    "--false-stars",
+    "1000",
+    "--max-mismatch-prob",
+    "0.0001",
+    "--attitude-algo",
+    "dqm",
+    "--print-attitude",
+    "-",
+]
 said = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=True).stdout
 found = dict(line.split(maxsplit=1) for line in said.splitlines() if line.startswith("attitude_"))
 if found.get("attitude_known") == "1":

@@ -25,7 +25,10 @@ def turned(angle_rad: float) -> tuple[float, float, float, float]:
     components, and a star
     seems to turn against the camera.
     """
-    w, (x, y, z) = math.cos(-0.5 * angle_rad), (math.sin(-0.5 * angle_rad) * component for component in AXIS_CAM)
+    w, (x, y, z) = (
+        math.cos(-0.5 * angle_rad),
+        (math.sin(-0.5 * angle_rad) * component for component in AXIS_CAM),
+    )
     a, b, c, d = START_Q_ICRS_TO_CAM
     q = (
         w * a - x * b - y * c - z * d,
@@ -47,11 +50,16 @@ def profile(t_s: float) -> tuple[float, float]:
 
 def main() -> None:
     """Write the log to stdout."""
-    print("# made by make_slew.py: 20 degrees from rest to rest in 20 s; q_icrs_to_cam, rates of the camera in rad/s")
+    print(
+        "# made by make_slew.py: 20 degrees from rest to rest in 20 s; q_icrs_to_cam, rates of the camera in rad/s"
+    )
     print("t_s,qw,qx,qy,qz,rx,ry,rz")
     for k in range(round((SLEW_S + 2 * REST_S) * SAMPLES_HZ) + 1):
         angle_rad, rate_rad_s = profile(k / SAMPLES_HZ)
-        numbers = [*(f"{q:.12f}" for q in turned(angle_rad)), *(f"{rate_rad_s * c:.12f}" for c in AXIS_CAM)]
+        numbers = [
+            *(f"{q:.12f}" for q in turned(angle_rad)),
+            *(f"{rate_rad_s * c:.12f}" for c in AXIS_CAM),
+        ]
         print(f"{k / SAMPLES_HZ:.1f},{','.join(numbers)}")
 
 

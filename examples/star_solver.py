@@ -58,10 +58,14 @@ def solve(image: npt.NDArray[Any], tracker: dict[str, Any]) -> list[float] | Non
     height, width = image.shape
     found = find_stars(image)
     centre = tracker.get("principal_point_px") or ((width - 1) / 2, (height - 1) / 2)
-    seen = np.stack([found.x_px - centre[0], found.y_px - centre[1], np.full(len(found), focal_px)], axis=1)[~found.at_edge]
+    seen = np.stack(
+        [found.x_px - centre[0], found.y_px - centre[1], np.full(len(found), focal_px)], axis=1
+    )[~found.at_edge]
     seen = (seen / np.linalg.norm(seen, axis=1, keepdims=True))[:CHECKED]
     field_rad = 2 * np.arctan(np.hypot(width, height) / 2 / focal_px)
-    stars, tree, pairs, chords = sky(round(float(field_rad), 3), float(tracker.get("epoch_jyear", EPOCH_JYEAR)))
+    stars, tree, pairs, chords = sky(
+        round(float(field_rad), 3), float(tracker.get("epoch_jyear", EPOCH_JYEAR))
+    )
     tolerance = TOLERANCE_PX / focal_px
     for i, j in combinations(range(min(BRIGHT, len(seen))), 2):
         chord = np.linalg.norm(seen[i] - seen[j])
@@ -69,11 +73,16 @@ def solve(image: npt.NDArray[Any], tracker: dict[str, Any]) -> list[float] | Non
         both = np.concatenate([pairs[first:last], pairs[first:last, ::-1]])
         attitude = confirmed(seen, (i, j), stars[both], tree, tolerance)
         if attitude is not None:
-            return [float(component) for component in from_matrix(refined(attitude, seen, stars, tree, tolerance))]
+            return [
+                float(component)
+                for component in from_matrix(refined(attitude, seen, stars, tree, tolerance))
+            ]
     return None
 
 
-def confirmed(seen: Array, pair: tuple[int, int], stars: Array, tree: KDTree, tolerance: float) -> Array | None:
+def confirmed(
+    seen: Array, pair: tuple[int, int], stars: Array, tree: KDTree, tolerance: float
+) -> Array | None:
     """The rotation (3, 3) from ICRS to cam, of those that put two seen stars on pairs (m, 2, 3),
     that most stars confirm.
     """
@@ -81,7 +90,9 @@ def confirmed(seen: Array, pair: tuple[int, int], stars: Array, tree: KDTree, to
         return None
     cam, icrs = triad(seen[pair[0]][None], seen[pair[1]][None]), triad(stars[:, 0], stars[:, 1])
     icrs_from_cam = icrs @ cam.transpose(0, 2, 1)
-    distance, _ = tree.query(np.einsum("mij,kj->mki", icrs_from_cam, seen), distance_upper_bound=4 * tolerance)
+    distance, _ = tree.query(
+        np.einsum("mij,kj->mki", icrs_from_cam, seen), distance_upper_bound=4 * tolerance
+    )
     count = np.isfinite(distance).sum(axis=1)
     best = int(np.argmax(count))
     if count[best] < max(MIN_CONFIRMED, MIN_SHARE * len(seen)):
@@ -94,11 +105,15 @@ def triad(a: Array, b: Array) -> Array:
     normal, and the third.
     """
     middle, normal = a + b, np.cross(a, b)
-    middle, normal = (part / np.linalg.norm(part, axis=1, keepdims=True) for part in (middle, normal))
+    middle, normal = (
+        part / np.linalg.norm(part, axis=1, keepdims=True) for part in (middle, normal)
+    )
     return np.stack([middle, normal, np.cross(middle, normal)], axis=2)
 
 
-def refined(cam_from_icrs: Array, seen: Array, stars: Array, tree: KDTree, tolerance: float) -> Array:
+def refined(
+    cam_from_icrs: Array, seen: Array, stars: Array, tree: KDTree, tolerance: float
+) -> Array:
     """The rotation by all confirmed stars together: Wahba's problem by SVD."""
     for _ in range(3):
         distance, star = tree.query(seen @ cam_from_icrs, distance_upper_bound=4 * tolerance)

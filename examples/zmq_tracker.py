@@ -28,7 +28,17 @@ def answer(
     z), the rate (x, y, z).
     """
     flags |= 0 if rate_cam_rad_s is None else RATE_VALID
-    body = struct.pack("<BBHIq4d3fI", 1, 5, flags, sequence, t_ns, *q_icrs_to_cam, *(rate_cam_rad_s or (0, 0, 0)), stars)
+    body = struct.pack(
+        "<BBHIq4d3fI",
+        1,
+        5,
+        flags,
+        sequence,
+        t_ns,
+        *q_icrs_to_cam,
+        *(rate_cam_rad_s or (0, 0, 0)),
+        stars,
+    )
     return body + struct.pack("<I", zlib.crc32(body))
 
 

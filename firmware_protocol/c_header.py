@@ -6,12 +6,22 @@ import re
 
 from definition import FRAMING_BYTES, Field, Packet, Wire
 
-C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i64": "int64_t", "f32": "float", "f64": "double"}
+C_TYPES = {
+    "u8": "uint8_t",
+    "u16": "uint16_t",
+    "u32": "uint32_t",
+    "i64": "int64_t",
+    "f32": "float",
+    "f64": "double",
+}
 
 
 def header(wire: Wire, template: str) -> str:
     """The C header."""
-    sizes = [f"    case HILSTAR_KIND_{p.name.upper()}: return HILSTAR_{p.name.upper()}_BYTES;" for p in wire.packets]
+    sizes = [
+        f"    case HILSTAR_KIND_{p.name.upper()}: return HILSTAR_{p.name.upper()}_BYTES;"
+        for p in wire.packets
+    ]
     parts = {
         "CONSTANTS": "\n".join(_c_constants(wire)),
         "STRUCTS": "\n\n".join(_c_struct(p) for p in wire.packets),
@@ -28,7 +38,11 @@ def _c_constants(wire: Wire) -> list[str]:
         lines.append(f"/** {p.meaning[0].upper()}{p.meaning[1:]}. */")
         lines.append(f"#define HILSTAR_KIND_{p.name.upper()} {p.kind}")
         lines.append(f"#define HILSTAR_{p.name.upper()}_BYTES {p.size}")
-    lines += ["", f"#define HILSTAR_LONGEST_PACKET {longest}", "/** On the wire, its COBS byte and its 0x00 among them. */"]
+    lines += [
+        "",
+        f"#define HILSTAR_LONGEST_PACKET {longest}",
+        "/** On the wire, its COBS byte and its 0x00 among them. */",
+    ]
     lines.append(f"#define HILSTAR_LONGEST_FRAME {longest + FRAMING_BYTES}")
     for group, bits in wire.bits.items():
         lines.append("")
@@ -43,7 +57,10 @@ def _c_constants(wire: Wire) -> list[str]:
 
 
 def _c_struct(packet: Packet) -> str:
-    lines = [f"/** {packet.name} ({packet.direction}, {packet.size} bytes): {packet.meaning}. */", "typedef struct {"]
+    lines = [
+        f"/** {packet.name} ({packet.direction}, {packet.size} bytes): {packet.meaning}. */",
+        "typedef struct {",
+    ]
     for f in packet.variable:
         bits = f" (HILSTAR_{f.bits.upper()}_...)" if f.bits else ""
         lines.append(f"    /** {f.said}{bits} */")
@@ -54,7 +71,9 @@ def _c_struct(packet: Packet) -> str:
 
 def _c_encode(packet: Packet) -> str:
     out = [f"/** Writes {packet.size} bytes to `out`. */"]
-    out.append(f"static inline size_t hilstar_encode_{packet.name}(const hilstar_{packet.name} *in, uint8_t *out)")
+    out.append(
+        f"static inline size_t hilstar_encode_{packet.name}(const hilstar_{packet.name} *in, uint8_t *out)"
+    )
     out += ["{", *_c_index(packet)]
     for f in packet.fields:
         place = f"out + {f.offset}" if f.offset else "out"
@@ -71,7 +90,13 @@ def _c_put(f: Field, place: str) -> str:
     where, what = _c_element(f, place, f"in->{f.name}")
     if f.type == "f32":
         return f"hilstar_put_f32({where}, &{what});"
-    value = f"hilstar_bits_of_f64({what})" if f.type == "f64" else f"(uint64_t){what}" if f.type == "i64" else what
+    value = (
+        f"hilstar_bits_of_f64({what})"
+        if f.type == "f64"
+        else f"(uint64_t){what}"
+        if f.type == "i64"
+        else what
+    )
     return f"hilstar_put({where}, {value}, {f.item_bytes});"
 
 
@@ -92,7 +117,9 @@ def _c_get(f: Field) -> str:
     if f.type == "f32":
         return f"hilstar_get_f32({where}, &{what});"
     raw = f"hilstar_get({where}, {f.item_bytes})"
-    value = {"f64": f"hilstar_f64_of({raw})", "i64": f"hilstar_i64_of({raw})"}.get(f.type, f"({C_TYPES[f.type]}){raw}")
+    value = {"f64": f"hilstar_f64_of({raw})", "i64": f"hilstar_i64_of({raw})"}.get(
+        f.type, f"({C_TYPES[f.type]}){raw}"
+    )
     return f"{what} = {value};"
 
 

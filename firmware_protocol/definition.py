@@ -56,12 +56,18 @@ class Packet:
     @property
     def body(self) -> str:
         """The struct format of all but the CRC."""
-        return "<" + "".join(f"{f.count if f.count > 1 else ''}{STRUCT[f.type]}" for f in self.fields if not f.crc)
+        return "<" + "".join(
+            f"{f.count if f.count > 1 else ''}{STRUCT[f.type]}" for f in self.fields if not f.crc
+        )
 
     @property
     def direction(self) -> str:
         """Who sends it to whom."""
-        ways = {"simulator": "simulator to hilstar", "hilstar": "hilstar to simulator", "tracker": "tracker to hilstar"}
+        ways = {
+            "simulator": "simulator to hilstar",
+            "hilstar": "hilstar to simulator",
+            "tracker": "tracker to hilstar",
+        }
         return ways.get(self.sender, "either way")
 
     @property
@@ -102,8 +108,12 @@ class Wire:
 def load(path: Path) -> Wire:
     """Read protocol.toml. Raises SystemExit where it contradicts itself."""
     table = tomllib.loads(path.read_text())
-    packets = tuple(_packet(name, entry, table["version"]) for name, entry in table["packet"].items())
-    bits = {group: tuple(Bit(**entry) for entry in entries) for group, entries in table["bits"].items()}
+    packets = tuple(
+        _packet(name, entry, table["version"]) for name, entry in table["packet"].items()
+    )
+    bits = {
+        group: tuple(Bit(**entry) for entry in entries) for group, entries in table["bits"].items()
+    }
     limits = tuple(Limit(name, **entry) for name, entry in table["limit"].items())
     return Wire(table["version"], packets, bits, limits, table["baud_rates"])
 
@@ -115,8 +125,12 @@ def _packet(name: str, entry: dict[str, Any], version: int) -> Packet:
         fields.append(Field(offset=offset, **line))
         offset += fields[-1].size
     if offset != entry["size_bytes"]:
-        raise SystemExit(f"packet.{name}: the fields have {offset} bytes, but size_bytes is {entry['size_bytes']}")
+        raise SystemExit(
+            f"packet.{name}: the fields have {offset} bytes, but size_bytes is {entry['size_bytes']}"
+        )
     head = [(f.name, f.type, f.value) for f in fields[:2]]
     if head != [("version", "u8", version), ("kind", "u8", entry["kind"])] or not fields[-1].crc:
-        raise SystemExit(f"packet.{name}: the first fields must be version and kind, each with its value, and the last the CRC")
+        raise SystemExit(
+            f"packet.{name}: the first fields must be version and kind, each with its value, and the last the CRC"
+        )
     return Packet(name, entry["kind"], offset, entry["sender"], entry["meaning"], tuple(fields))

@@ -31,7 +31,13 @@ DIAGRAM_CELL = 8  # characters a byte
 
 def python_table(wire: Wire) -> str:
     """The Python module."""
-    lines = [f'"""The numbers of the wire. {WRITTEN_BY}"""', "", "import struct", "", f"VERSION = {wire.version}"]
+    lines = [
+        f'"""The numbers of the wire. {WRITTEN_BY}"""',
+        "",
+        "import struct",
+        "",
+        f"VERSION = {wire.version}",
+    ]
     lines += [f"KIND_{p.name.upper()} = {p.kind}  # {p.meaning}" for p in wire.packets]
     lines += ["", "# Everything but the CRC-32, in order:"]
     for p in wire.packets:
@@ -41,7 +47,10 @@ def python_table(wire: Wire) -> str:
     lines.append(f"PACKET_BYTES = {{{', '.join(f'{p.kind}: {p.size}' for p in wire.packets)}}}")
     for group, bits in wire.bits.items():
         lines.append("")
-        lines += [f"{group.upper()}_{bit.name.upper()} = {1 << k}  # {bit.meaning}" for k, bit in enumerate(bits)]
+        lines += [
+            f"{group.upper()}_{bit.name.upper()} = {1 << k}  # {bit.meaning}"
+            for k, bit in enumerate(bits)
+        ]
     lines.append("")
     lines += [f"{limit.name.upper()} = {limit.value!r}  # {limit.meaning}" for limit in wire.limits]
     return "\n".join(lines) + "\n"
@@ -54,31 +63,65 @@ def readme(wire: Wire, text: str) -> str:
     """README.md with its generated blocks renewed. Raises SystemExit where a block is missing or
     unknown.
     """
-    blocks = {"kinds": _kinds(wire), "timing": _timing(wire), "cobs": _cobs_example(wire), "limits": _limits(wire)}
+    blocks = {
+        "kinds": _kinds(wire),
+        "timing": _timing(wire),
+        "cobs": _cobs_example(wire),
+        "limits": _limits(wire),
+    }
     blocks |= {p.name: _packet_section(p, wire) for p in wire.packets}
     found: list[str] = []
 
     def renewed(match: re.Match[str]) -> str:
         found.append(match[1])
-        return f"<!-- generated: {match[1]} -->\n{blocks.get(match[1], '')}\n<!-- end of generated -->"
+        return (
+            f"<!-- generated: {match[1]} -->\n{blocks.get(match[1], '')}\n<!-- end of generated -->"
+        )
 
-    text = re.sub(r"<!-- generated: (\w+) -->\n.*?<!-- end of generated -->", renewed, text, flags=re.DOTALL)
+    text = re.sub(
+        r"<!-- generated: (\w+) -->\n.*?<!-- end of generated -->", renewed, text, flags=re.DOTALL
+    )
     if sorted(found) != sorted(blocks):
-        raise SystemExit(f"README.md has the generated blocks {sorted(found)}; write {sorted(blocks)}, each once")
+        raise SystemExit(
+            f"README.md has the generated blocks {sorted(found)}; write {sorted(blocks)}, each once"
+        )
     return text
 
 
 def _kinds(wire: Wire) -> str:
-    head = ("kind", "packet", "bytes", "on the serial line", "direction", "meaning", "Python `struct`, without the CRC")
+    head = (
+        "kind",
+        "packet",
+        "bytes",
+        "on the serial line",
+        "direction",
+        "meaning",
+        "Python `struct`, without the CRC",
+    )
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for p in wire.packets:
-        cells = (p.kind, f"`{p.name}`", p.size, p.size + FRAMING_BYTES, p.direction, p.meaning, f"`{p.body}`")
+        cells = (
+            p.kind,
+            f"`{p.name}`",
+            p.size,
+            p.size + FRAMING_BYTES,
+            p.direction,
+            p.meaning,
+            f"`{p.body}`",
+        )
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
 def _packet_section(packet: Packet, wire: Wire) -> str:
-    lines = ["```text", *_diagram(packet), "```", "", "| offset | type | field | unit | meaning |", "|---|---|---|---|---|"]
+    lines = [
+        "```text",
+        *_diagram(packet),
+        "```",
+        "",
+        "| offset | type | field | unit | meaning |",
+        "|---|---|---|---|---|",
+    ]
     for f in packet.fields:
         form = f"{f.type}[{f.count}]" if f.count > 1 else f.type
         always = f"{f.value}: {f.meaning}" if f.value is not None else f.meaning
@@ -86,14 +129,24 @@ def _packet_section(packet: Packet, wire: Wire) -> str:
     for f in packet.fields:
         if f.bits:
             lines += ["", f"| bit | `{f.name}` | meaning |", "|---|---|---|"]
-            lines += [f"| {k} ({1 << k}) | `{bit.name}` | {bit.meaning} |" for k, bit in enumerate(wire.bits[f.bits])]
+            lines += [
+                f"| {k} ({1 << k}) | `{bit.name}` | {bit.meaning} |"
+                for k, bit in enumerate(wire.bits[f.bits])
+            ]
     return "\n".join(lines)
 
 
 def _diagram(packet: Packet) -> list[str]:
-    cells = [(f"{f.name}[{i}]" if f.count > 1 else f.name, f.item_bytes) for f in packet.fields for i in range(f.count)]
+    cells = [
+        (f"{f.name}[{i}]" if f.count > 1 else f.name, f.item_bytes)
+        for f in packet.fields
+        for i in range(f.count)
+    ]
     rule = "      +" + "-" * (DIAGRAM_BYTES * DIAGRAM_CELL - 1) + "+"
-    lines = ["byte   " + "".join(f"+{k}".center(DIAGRAM_CELL) for k in range(DIAGRAM_BYTES)).rstrip(), rule]
+    lines = [
+        "byte   " + "".join(f"+{k}".center(DIAGRAM_CELL) for k in range(DIAGRAM_BYTES)).rstrip(),
+        rule,
+    ]
     row, at = "", 0
     for name, size in cells:
         row += name.center(size * DIAGRAM_CELL - 1) + "|"
@@ -107,7 +160,10 @@ def _diagram(packet: Packet) -> list[str]:
 
 def _timing(wire: Wire) -> str:
     columns = " | ".join(f"{p.name}, {p.size + FRAMING_BYTES} bytes" for p in wire.packets)
-    lines = [f"| baud | {columns} | maximum attitudes per second |", "|---|" + "---|" * (len(wire.packets) + 1)]
+    lines = [
+        f"| baud | {columns} | maximum attitudes per second |",
+        "|---|" + "---|" * (len(wire.packets) + 1),
+    ]
     for baud in wire.bauds:
         bits = [(p.size + FRAMING_BYTES) * BITS_PER_BYTE for p in wire.packets]
         times = " | ".join(f"{1000 * count / baud:.3g} ms" for count in bits)
@@ -134,7 +190,9 @@ def _cobs_example(wire: Wire) -> str:
 def generated(folder: Path, package: Path) -> dict[Path, str]:
     """Every generated file and what it should contain."""
     wire = load(folder / "protocol.toml")
-    entries = ",\n".join(json.dumps(vector) for vector in vectors({p.name: p for p in wire.packets}))
+    entries = ",\n".join(
+        json.dumps(vector) for vector in vectors({p.name: p for p in wire.packets})
+    )
     return {
         folder / "hilstar_protocol.h": header(wire, (folder / "header_template.h").read_text()),
         folder / "vectors.json": f"[\n{entries}\n]\n",
@@ -146,14 +204,20 @@ def generated(folder: Path, package: Path) -> dict[Path, str]:
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description="Make what describes the wire from protocol.toml.")
-    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 and name the files that are stale")
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="write nothing; exit 1 and name the files that are stale",
+    )
     check = parser.parse_args().check
     files = generated(HERE, HERE.parent / "hilstar" / "attitude" / "wire")
     stale = [path for path, text in files.items() if not path.exists() or path.read_text() != text]
     for path in stale:
         if not check:
             path.write_text(files[path])
-        print(f"{'stale' if check else 'written'}: {path.relative_to(HERE.parent)}", file=sys.stderr)
+        print(
+            f"{'stale' if check else 'written'}: {path.relative_to(HERE.parent)}", file=sys.stderr
+        )
     if check and stale:
         print("run python firmware_protocol/generate.py", file=sys.stderr)
     return 1 if check and stale else 0

@@ -12,7 +12,16 @@ if TYPE_CHECKING:
     from hilstar.server.bench.frame import Bench, Drawn, Frame
     from hilstar.server.sender import Sender
 
-__all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
+__all__ = [
+    "Bench",
+    "Drawn",
+    "Frame",
+    "HilstarError",
+    "InputError",
+    "MachineError",
+    "Sender",
+    "load",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -29,7 +29,10 @@ def tradeoff_step(name: str) -> Trials:
     """A step of tradeoff.csv as the study measured it, whose errors below ROUNDING_MAG are none."""
     with (HERE / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
         table = [row for row in csv.DictReader(file) if row["step"] == name]
-    error, second = (Figure(table[0][f"{key}_is"], table[0][f"{key}_unit"], ROUNDING_MAG) for key in ("error", "second"))
+    error, second = (
+        Figure(table[0][f"{key}_is"], table[0][f"{key}_unit"], ROUNDING_MAG)
+        for key in ("error", "second")
+    )
     trials = [
         Trial(
             row["method"],
@@ -69,34 +72,63 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
     paper: dict[str, list[float]] = {"1 s": [], "20 ms a core": []}
     for count in cores:
         for words, seconds in (("1 s", 1.0), ("20 ms a core", max(1.0, 0.02 * count))):
-            limits = count / case_s, seconds / case_s / 3.3e-3, 1 / (60e-6 + 1.8e-3 * case_s / seconds)
+            limits = (
+                count / case_s,
+                seconds / case_s / 3.3e-3,
+                1 / (60e-6 + 1.8e-3 * case_s / seconds),
+            )
             paper[words].append(min(limits))
     title = "Frames grow with stars up to the cap on pixels, reports with hours; one scheduler feeds 1000 cores by longer tasks"
     with chart(DOCS / "scale.svg", title, 3, 2, share_x=False) as panels:
         stars, pixels, memory, workers, packets, hours = panels
         stars.plot(*points("stars", "time"), "o-", color=RED)
         stars.axvline(250_000, color=BLUE, ls=":", label="only the brightest are drawn")
-        stars.set(title="a frame, 1920 x 1080", xlabel="stars in view", ylabel="processor time [ms]")
+        stars.set(
+            title="a frame, 1920 x 1080", xlabel="stars in view", ylabel="processor time [ms]"
+        )
         pixels.plot(*points("pixels", "time"), "o-", color=RED)
-        pixels.set(title="a frame of 1000 stars, VGA to 8K", xlabel="pixels", ylabel="processor time [ms]")
+        pixels.set(
+            title="a frame of 1000 stars, VGA to 8K", xlabel="pixels", ylabel="processor time [ms]"
+        )
         for axis, colour in (("stars", PURPLE), ("pixels", TEAL)):
             memory.plot(*points(axis, "memory_mb"), "o-", color=colour, label=f"against {axis}")
-        memory.set(title="peak of a process's memory", xlabel="stars, or pixels", ylabel="MB", xscale="log")
+        memory.set(
+            title="peak of a process's memory", xlabel="stars, or pixels", ylabel="MB", xscale="log"
+        )
         for (words, rate), colour in zip(paper.items(), (ORANGE, GREEN), strict=True):
             workers.plot(cores, rate, "-", color=colour, label=f"on paper, tasks of {words}")
         at, ms = points("workers", "time")
-        workers.plot(at, [n / case * 1e3 for n, case in zip(at, ms, strict=True)], "o", color=RED, label="measured")
+        workers.plot(
+            at,
+            [n / case * 1e3 for n, case in zip(at, ms, strict=True)],
+            "o",
+            color=RED,
+            label="measured",
+        )
         workers.set(title="a campaign's cases", xlabel="workers", ylabel="cases a second")
         packets.plot(*points("packets", "time"), "o-", color=RED)
-        packets.set(title="serve, 640 x 480 at 60 Hz", xlabel="packets a second", ylabel="of a core [%]", xscale="log")
+        packets.set(
+            title="serve, 640 x 480 at 60 Hz",
+            xlabel="packets a second",
+            ylabel="of a core [%]",
+            xscale="log",
+        )
         at, ms = points("hours", "time")
         hours.plot(at, [value / 1e3 for value in ms], "o-", color=RED, label="processor time [s]")
-        hours.plot(at, points("hours", "memory_mb")[1], "o-", color=PURPLE, label="peak of memory [MB]")
-        hours.set(title="report: 60 frames and packets a second", xlabel="hours of the run", ylabel="s, or MB")
+        hours.plot(
+            at, points("hours", "memory_mb")[1], "o-", color=PURPLE, label="peak of memory [MB]"
+        )
+        hours.set(
+            title="report: 60 frames and packets a second",
+            xlabel="hours of the run",
+            ylabel="s, or MB",
+        )
         for axes in (stars, pixels, workers, hours):
             axes.set(xscale="log", yscale="log")
         for axes in (stars, memory, workers, hours):
-            axes.legend(fontsize="small", loc="upper left" if axes in (stars, memory) else "lower right")
+            axes.legend(
+                fontsize="small", loc="upper left" if axes in (stars, memory) else "lower right"
+            )
         packets.set_ylim(bottom=0)
         memory.set_ylim(bottom=0)
 
@@ -124,9 +156,15 @@ def rows_of(name: str) -> list[dict[str, str]]:
 
 def read_records(path: Path, record: type[Any]) -> list[Any]:
     """The rows of a study's table as its dataclasses of texts, numbers and flags."""
-    convert = {name: "True".__eq__ if kind is bool else kind for name, kind in get_type_hints(record).items()}
+    convert = {
+        name: "True".__eq__ if kind is bool else kind
+        for name, kind in get_type_hints(record).items()
+    }
     with path.open(encoding="utf-8", newline="") as file:
-        return [record(**{name: convert[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
+        return [
+            record(**{name: convert[name](text) for name, text in row.items()})
+            for row in csv.DictReader(file)
+        ]
 
 
 if __name__ == "__main__":
@@ -134,6 +172,8 @@ if __name__ == "__main__":
     draw_tracker(rows_of("tracker.csv"))
     colour.draw(DOCS / "colour.svg", colour_rows(), IDLE)
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome), IDLE)
-    timing.draw_stripes(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint))
+    timing.draw_stripes(
+        DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint)
+    )
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

@@ -41,7 +41,11 @@ def rows_of(name: str) -> list[dict[str, str]]:
 def records_of(name: str, record: type[Any], **columns: str) -> list[Any]:
     """The rows of a CSV file whose columns have these values, as a study's dataclasses."""
     kinds = get_type_hints(record)
-    rows = [row for row in rows_of(name) if all(row[column] == value for column, value in columns.items())]
+    rows = [
+        row
+        for row in rows_of(name)
+        if all(row[column] == value for column, value in columns.items())
+    ]
     return [record(**{column: kind(row[column]) for column, kind in kinds.items()}) for row in rows]
 
 
@@ -56,12 +60,17 @@ def table(head: list[str], body: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def bench_table(name: str = "bench.csv", counts: tuple[int, ...] = COUNTS, others: tuple[str, ...] = OTHERS) -> str:
+def bench_table(
+    name: str = "bench.csv", counts: tuple[int, ...] = COUNTS, others: tuple[str, ...] = OTHERS
+) -> str:
     """Medians of the whole frame by image size, and of the linear image beside the others at
     1080p.
     """
     rows = rows_of(name)
-    at = {(r["width"], r["height"], int(r["stars"]), r["method"], r["kind"]): float(r["median_ms"]) for r in rows}
+    at = {
+        (r["width"], r["height"], int(r["stars"]), r["method"], r["kind"]): float(r["median_ms"])
+        for r in rows
+    }
     sizes = list(dict.fromkeys((r["width"], r["height"]) for r in rows))
 
     def line(name: str, size: tuple[str, str], method: str, kind: str) -> list[str]:
@@ -89,7 +98,10 @@ def kinds_table() -> str:
     for width, height in sizes:
         for few in (0, 1):
             for quantisation in ("round", "exact"):
-                found = [at[width, quantisation, kind, few] for kind in dict.fromkeys(r["kind"] for r in rows)]
+                found = [
+                    at[width, quantisation, kind, few]
+                    for kind in dict.fromkeys(r["kind"] for r in rows)
+                ]
                 head = [f"{width} x {height}", found[0]["stars"], f"`{quantisation}`"]
                 body.append(head + [figure(float(one["median_ms"])) for one in found])
     return table(["ms, median", "stars", "codes", *dict.fromkeys(r["kind"] for r in rows)], body)
@@ -104,9 +116,15 @@ def tradeoff_table() -> str:
     for step, rows in steps.items():
         default = next(row for row in rows if row["default"] == "True")
         exact = [row for row in rows if row["exact"] == "True" and row is not default]
-        error = "none" if float(default["error"]) == 0 else f"{figure(float(default['error']))} {default['error_unit']}"
+        error = (
+            "none"
+            if float(default["error"]) == 0
+            else f"{figure(float(default['error']))} {default['error_unit']}"
+        )
         beside = f"{exact[0]['method']}: {figure(float(exact[0]['time_ms']))} ms" if exact else "-"
-        body.append([step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside])
+        body.append(
+            [step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside]
+        )
     return table(["step", "default", "error", "time", "the exact way"], body)
 
 
@@ -116,7 +134,16 @@ ANSWERED_BITS = ("8", "10", "12")
 
 def answers_table() -> str:
     """What to set on each panel for each turn, and what to expect, by primaries and rates."""
-    head = ["bits", "turn", "packets", "set", "expect", "set, if primaries are known", "expect", "most of the error"]
+    head = [
+        "bits",
+        "turn",
+        "packets",
+        "set",
+        "expect",
+        "set, if primaries are known",
+        "expect",
+        "most of the error",
+    ]
     body: list[list[str]] = []
     for bits in ANSWERED_BITS:
         scenes = scenes_of(records_of("chain.csv", CombinationRow, bits=bits))
@@ -124,12 +151,16 @@ def answers_table() -> str:
         for scene in scenes:
             turn_deg_s = scene[0].rate_deg_s
             for rates in (True, False) if turn_deg_s else (True,):
-                plain, stealing = (answer(scene, budget, Given(primaries, rates)) for primaries in (False, True))
+                plain, stealing = (
+                    answer(scene, budget, Given(primaries, rates)) for primaries in (False, True)
+                )
                 turn = f"{turn_deg_s:g} deg/s" if turn_deg_s else "rest"
                 packets = PACKETS[rates] if turn_deg_s else "any"
                 step = STEP_WORDS.get(plain.largest.step, plain.largest.step)
                 part = f"{step}, {two_digits(plain.largest.error_arcsec)} arcsec"
-                body.append([bits, turn, packets, *answer_cells(plain), *answer_cells(stealing), part])
+                body.append(
+                    [bits, turn, packets, *answer_cells(plain), *answer_cells(stealing), part]
+                )
     return table(head, body)
 
 
@@ -141,7 +172,10 @@ def answer_cells(choice: Answer) -> tuple[str, str]:
     if choice.row.rate_deg_s:
         return keys, expected
     method = choice.row.quantisation + (", bit stealing" if stealing else "")
-    times = {(row["bits"], row["method"]): float(row["frame_ms"]) for row in rows_of("quantisation_time.csv")}
+    times = {
+        (row["bits"], row["method"]): float(row["frame_ms"])
+        for row in rows_of("quantisation_time.csv")
+    }
     return keys, f"{expected}; {times[str(choice.row.bits), method]:.1f} ms"
 
 
@@ -172,7 +206,17 @@ def economy_table() -> str:
         worst_px = max(float(value) for name, value in auto.items() if name.startswith("max_px_"))
         errors = f"{float(auto['flux_max_mag']):.3f} mag, {worst_px:.3f} px"
         claimed = f"{float(auto['claimed_mag']):.3f} mag, {float(auto['claimed_px']):.3f} px"
-        body.append([auto["bits"], auto["scene"], auto["stars"], f"{figure(full_ms)} ms", *needs, errors, claimed])
+        body.append(
+            [
+                auto["bits"],
+                auto["scene"],
+                auto["stars"],
+                f"{figure(full_ms)} ms",
+                *needs,
+                errors,
+                claimed,
+            ]
+        )
     heads = ["bits", "scene", "stars", "full effort", "0.05 mag, 0.1 px", "0.1 mag, 0.1 px"]
     return table([*heads, "worst star of the field", "claimed of any star"], body)
 
@@ -209,8 +253,14 @@ def quantisation_table() -> str:
         return float(at["8", method]["frame_ms"]) / float(at["8", "round"]["frame_ms"])
 
     methods = dict.fromkeys(row["method"] for row in rows)
-    ends = [f"{bits} bits, {float(at[bits, 'round']['mag_under_white']):g} mag under white" for bits in ("8", "10")]
-    body = [[method, *(errors(at[bits, method]) for bits in ("8", "10")), f"{times(method):.1f} times"] for method in methods]
+    ends = [
+        f"{bits} bits, {float(at[bits, 'round']['mag_under_white']):g} mag under white"
+        for bits in ("8", "10")
+    ]
+    body = [
+        [method, *(errors(at[bits, method]) for bits in ("8", "10")), f"{times(method):.1f} times"]
+        for method in methods
+    ]
     return table(["", *ends, "1000 stars, 1080p, 8 bits, to the time of `round`"], body)
 
 
@@ -220,7 +270,11 @@ def centroider_table() -> str:
     head, body = ["centroider"], [[name] for name in CENTROIDERS.values()]
     for bits in ("8", "10"):
         rounded, exact = at[bits, "round"], at[bits, "exact"]
-        head += [f"{bits} bits, {float(exact['mag_under_white']):g} mag: `round`", "`exact`", "of it"]
+        head += [
+            f"{bits} bits, {float(exact['mag_under_white']):g} mag: `round`",
+            "`exact`",
+            "of it",
+        ]
         for line, kind in zip(body, CENTROIDERS, strict=True):
             both = [float(row[f"axis_rms_px_{kind}"]) for row in (rounded, exact)]
             line += [f"{both[0]:.3f} px", f"{both[1]:.3f} px", f"{both[1] / both[0]:.2f}"]
@@ -247,15 +301,30 @@ def over_frames_table() -> str:
 
     panels = dict.fromkeys(row["panel"] for row in rows)
     head = ["", *(f"{count} frames" if count != "1" else "1 frame" for count in frames)]
-    return table(head, [[name(panel), *(cell(at[panel, count]) for count in frames)] for panel in panels])
+    return table(
+        head, [[name(panel), *(cell(at[panel, count]) for count in frames)] for panel in panels]
+    )
 
 
 def colour_table() -> str:
     """Each choice before each tracker, by the codes."""
-    head = ["tracker", "`colour`", "codes", "colour, mean", "flux, 95 %", "a channel, 95 %", "place, 95 %"]
+    head = [
+        "tracker",
+        "`colour`",
+        "codes",
+        "colour, mean",
+        "flux, 95 %",
+        "a channel, 95 %",
+        "place, 95 %",
+    ]
     body = []
     for row in rows_of("colour.csv"):
-        words = [row["tracker"], f"`{row['colour']}`", f"`{row['method']}`", f"{figure(float(row['subtypes']))} subtypes"]
+        words = [
+            row["tracker"],
+            f"`{row['colour']}`",
+            f"`{row['method']}`",
+            f"{figure(float(row['subtypes']))} subtypes",
+        ]
         channel = "-" if row["tracker"].startswith("mono") else f"{float(row['channel']):.2g} %"
         body.append([*words, f"{float(row['mag']):.2g} mag", channel, f"{float(row['px']):.2g} px"])
     return table(head, body)
@@ -263,18 +332,40 @@ def colour_table() -> str:
 
 def gamut_table() -> str:
     """How many stars have their colour on each panel before each sensor, and what is left."""
-    head = ["panel", "sensor", "condition number", "stars out of gamut", "colour off, mean", "`white`"]
+    head = [
+        "panel",
+        "sensor",
+        "condition number",
+        "stars out of gamut",
+        "colour off, mean",
+        "`white`",
+    ]
     body = []
     for row in rows_of("colour_gamut.csv"):
         out, off, white = (float(row[name]) for name in ("out_share", "subtypes", "subtypes_white"))
-        names = [row["panel"], row["sensor"], f"{float(row['condition']):.1f}" if "Bayer" in row["sensor"] else "-"]
-        body.append([*names, f"{100 * out:.2g} %", f"{off:.2g} subtypes" if off > 1e-4 else "none", f"{white:.0f}"])
+        names = [
+            row["panel"],
+            row["sensor"],
+            f"{float(row['condition']):.1f}" if "Bayer" in row["sensor"] else "-",
+        ]
+        body.append(
+            [
+                *names,
+                f"{100 * out:.2g} %",
+                f"{off:.2g} subtypes" if off > 1e-4 else "none",
+                f"{white:.0f}",
+            ]
+        )
     return table(head, body)
 
 
 def class_table() -> str:
     """What a mono sensor's mixtures on an sRGB LCD lack, by spectral class."""
-    at = {(row["sensor"], row["class"]): row for row in rows_of("colour_class.csv") if row["panel"] == "sRGB LCD"}
+    at = {
+        (row["sensor"], row["class"]): row
+        for row in rows_of("colour_class.csv")
+        if row["panel"] == "sRGB LCD"
+    }
     classes = list(dict.fromkeys(kind for _, kind in at))
 
     def cell(row: dict[str, str]) -> str:
@@ -282,7 +373,10 @@ def class_table() -> str:
         return f"{figure(off_nm)} nm, {subtypes:.2g}" if subtypes > 1e-3 else "none"
 
     sensors = dict.fromkeys(sensor for sensor, _ in at)
-    return table(["sensor", *classes], [[sensor, *(cell(at[sensor, kind]) for kind in classes)] for sensor in sensors])
+    return table(
+        ["sensor", *classes],
+        [[sensor, *(cell(at[sensor, kind]) for kind in classes)] for sensor in sensors],
+    )
 
 
 def red_table() -> str:
@@ -312,15 +406,24 @@ def lateral_table() -> str:
 
 def mosaic_table() -> str:
     """Places in a raw mosaic and in its superpixels."""
-    rows = {(row["sigma_px"], row["temperature_k"], row["image"]): row for row in rows_of("colour_mosaic.csv")}
+    rows = {
+        (row["sigma_px"], row["temperature_k"], row["image"]): row
+        for row in rows_of("colour_mosaic.csv")
+    }
     temperatures = list(dict.fromkeys(key[1] for key in rows))
 
     def cell(*key: str) -> str:
         return f"{float(rows[key]['rms_px']):.2g} ({float(rows[key]['max_px']):.2g})"
 
-    head = ["sigma", *(f"{float(k):.0f} K: {image}" for k in temperatures for image in ("mosaic", "superpixel"))]
+    head = [
+        "sigma",
+        *(f"{float(k):.0f} K: {image}" for k in temperatures for image in ("mosaic", "superpixel")),
+    ]
     body = [
-        [f"{px} px", *(cell(px, k, image) for k in temperatures for image in ("mosaic", "superpixel"))]
+        [
+            f"{px} px",
+            *(cell(px, k, image) for k in temperatures for image in ("mosaic", "superpixel")),
+        ]
         for px in dict.fromkeys(key[0] for key in rows)
     ]
     return table(head, body)
@@ -328,7 +431,15 @@ def mosaic_table() -> str:
 
 def confronted_table() -> str:
     """What is left of each photograph of the set, and why others were refused."""
-    head = ["camera, image", "stars to V = 6.5", "px rms", "mag rms", "background chi²", "unexplained", "held out"]
+    head = [
+        "camera, image",
+        "stars to V = 6.5",
+        "px rms",
+        "mag rms",
+        "background chi²",
+        "unexplained",
+        "held out",
+    ]
     body = []
     for row in rows_of("confronted.csv"):
         name = f"{row['camera']}, {row['image']}"
@@ -338,7 +449,16 @@ def confronted_table() -> str:
         figures = [f"{float(row[key]):.3f}" for key in ("rms_px", "rms_mag")]
         held = [float(row[f"held_out_{key}"]) for key in ("px", "mag")]
         out = "" if math.isnan(held[0]) else f"{held[0]:.3f} px, {held[1]:.3f} mag"
-        body.append([name, row["stars"], *figures, f"{float(row['background_chi2']):.2f}", row["unexplained"], out])
+        body.append(
+            [
+                name,
+                row["stars"],
+                *figures,
+                f"{float(row['background_chi2']):.2f}",
+                row["unexplained"],
+                out,
+            ]
+        )
     return table(head, body)
 
 
@@ -398,7 +518,12 @@ def with_tables(text: str) -> str:
     """`text` with each table between its marks `<!-- table: NAME -->` and `<!-- end -->`."""
     for name, make in TABLES.items():
         begin, end = f"<!-- table: {name} -->", "<!-- end -->"
-        text = re.sub(rf"{begin}\n.*?{end}", lambda _, n=make, b=begin, e=end: f"{b}\n{n()}\n{e}", text, flags=re.DOTALL)
+        text = re.sub(
+            rf"{begin}\n.*?{end}",
+            lambda _, n=make, b=begin, e=end: f"{b}\n{n()}\n{e}",
+            text,
+            flags=re.DOTALL,
+        )
     return text
 
 

@@ -72,7 +72,9 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     """With --durations, the seconds of each folder too: where a suite's time is."""
     if config.getoption("durations") is None:
         return
@@ -80,7 +82,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     for reports in terminalreporter.stats.values():
         for report in reports:
             if isinstance(report, pytest.TestReport):
-                seconds["/".join(report.nodeid.split("/")[1:3]).partition("::")[0]] += report.duration
+                seconds["/".join(report.nodeid.split("/")[1:3]).partition("::")[0]] += (
+                    report.duration
+                )
     terminalreporter.section("seconds by folder, summed over workers")
     for folder, duration in seconds.most_common(20):
         terminalreporter.write_line(f"{duration:8.1f} s  {folder}")

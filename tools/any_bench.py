@@ -54,19 +54,42 @@ MARKERS = {HEAVY: "s", WRONG: "X", TRACEBACK: "D"}
 
 def main() -> None:
     """Run the benches that are missing, and write the table and the chart of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--benches", type=int, required=True, metavar="N", help="how many benches there are in the end")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--benches",
+        type=int,
+        required=True,
+        metavar="N",
+        help="how many benches there are in the end",
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all benches")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--limit", type=float, default=LIMIT_S, metavar="SECONDS", help="a command is stopped after so long")
-    parser.add_argument("--keep", action="store_true", help="keep the sessions' images and the ledgers")
-    parser.add_argument("--note", default="", metavar="TEXT", help="a sentence under the chart, such as what was tried")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=LIMIT_S,
+        metavar="SECONDS",
+        help="a command is stopped after so long",
+    )
+    parser.add_argument(
+        "--keep", action="store_true", help="keep the sessions' images and the ledgers"
+    )
+    parser.add_argument(
+        "--note",
+        default="",
+        metavar="TEXT",
+        help="a sentence under the chart, such as what was tried",
+    )
     given = parser.parse_args()
     output = given.output
     output.mkdir(parents=True, exist_ok=True)
     check_head(output / HEAD, given.seed)
     rows: list[dict[str, Any]] = []
-    for number in sorted(range(given.benches), key=lambda number: pixels(drawn_bench(given.seed, number))):
+    for number in sorted(
+        range(given.benches), key=lambda number: pixels(drawn_bench(given.seed, number))
+    ):
         row = run_bench(given.seed, number, output / f"{number:04}", given.limit, keep=given.keep)
         rows.append(row)
         rows.sort(key=lambda one: int(one["bench"]))
@@ -106,10 +129,21 @@ def draw(path: Path, rows: list[dict[str, Any]], note: str = "") -> None:
         for outcome in OUTCOMES:
             those = [row for row in rows if row["outcome"] == outcome]
             if those:
-                shares, ratios = [100 * row["seen"] for row in those], [row["pixel_ratio"] for row in those]
+                shares, ratios = (
+                    [100 * row["seen"] for row in those],
+                    [row["pixel_ratio"] for row in those],
+                )
                 label = f"{outcome} ({len(those)})"
                 marker = MARKERS.get(outcome, "o")
-                axes.plot(shares, ratios, marker, color=COLOURS[outcome], label=label, linestyle="none", markersize=6)
+                axes.plot(
+                    shares,
+                    ratios,
+                    marker,
+                    color=COLOURS[outcome],
+                    label=label,
+                    linestyle="none",
+                    markersize=6,
+                )
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel("tracker's field, relative to the screen's [%]")

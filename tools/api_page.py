@@ -15,8 +15,15 @@ MARK = "<!-- what follows is generated: python tools/make_pages.py -->\n"
 LINE_CHARACTERS = 100
 # Each section's objects, and of a class the members that users call.
 SECTIONS: dict[str, dict[str, tuple[str, ...]]] = {
-    "Benches and frames": {"hilstar.load": (), "hilstar.Bench": ("frame", "losses_mag", "close"), "hilstar.Frame": ()},
-    "Comparison of two skies": {"hilstar.testing.assert_same_sky": (), "hilstar.testing.compare": ()},
+    "Benches and frames": {
+        "hilstar.load": (),
+        "hilstar.Bench": ("frame", "losses_mag", "close"),
+        "hilstar.Frame": (),
+    },
+    "Comparison of two skies": {
+        "hilstar.testing.assert_same_sky": (),
+        "hilstar.testing.compare": (),
+    },
     "Rotations": {
         f"hilstar.rotation.{name}": ()
         for name in (
@@ -33,7 +40,10 @@ SECTIONS: dict[str, dict[str, tuple[str, ...]]] = {
         "hilstar.Sender": ("endpoint", "status", "wait", "send", "close"),
         "hilstar.attitude.wire.packet.Status": (),
     },
-    "Packets": {"hilstar.attitude.wire.packet.AttitudeSample": (), "hilstar.attitude.wire.packet.encode": ()},
+    "Packets": {
+        "hilstar.attitude.wire.packet.AttitudeSample": (),
+        "hilstar.attitude.wire.packet.encode": (),
+    },
     "Errors": {"hilstar.HilstarError": (), "hilstar.InputError": (), "hilstar.MachineError": ()},
 }
 FROM_LOAD = {"hilstar.Bench"}  # made by a function: how it is put together is nobody's call
@@ -50,10 +60,14 @@ def _reference() -> Iterator[str]:
         yield f"## {title}\n"
         for name, members in names.items():
             found = pydoc.locate(name)
-            yield from _entry("###", name, found, "" if name in FROM_LOAD else signature(name, found))
+            yield from _entry(
+                "###", name, found, "" if name in FROM_LOAD else signature(name, found)
+            )
             for member in members:
                 part = inspect.getattr_static(found, member)
-                yield from _entry("####", f"{name.rpartition('.')[2]}.{member}", part, signature(member, part))
+                yield from _entry(
+                    "####", f"{name.rpartition('.')[2]}.{member}", part, signature(member, part)
+                )
 
 
 def _entry(level: str, name: str, found: Any, code: str) -> Iterator[str]:
@@ -76,7 +90,10 @@ def signature(name: str, found: Any) -> str:
     shown = inspect.signature(found)
     returns = "" if inspect.isclass(found) else f" -> {shown.return_annotation}"
     parameters = [_parameter(each) for each in shown.parameters.values() if each.name != "self"]
-    first = next((k for k, each in enumerate(shown.parameters.values()) if each.kind is each.KEYWORD_ONLY), None)
+    first = next(
+        (k for k, each in enumerate(shown.parameters.values()) if each.kind is each.KEYWORD_ONLY),
+        None,
+    )
     if first is not None:
         parameters.insert(first, "*")
     line = f"{short}({', '.join(parameters)}){returns}"
@@ -86,5 +103,9 @@ def signature(name: str, found: Any) -> str:
 
 
 def _parameter(each: inspect.Parameter) -> str:
-    default = "" if each.default is each.empty else f" = {getattr(each.default, '__name__', None) or repr(each.default)}"
+    default = (
+        ""
+        if each.default is each.empty
+        else f" = {getattr(each.default, '__name__', None) or repr(each.default)}"
+    )
     return f"{each.name}: {each.annotation}{default}"

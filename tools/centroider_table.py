@@ -25,7 +25,12 @@ from tests.support.glass import SIDE_PX, stack
 
 FIELDS = 16
 FAINTEST_V_MAG, WRONG_PX = 5.5, 1.0  # farther off, a window has gone to a neighbour
-TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
+TRACKER = {
+    "resolution_px": [SIDE_PX, SIDE_PX],
+    "focal_length_mm": 12,
+    "exposure_s": 0.2,
+    "transmission": None,
+}
 DETECTOR = {"gain_e_per_dn": 1.0, "full_well_e": 1e6, "bits": 16}
 PSF = {"centroider": "psf"}
 WAYS: dict[str, dict[str, Any]] = {
@@ -53,19 +58,36 @@ def main() -> int:
         (folder / "bench.toml").write_text(bench_text(tables))
         rng = np.random.default_rng(1)
         with Simulator(read_bench_file(folder / "bench.toml")) as tracker:
-            looks = zip(rng.uniform(0, 360, FIELDS), np.degrees(np.arcsin(rng.uniform(-1, 1, FIELDS))), strict=True)
-            views = [tracker.view(from_radec_roll_deg(ra, dec, 20.0 * k), np.zeros(3)) for k, (ra, dec) in enumerate(looks)]
+            looks = zip(
+                rng.uniform(0, 360, FIELDS),
+                np.degrees(np.arcsin(rng.uniform(-1, 1, FIELDS))),
+                strict=True,
+            )
+            views = [
+                tracker.view(from_radec_roll_deg(ra, dec, 20.0 * k), np.zeros(3))
+                for k, (ra, dec) in enumerate(looks)
+            ]
             shots = [tracker.expose(view, None) for view in views]
-            print("| fitted by | stars | in all | distortion | colour | rest |\n| --- | --- | --- | --- | --- | --- |")
+            print(
+                "| fitted by | stars | in all | distortion | colour | rest |\n| --- | --- | --- | --- | --- | --- |"
+            )
             for way, keys in WAYS.items():
                 solver = CentroidSolver(Centroiding(**keys), folder)
-                found = [seen.star_errors for seen in (solver.solve(shot, tracker) for shot in shots) if seen.star_errors]
+                found = [
+                    seen.star_errors
+                    for seen in (solver.solve(shot, tracker) for shot in shots)
+                    if seen.star_errors
+                ]
                 star = np.concatenate([one.star for one in found])
                 errors = np.concatenate([np.stack([one.dx_px, one.dy_px], axis=1) for one in found])
                 good = (star["v_mag"] < FAINTEST_V_MAG) & (np.hypot(*errors.T) < WRONG_PX)
                 places = np.stack([star["x_px"], star["y_px"]], axis=1)[good]
-                rms = split_errors(places, star["bv"][good], errors[good], (SIDE_PX, SIDE_PX)).rms_px()
-                cells = " | ".join(f"{rms[part]:.4f}" for part in ("total", "distortion", "colour", "psf"))
+                rms = split_errors(
+                    places, star["bv"][good], errors[good], (SIDE_PX, SIDE_PX)
+                ).rms_px()
+                cells = " | ".join(
+                    f"{rms[part]:.4f}" for part in ("total", "distortion", "colour", "psf")
+                )
                 print(f"| {way} | {good.sum()} | {cells} |", flush=True)
     return 0
 

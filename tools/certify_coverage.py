@@ -21,20 +21,40 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.support.planted_certify import EXACT_LENS, Counted, coverage, coverage_by_images, stated_lens
+from tests.support.planted_certify import (
+    EXACT_LENS,
+    Counted,
+    coverage,
+    coverage_by_images,
+    stated_lens,
+)
 from tests.support.planted_readings import KINDS
 
 IMAGES = "images"
 UNSTATED = "tracker's own lens, not stated"
 OWN_LENS = "tracker's own lens"
 SIGMAS = 3.0
-COLUMNS = ("kind", "quantity", "region", "benches", "not_assessed", "held_percent", "low_percent", "high_percent", "ratio")
+COLUMNS = (
+    "kind",
+    "quantity",
+    "region",
+    "benches",
+    "not_assessed",
+    "held_percent",
+    "low_percent",
+    "high_percent",
+    "ratio",
+)
 
 
 def interval(share: float, count: int) -> tuple[float, float]:
     """Three sigmas about a share of `count` trials (Wilson 1927)."""
     middle = (share + SIGMAS**2 / (2 * count)) / (1 + SIGMAS**2 / count)
-    half = SIGMAS * math.sqrt(share * (1 - share) / count + SIGMAS**2 / (4 * count**2)) / (1 + SIGMAS**2 / count)
+    half = (
+        SIGMAS
+        * math.sqrt(share * (1 - share) / count + SIGMAS**2 / (4 * count**2))
+        / (1 + SIGMAS**2 / count)
+    )
     return middle - half, middle + half
 
 
@@ -71,8 +91,17 @@ def main() -> None:
             found = coverage_by_images(asked.benches, asked.seed)
         else:
             tables = {UNSTATED: "", OWN_LENS: stated_lens()}.get(kind, EXACT_LENS)
-            found = coverage(KINDS[OWN_LENS if kind == UNSTATED else kind], asked.benches, asked.seed, keys, tables)
-        print(f"{kind}: {(time.process_time() - started) / asked.benches:.2f} s of CPU a bench", flush=True)
+            found = coverage(
+                KINDS[OWN_LENS if kind == UNSTATED else kind],
+                asked.benches,
+                asked.seed,
+                keys,
+                tables,
+            )
+        print(
+            f"{kind}: {(time.process_time() - started) / asked.benches:.2f} s of CPU a bench",
+            flush=True,
+        )
         new = rows_of(kind, asked.benches, found)
         for row in new:
             print(

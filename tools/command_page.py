@@ -70,7 +70,9 @@ class Parameter:
         """Its line of the list."""
         names = ", ".join(self.flags)
         head = f"- `{' '.join(word for word in (names, self.value) if word)}`"
-        notes = ["required"] if self.required else [f"default `{self.default}`"] if self.default else []
+        notes = (
+            ["required"] if self.required else [f"default `{self.default}`"] if self.default else []
+        )
         return f"{head}{''.join(f' ({note})' for note in notes)}: {self.meaning}"
 
 
@@ -79,11 +81,17 @@ def page() -> str:
     parts, panels = [HEAD], dict.fromkeys(panel for panel, _, _ in commands_of(application()))
     for title in panels:
         parts.append(f"## {title}\n")
-        parts += [section(name, command) for panel, name, command in commands_of(application()) if panel == title]
+        parts += [
+            section(name, command)
+            for panel, name, command in commands_of(application())
+            if panel == title
+        ]
     return "\n".join(parts)
 
 
-def commands_of(group: Typer, prefix: str = "", panel: str = "") -> Iterator[tuple[str, str, Callable[..., Any]]]:
+def commands_of(
+    group: Typer, prefix: str = "", panel: str = ""
+) -> Iterator[tuple[str, str, Callable[..., Any]]]:
     """Each command's panel, name ("calibrate plan") and function; a group's commands are in its
     own panel.
     """
@@ -94,7 +102,9 @@ def commands_of(group: Typer, prefix: str = "", panel: str = "") -> Iterator[tup
         yield panel or str(info.rich_help_panel), prefix + name, info.callback
     for inner in group.registered_groups:
         if inner.typer_instance is not None:
-            yield from commands_of(inner.typer_instance, f"{prefix}{inner.name} ", str(inner.rich_help_panel))
+            yield from commands_of(
+                inner.typer_instance, f"{prefix}{inner.name} ", str(inner.rich_help_panel)
+            )
 
 
 def section(name: str, command: Callable[..., Any]) -> str:
@@ -165,4 +175,8 @@ def default_text(default: Any) -> str:
     """A default that says something: no flag's False, no None, no empty text."""
     if default is inspect.Parameter.empty or default is None or default is False or default == "":
         return ""
-    return f"{default:g}" if isinstance(default, float) else str(default.value if isinstance(default, Enum) else default)
+    return (
+        f"{default:g}"
+        if isinstance(default, float)
+        else str(default.value if isinstance(default, Enum) else default)
+    )

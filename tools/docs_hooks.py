@@ -27,7 +27,9 @@ def on_files(files: Files, config: Any) -> Files:
     from mkdocs.structure.files import File  # which the tests of the rest do without
 
     for page, path in ADDED.items():
-        files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
+        files.append(
+            File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8"))
+        )
     return files
 
 
@@ -35,14 +37,18 @@ def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
     """A page's text with each link as the site has it: to a page, or as "words (`PATH`)" to any
     other file.
     """
-    source = "docs/x.md" if page is None else ADDED.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    source = (
+        "docs/x.md" if page is None else ADDED.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    )
 
     def linked(link: re.Match[str]) -> str:
         text, heading = link[1], link[3] or ""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[2]))
         if path.startswith("docs/"):
             return f"[{text}]({path.removeprefix('docs/')}{heading})"
-        site = next((name for name, file in ADDED.items() if path in {file, posixpath.dirname(file)}), None)
+        site = next(
+            (name for name, file in ADDED.items() if path in {file, posixpath.dirname(file)}), None
+        )
         if site is not None:
             return f"[{text}]({site}{heading})"
         return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"

@@ -33,10 +33,14 @@ class Drawing:
         """A line of text."""
         self.parts.append(f'<text x="{x:g}" y="{y:g}" class="{kind}">{escape(line)}</text>')
 
-    def box(self, at: tuple[float, float], size: tuple[float, float], lines: str, kind: str = "box") -> None:
+    def box(
+        self, at: tuple[float, float], size: tuple[float, float], lines: str, kind: str = "box"
+    ) -> None:
         """A box with a heading and notes below it, each a line, in its middle."""
         (x, y), (w, h) = at, size
-        self.parts.append(f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="8" class="{kind}"/>')
+        self.parts.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="8" class="{kind}"/>'
+        )
         texts = lines.split("\n")
         top = y + h / 2 - LINE_PX * (len(texts) - 1) / 2 + 4.5
         for k, line in enumerate(texts):
@@ -47,10 +51,19 @@ class Drawing:
         (a, b), (x, y) = points[-2:]
         length = ((x - a) ** 2 + (y - b) ** 2) ** 0.5
         u, v = (x - a) / length, (y - b) / length
-        path = " ".join(f"{'ML'[k > 0]}{p:g} {q:g}" for k, (p, q) in enumerate((*points[:-1], (x - 6 * u, y - 6 * v))))
-        corners = [(x, y), (x - 9 * u + 4 * v, y - 9 * v - 4 * u), (x - 9 * u - 4 * v, y - 9 * v + 4 * u)]
+        path = " ".join(
+            f"{'ML'[k > 0]}{p:g} {q:g}"
+            for k, (p, q) in enumerate((*points[:-1], (x - 6 * u, y - 6 * v)))
+        )
+        corners = [
+            (x, y),
+            (x - 9 * u + 4 * v, y - 9 * v - 4 * u),
+            (x - 9 * u - 4 * v, y - 9 * v + 4 * u),
+        ]
         self.parts.append(f'<path d="{path}" class="{kind}"/>')
-        self.parts.append(f'<polygon points="{" ".join(f"{p:.1f},{q:.1f}" for p, q in corners)}" class="{tip}"/>')
+        self.parts.append(
+            f'<polygon points="{" ".join(f"{p:.1f},{q:.1f}" for p, q in corners)}" class="{tip}"/>'
+        )
 
     def line(self, *points: tuple[float, float], kind: str = "line") -> None:
         """A line through the points."""
@@ -70,7 +83,9 @@ class Drawing:
         size = f'viewBox="0 0 {WIDTH} {self.height}" width="{WIDTH}" height="{self.height}"'
         head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">'
         body = "\n".join(self.parts)
-        return f"{head}\n<title>{escape(self.title)}</title>\n<style>{STYLE}</style>\n{body}\n</svg>\n"
+        return (
+            f"{head}\n<title>{escape(self.title)}</title>\n<style>{STYLE}</style>\n{body}\n</svg>\n"
+        )
 
 
 def chain() -> str:
@@ -94,7 +109,11 @@ def chain() -> str:
         x += w + 24
     d.box((308, 8), (124, 56), "Catalogue\nspectra, bodies")
     d.arrow((370, 64), (370, 96))
-    for x0, words in ((628, "Monitor\nphotons"), (456, "Collimating lens\na star at infinity"), (284, "Star tracker\nyours")):
+    for x0, words in (
+        (628, "Monitor\nphotons"),
+        (456, "Collimating lens\na star at infinity"),
+        (284, "Star tracker\nyours"),
+    ):
         d.box((x0, 222), (124, 60), words, "light")
     d.arrow((690, 170), (690, 222))
     d.arrow((628, 252), (580, 252), kind="ray", tip="raytip")
@@ -140,7 +159,10 @@ def bench() -> str:
 
 def packet_life() -> str:
     """attitude-in.md: what happens to a packet until it is light, and what each stage takes."""
-    d = Drawing("A packet's life: sent, arrived, checked, on the timeline, predicted, drawn, swapped, light", 250)
+    d = Drawing(
+        "A packet's life: sent, arrived, checked, on the timeline, predicted, drawn, swapped, light",
+        250,
+    )
     steps = (
         ("Sent", "t_ns: the\nsender’s clock"),
         ("Arrived", "stamped with\nthe host’s clock"),
@@ -177,16 +199,26 @@ def packet_life() -> str:
 
 def heads() -> str:
     """heads.md: several heads, one attitude."""
-    d = Drawing("One source of the body's attitude; a process, a monitor, a ledger and a page for each head", 250)
+    d = Drawing(
+        "One source of the body's attitude; a process, a monitor, a ledger and a page for each head",
+        250,
+    )
     d.box((8, 92), (136, 66), "Body’s attitude\none sender,\none clock")
-    d.box((172, 84), (152, 82), "hilstar serve\nheads.toml: one link,\ntime requests answered", "own")
+    d.box(
+        (172, 84), (152, 82), "hilstar serve\nheads.toml: one link,\ntime requests answered", "own"
+    )
     d.arrow((144, 125), (172, 125))
     for k, name in enumerate(("plus-x", "minus-y", "zenith")):
         y = 14 + 78 * k
         d.arrow((324, 125), (372, y + 31))
         d.box((372, y), (158, 62), f"{name}\nq_body_to_cam,\nits own moment of light", "own")
         d.arrow((530, y + 31), (566, y + 31), kind="ray", tip="raytip")
-        d.box((566, y), (186, 62), f"monitor, lens, tracker {k + 1}\nrun.{name}.mcap\nits own page", "light")
+        d.box(
+            (566, y),
+            (186, 62),
+            f"monitor, lens, tracker {k + 1}\nrun.{name}.mcap\nits own page",
+            "light",
+        )
     return d.svg()
 
 
@@ -217,7 +249,10 @@ def separated() -> str:
 
 def theory_bench() -> str:
     """theory-bench.md: the bench with its frames' axes and pixels."""
-    d = Drawing("The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky at infinity", 372)
+    d = Drawing(
+        "The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky at infinity",
+        372,
+    )
     d.text(20, 24, "monitor", "head")
     d.text(20, 24 + LINE_PX, "pixel (0, 0) is the centre of the top left one", "note")
     d.parts.append('<rect x="40" y="64" width="176" height="112" rx="2" class="box"/>')
@@ -275,7 +310,10 @@ def theory_bench() -> str:
 
 def theory_light() -> str:
     """theory-light.md: from a catalogue's magnitude to the light that the tracker receives."""
-    d = Drawing("The light chain: magnitude and colour, electron rate, sprite, linear image, level, code, light, tracker", 300)
+    d = Drawing(
+        "The light chain: magnitude and colour, electron rate, sprite, linear image, level, code, light, tracker",
+        300,
+    )
     rows = (
         (
             ("V, B-V, V-I", "Hipparcos, or\nyour table"),
@@ -309,14 +347,20 @@ def theory_light() -> str:
     d.arrow((690, 114), (690, 148), (70, 148), (70, 182))
     d.text(380, 141, "quantiser: round, dither, exact or temporal", "middle note")
     d.text(6, 24, "blue: computed by hilstar in electrons per second of the tracker", "note")
-    d.text(6, 288, "orange: hardware; the twin and the virtual tracker model it, the display adds none of it", "note")
+    d.text(
+        6,
+        288,
+        "orange: hardware; the twin and the virtual tracker model it, the display adds none of it",
+        "note",
+    )
     return d.svg()
 
 
 def theory_frame() -> str:
     """theory-frame.md: packets, clocks and frames on one axis of time."""
     d = Drawing(
-        "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over three refreshes", 392
+        "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over three refreshes",
+        392,
     )
     left, period = 128.0, 190.0
 
@@ -342,13 +386,20 @@ def theory_frame() -> str:
         d.line((x + 14 + 5 * (k % 3), 108), (x + 14 + 5 * (k % 3), 126))
     for k in range(2):
         begin, end = at(k + 0.62), at(k + 0.78)
-        d.parts.append(f'<rect x="{begin:g}" y="166" width="{end - begin:g}" height="28" class="own"/>')
+        d.parts.append(
+            f'<rect x="{begin:g}" y="166" width="{end - begin:g}" height="28" class="own"/>'
+        )
         d.text((begin + end) / 2, 184, "draw", "middle note")
         d.arrow((end, 180), (at(k + 1), 226))
         d.arrow((at(k + 1), 240), (at(k + 1) + 18, 268), kind="ray", tip="raytip")
         x0, top, bottom = at(k + 1) + 18, 272.0, 332.0
         slant, edge = 0.86 * period, 744.0
-        corners = [(x0, top), (x0 + period, top), (x0 + period + slant, bottom), (x0 + slant, bottom)]
+        corners = [
+            (x0, top),
+            (x0 + period, top),
+            (x0 + period + slant, bottom),
+            (x0 + slant, bottom),
+        ]
         if corners[2][0] > edge:
             cut = top + (edge - corners[1][0]) / slant * (bottom - top)
             corners[2:3] = [(edge, cut), (edge, bottom)]
@@ -357,7 +408,12 @@ def theory_frame() -> str:
         d.text(x0 + 92, 308, f"light of frame {k + 1}", "note")
     d.parts.append(f'<circle cx="{at(1) + 18 + 0.43 * period:g}" cy="302" r="4" class="raytip"/>')
     d.line((at(1) + 18 + 0.43 * period, 306), (at(1) + 18 + 0.43 * period, 352))
-    d.text(at(1) + 18 + 0.43 * period, 366, "the attitude is predicted to here: the middle row’s first light", "middle")
+    d.text(
+        at(1) + 18 + 0.43 * period,
+        366,
+        "the attitude is predicted to here: the middle row’s first light",
+        "middle",
+    )
     d.text(at(1) + 18 + 0.43 * period, 382, "swap + panel_delay_ms + scanout_ms / 2", "middle note")
     d.text(at(0.62), 212, "latest packets in", "middle note")
     return d.svg()

@@ -23,7 +23,14 @@ from pathlib import Path
 import numpy as np
 
 DATA = Path(__file__).resolve().parents[1] / "hilstar" / "sky" / "data"
-NAMES = {"ctio": "ctio", "kpno": "kpno", "la-palma": "lapalma", "lick": "mtham", "mauna-kea": "mko", "paranal": "paranal"}
+NAMES = {
+    "ctio": "ctio",
+    "kpno": "kpno",
+    "la-palma": "lapalma",
+    "lick": "mtham",
+    "mauna-kea": "mko",
+    "paranal": "paranal",
+}
 GRID_NM = np.arange(300, 1101, 10)
 
 
@@ -31,15 +38,23 @@ def main(folder: Path, sky: Path) -> None:
     """Write both tables."""
     columns = []
     for name in NAMES.values():
-        angstrom, mag = np.loadtxt(folder / f"{name}extinct.dat", comments="#", unpack=True, usecols=(0, 1))
+        angstrom, mag = np.loadtxt(
+            folder / f"{name}extinct.dat", comments="#", unpack=True, usecols=(0, 1)
+        )
         columns.append(np.interp(GRID_NM, angstrom / 10, mag))
     head = "# Extinction, mag an air mass: astropy/specreduce-data@dcba1c6, BSD-3-Clause; made by tools/make_air.py\n"
     table = np.column_stack(columns)
-    rows = "".join(f"{nm},{','.join(f'{mag:.4g}' for mag in row)}\n" for nm, row in zip(GRID_NM, table, strict=True))
+    rows = "".join(
+        f"{nm},{','.join(f'{mag:.4g}' for mag in row)}\n"
+        for nm, row in zip(GRID_NM, table, strict=True)
+    )
     (DATA / "extinction.csv").write_text(f"{head}wavelength_nm,{','.join(NAMES)}\n{rows}")
     nm, flux = np.loadtxt(sky, comments=("#", "w"), delimiter=",", unpack=True)
     head = "# Night sky, relative F_lambda: Hanuschik 2003, desihub/specter@b8490d3, BSD-3-Clause; made by tools/make_air.py\n"
-    rows = "".join(f"{at:g},{value:.3g}\n" for at, value in zip(nm, np.maximum(flux, 0) / flux.max(), strict=True))
+    rows = "".join(
+        f"{at:g},{value:.3g}\n"
+        for at, value in zip(nm, np.maximum(flux, 0) / flux.max(), strict=True)
+    )
     (DATA / "night_sky.csv").write_text(f"{head}wavelength_nm,value\n{rows}")
 
 

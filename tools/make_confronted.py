@@ -34,11 +34,19 @@ def main() -> None:
 
     with TemporaryDirectory() as name:
         folder = Path(name)
-        words = ["confront", str(FRAMES[0].parent / "guess.toml"), *map(str, FRAMES), "-o", str(folder / "out")]
+        words = [
+            "confront",
+            str(FRAMES[0].parent / "guess.toml"),
+            *map(str, FRAMES),
+            "-o",
+            str(folder / "out"),
+        ]
         if code := run_command(words):
             sys.exit(code)
         page = (folder / "out/index.html").read_text(encoding="utf-8")
-    for alt, data in re.findall(r'<img alt="([^"]*)" src="data:image/svg\+xml;base64,([^"]*)"', page):
+    for alt, data in re.findall(
+        r'<img alt="([^"]*)" src="data:image/svg\+xml;base64,([^"]*)"', page
+    ):
         for begin, file in CHARTS.items():
             if alt.startswith(begin):
                 (ROOT / "docs" / file).write_bytes(base64.b64decode(data))

@@ -20,9 +20,13 @@ def main() -> None:
     """Write the file."""
     lines = (DATA / "constellation_names.dat").read_text(encoding="utf-8").splitlines()
     names = {line[:3]: line[4:].strip() for line in lines if line and not line.startswith("#")}
-    rows = [line.split() for line in (DATA / "constellation_data_roman87.dat").read_text().splitlines()]
+    rows = [
+        line.split() for line in (DATA / "constellation_data_roman87.dat").read_text().splitlines()
+    ]
     with TARGET.open("w", encoding="utf-8", newline="") as file:
-        file.write("# Zones of the constellations, equinox B1875: hours of right ascension, lowest declination in degrees\n")
+        file.write(
+            "# Zones of the constellations, equinox B1875: hours of right ascension, lowest declination in degrees\n"
+        )
         file.write(
             "# Roman 1987 (PASP 99, 695; CDS VI/42), from the data files of Astropy (BSD-3); made by make_constellations.py\n"
         )

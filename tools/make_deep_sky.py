@@ -27,7 +27,11 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 SERSIC_4 = 7.669  # b of index 4: half of the light is within the effective radius
-GALAXIES, DISCS, NEBULAE = ("G", "GPair", "GTrpl"), ("GCl",), ("HII", "Neb", "RfN", "PN", "SNR", "EmN")
+GALAXIES, DISCS, NEBULAE = (
+    ("G", "GPair", "GTrpl"),
+    ("GCl",),
+    ("HII", "Neb", "RfN", "PN", "SNR", "EmN"),
+)
 # the middle of a profile is the mean of FINER by FINER places
 MAX_SIDE_PX, MIN_SIDE_PX, FINER = 65, 33, 5
 PX_DEG = 10 / 3600  # finer than a tracker's
@@ -54,19 +58,32 @@ def image_of(row: dict[str, str], v_mag: float) -> Any:
     at = (np.arange(side * FINER) - (side * FINER - 1) / 2) / FINER * px_deg
     north, west = np.meshgrid(at, at, indexing="ij")
     angle = math.radians(float(row["PosAng"] or 0.0))  # from north to east
-    along, across = north * math.cos(angle) - west * math.sin(angle), north * math.sin(angle) + west * math.cos(angle)
-    light = profile(row, np.hypot(along / major, across / minor)).reshape(side, FINER, side, FINER).mean(axis=(1, 3))
+    along, across = (
+        north * math.cos(angle) - west * math.sin(angle),
+        north * math.sin(angle) + west * math.cos(angle),
+    )
+    light = (
+        profile(row, np.hypot(along / major, across / minor))
+        .reshape(side, FINER, side, FINER)
+        .mean(axis=(1, 3))
+    )
     square_arcsec = (px_deg * 3600) ** 2
     with np.errstate(divide="ignore"):
         mag_arcsec2 = v_mag - 2.5 * np.log10(light / light.sum() / square_arcsec)
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crpix = ("RA---TAN", "DEC--TAN"), [-px_deg, px_deg], [(side + 1) / 2] * 2
+    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crpix = (
+        ("RA---TAN", "DEC--TAN"),
+        [-px_deg, px_deg],
+        [(side + 1) / 2] * 2,
+    )
     (hours, *ra), (degrees, *dec) = row["RA"].split(":"), row["Dec"].split(":")
     sign = -1 if degrees.startswith("-") else 1
     wcs.wcs.crval = [15 * _sexagesimal(hours, *ra), sign * _sexagesimal(degrees.lstrip("+-"), *dec)]
     header = wcs.to_header()
     header["BUNIT"] = "mag/arcsec2"
-    return fits.ImageHDU(np.where(light > 0, mag_arcsec2, np.nan).astype(np.float32), header, name=row["Name"])
+    return fits.ImageHDU(
+        np.where(light > 0, mag_arcsec2, np.nan).astype(np.float32), header, name=row["Name"]
+    )
 
 
 def _sexagesimal(whole: str, minutes: str, seconds: str) -> float:
@@ -76,7 +93,9 @@ def _sexagesimal(whole: str, minutes: str, seconds: str) -> float:
 def main(catalogues: list[Path], target: Path, faintest_v_mag: float) -> None:
     """Write the map of every object that has a size and a magnitude."""
     primary = fits.PrimaryHDU()
-    primary.header["COMMENT"] = "From OpenNGC (github.com/mattiaverga/OpenNGC), CC-BY-SA 4.0; so is this file"
+    primary.header["COMMENT"] = (
+        "From OpenNGC (github.com/mattiaverga/OpenNGC), CC-BY-SA 4.0; so is this file"
+    )
     images = [primary]
     for path in catalogues:
         with path.open(newline="", encoding="utf-8") as lines:
@@ -87,11 +106,15 @@ def main(catalogues: list[Path], target: Path, faintest_v_mag: float) -> None:
                 if float(mag) <= faintest_v_mag:
                     images.append(image_of(row, float(mag)))
     fits.HDUList(images).writeto(target, overwrite=True)
-    print(f"{target}: {len(images) - 1} objects to V = {faintest_v_mag:g}, {target.stat().st_size} bytes")
+    print(
+        f"{target}: {len(images) - 1} objects to V = {faintest_v_mag:g}, {target.stat().st_size} bytes"
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("catalogues", type=Path, nargs="+")
     parser.add_argument("-o", type=Path, required=True, dest="target")
     parser.add_argument("--to", type=float, default=9.0, dest="faintest_v_mag")

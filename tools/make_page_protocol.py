@@ -11,7 +11,9 @@ import msgspec
 
 from hilstar.server.console import protocol
 
-OUTPUT = Path(__file__).resolve().parents[1] / "hilstar" / "server" / "console" / "page" / "protocol.js"
+OUTPUT = (
+    Path(__file__).resolve().parents[1] / "hilstar" / "server" / "console" / "page" / "protocol.js"
+)
 HEAD = "// What the page and its server share. Made from console/protocol.py by tools/make_page_protocol.py: edit it there.\n"
 
 
@@ -25,9 +27,18 @@ def page_protocol() -> str:
         "KEPT_EVENTS": protocol.KEPT_EVENTS,
         "SWITCHES": [*protocol.SWITCHES, "ledger"],
         "MESSAGE_KEYS": [field.name for field in msgspec.structs.fields(protocol.PageText)],
-        "STAR": {field.name: place for place, field in enumerate(msgspec.structs.fields(protocol.StarMark))},
+        "STAR": {
+            field.name: place
+            for place, field in enumerate(msgspec.structs.fields(protocol.StarMark))
+        },
     }
-    return HEAD + "\n" + "".join(f"export const {name} = {json.dumps(value)};\n" for name, value in constants.items())
+    return (
+        HEAD
+        + "\n"
+        + "".join(
+            f"export const {name} = {json.dumps(value)};\n" for name, value in constants.items()
+        )
+    )
 
 
 if __name__ == "__main__":

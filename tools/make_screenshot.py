@@ -38,7 +38,9 @@ SIRIUS = "101.287,-16.716,25"
 
 def keep(data: bytes, name: str) -> None:
     """A PNG as a small one of the documentation."""
-    Image.open(io.BytesIO(data)).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(DOCS / name, optimize=True)
+    Image.open(io.BytesIO(data)).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
+        DOCS / name, optimize=True
+    )
 
 
 def keep_both(page: Browser, selector: str, name: str) -> None:
@@ -47,22 +49,61 @@ def keep_both(page: Browser, selector: str, name: str) -> None:
         page.prefer(color_scheme=theme)
         page.until(f"document.documentElement.dataset.theme === '{theme}'")
         time.sleep(1.0)  # for pictures and charts to be drawn again
-        keep(page.find(selector).screenshot_as_png if selector else page.get_screenshot_as_png(), f"{name}{ending}.png")
+        keep(
+            page.find(selector).screenshot_as_png if selector else page.get_screenshot_as_png(),
+            f"{name}{ending}.png",
+        )
 
 
 def watch(page: Browser, folder: Path) -> None:
     """A run about Sirius, which clips."""
     port = free_port()
-    text = (DOCS.parent / "configs" / "demo.toml").read_text().replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}")
-    (folder / "bench.toml").write_text(text.replace('quantisation = "exact"', 'quantisation = "round"'))
-    serve = ["serve", "bench.toml", "--headless", "--console", "127.0.0.1:0", "--control", "--ledger", "run.mcap"]
-    send = ["send", "--spin", "0,0,1,0.3", "--radec", SIRIUS, "--to", f"tcp://127.0.0.1:{port}", "--connect"]
+    text = (
+        (DOCS.parent / "configs" / "demo.toml")
+        .read_text()
+        .replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}")
+    )
+    (folder / "bench.toml").write_text(
+        text.replace('quantisation = "exact"', 'quantisation = "round"')
+    )
+    serve = [
+        "serve",
+        "bench.toml",
+        "--headless",
+        "--console",
+        "127.0.0.1:0",
+        "--control",
+        "--ledger",
+        "run.mcap",
+    ]
+    send = [
+        "send",
+        "--spin",
+        "0,0,1,0.3",
+        "--radec",
+        SIRIUS,
+        "--to",
+        f"tcp://127.0.0.1:{port}",
+        "--connect",
+    ]
     with (
-        subprocess.Popen([*HILSTAR, *serve], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run,
+        subprocess.Popen(
+            [*HILSTAR, *serve],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as run,
         subprocess.Popen([*HILSTAR, *send, "--rate", "100"], stdout=subprocess.DEVNULL) as sender,
     ):
         assert run.stderr is not None
-        page.get(next(found[1] for line in run.stderr if (found := re.search(r"page is at (http://\S+)", line))))
+        page.get(
+            next(
+                found[1]
+                for line in run.stderr
+                if (found := re.search(r"page is at (http://\S+)", line))
+            )
+        )
         page.until("document.getElementById('picture').dataset.frame")
         time.sleep(60.0)  # the charts' minute
         with contextlib.suppress(TimeoutException):
@@ -84,9 +125,20 @@ def watch(page: Browser, folder: Path) -> None:
 def first_light(page: Browser, folder: Path) -> None:
     """The page of a session before a monitor that warms up."""
     for name in ("demo.toml", "truth-example.toml"):
-        text = (DOCS.parent / "configs" / name).read_text().replace("[monitor]", "[monitor]\nphotodiode_px = 40", 1)
+        text = (
+            (DOCS.parent / "configs" / name)
+            .read_text()
+            .replace("[monitor]", "[monitor]\nphotodiode_px = 40", 1)
+        )
         (folder / name).write_text(text + ("" if name == "demo.toml" else WARM_UP))
-    words = ["first-light", "demo.toml", "-o", "session", "--virtual", str(folder / "truth-example.toml")]
+    words = [
+        "first-light",
+        "demo.toml",
+        "-o",
+        "session",
+        "--virtual",
+        str(folder / "truth-example.toml"),
+    ]
     subprocess.run([*HILSTAR, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
     take_session(page, folder / "session" / "first-light.html")
 
@@ -97,7 +149,9 @@ def take_session(page: Browser, path: Path) -> None:
     for theme, ending in (("light", "-light"), ("dark", "")):
         page.prefer(color_scheme=theme)
         page.get(path.as_uri())
-        page.run("for (const name of ['machine', 'display', 'orientation']) document.getElementById(name).remove()")
+        page.run(
+            "for (const name of ['machine', 'display', 'orientation']) document.getElementById(name).remove()"
+        )
         keep(page.get_screenshot_as_png(), f"first-light{ending}.png")
 
 
@@ -107,7 +161,12 @@ def main() -> None:
         page.size(*SIZE_PX)
         page.prefer(color_scheme="dark")
         watch(page, Path(scratch))
-        subprocess.run([*HILSTAR, "report", "run.mcap", "-o", "report"], cwd=scratch, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [*HILSTAR, "report", "run.mcap", "-o", "report"],
+            cwd=scratch,
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
         page.size(1366, 1700)
         page.get((Path(scratch) / "report" / "report.html").as_uri())
         page.until("document.body.dataset.ready === 'true'")

@@ -24,8 +24,13 @@ from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETE
 OUTPUT = ROOT / "hilstar" / "study" / "stability"
 
 if __name__ == "__main__":
-    for name, cases in (("catalogue_and_geometry", CATALOGUE_AND_GEOMETRY), ("detector_and_attitude", DETECTOR_AND_ATTITUDE)):
+    for name, cases in (
+        ("catalogue_and_geometry", CATALOGUE_AND_GEOMETRY),
+        ("detector_and_attitude", DETECTOR_AND_ATTITUDE),
+    ):
         write_csv(OUTPUT / f"{name}.csv", COLUMNS, [measure().row() for measure in cases])
     for name, curve in CURVES.items():
         columns = curve()
-        write_csv(OUTPUT / f"{name}.csv", tuple(columns), np.column_stack(list(columns.values())).tolist())
+        write_csv(
+            OUTPUT / f"{name}.csv", tuple(columns), np.column_stack(list(columns.values())).tolist()
+        )

@@ -41,7 +41,9 @@ def main(source: Path, target: Path = STAR_NAMES) -> None:
     digest = hashlib.sha256(data).hexdigest()
     if digest != SOURCE_SHA256:
         raise InputError(f"{source}: sha256 of {MEMBER} is {digest}, wanted {SOURCE_SHA256}")
-    rows = parquet.read_table(io.BytesIO(data), columns=["hip", "name", "bayer", "flamsteed"]).to_pylist()
+    rows = parquet.read_table(
+        io.BytesIO(data), columns=["hip", "name", "bayer", "flamsteed"]
+    ).to_pylist()
     catalog = load_catalog()
     at = {int(hip): k for k, hip in enumerate(catalog.hip)}
     rows = sorted((row for row in rows if row["hip"] in at), key=lambda row: row["hip"])
@@ -52,7 +54,9 @@ def main(source: Path, target: Path = STAR_NAMES) -> None:
     table.writerow(("hip", "designation", "name"))
     for row, constellation in zip(rows, get_constellation(places, short_name=True), strict=True):
         letter = row["bayer"] or row["flamsteed"]
-        table.writerow((row["hip"], f"{letter} {constellation}" if letter else "", row["name"] or ""))
+        table.writerow(
+            (row["hip"], f"{letter} {constellation}" if letter else "", row["name"] or "")
+        )
     target.write_text(HEAD + text.getvalue(), encoding="utf-8")
     print(f"{target}: {len(rows)} stars, {target.stat().st_size} bytes")
 

@@ -39,11 +39,18 @@ def table_17(text: str) -> str:
 def table_19(code: str) -> str:
     """Spectrum at 90 degrees from the Sun, in the ecliptic."""
     um, radiance = (
-        [float(value) for value in re.findall(r"[\d.e-]+", re.split(rf"self\.{name} = np\.array\(", code)[1].split("]")[0])]
+        [
+            float(value)
+            for value in re.findall(
+                r"[\d.e-]+", re.split(rf"self\.{name} = np\.array\(", code)[1].split("]")[0]
+            )
+        ]
         for name in ("zodi_lam", "zodi_Blam")
     )
     body = "".join(
-        f"{round(at * 1e3, 6):g},{value:g}\n" for at, value in zip(um, radiance, strict=True) if at < MAX_SCATTERED_UM
+        f"{round(at * 1e3, 6):g},{value:g}\n"
+        for at, value in zip(um, radiance, strict=True)
+        if at < MAX_SCATTERED_UM
     )
     head = "# Zodiacal light at 90 deg from the Sun in the ecliptic, W m-2 sr-1 um-1"
     return f"{head}: table 19, {SOURCE}\nwavelength_nm,value\n{body}"

@@ -18,7 +18,13 @@ from msgspec import structs
 from hilstar.basics.charts import write_csv, write_records
 from hilstar.basics.resources import resource_path
 from hilstar.instruments.study.chain.choices import Parts, five_scenes
-from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, Rounds, SceneMeasurement, error_budget
+from hilstar.instruments.study.chain.measuring import (
+    CombinationRow,
+    ErrorPart,
+    Rounds,
+    SceneMeasurement,
+    error_budget,
+)
 from hilstar.instruments.study.chain.tracker import StudyTracker
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 
@@ -52,7 +58,9 @@ def main() -> None:
             rows += errors
             budget += [(bits, *astuple(part)) for part in parts]
     write_records(RESULTS / "chain.csv", rows)
-    write_csv(RESULTS / "chain_budget.csv", ("bits", *(field.name for field in fields(ErrorPart))), budget)
+    write_csv(
+        RESULTS / "chain_budget.csv", ("bits", *(field.name for field in fields(ErrorPart))), budget
+    )
 
 
 if __name__ == "__main__":

@@ -158,9 +158,14 @@ def pointing_at(ra_deg: float, dec_deg: float) -> Any:
     boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     matrix = np.array([west, south, boresight])
     symmetric = np.block(
-        [[np.trace(matrix), np.zeros((1, 3))], [np.zeros((3, 1)), matrix + matrix.T - np.trace(matrix) * np.eye(3)]]
+        [
+            [np.trace(matrix), np.zeros((1, 3))],
+            [np.zeros((3, 1)), matrix + matrix.T - np.trace(matrix) * np.eye(3)],
+        ]
     )
-    odd = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    odd = np.array(
+        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    )
     symmetric[0, 1:] = symmetric[1:, 0] = odd
     return np.linalg.eigh(symmetric)[1][:, -1]
 
@@ -175,7 +180,9 @@ def write_log(path: Path, name: str) -> None:
     lines = ["t_s,qw,qx,qy,qz,rx,ry,rz"]
     for k in range(FRAMES + 1):
         angle = np.linalg.norm(omega) * k * STEP_S
-        turn = np.concatenate([[np.cos(angle / 2)], -np.sin(angle / 2) * omega / np.linalg.norm(omega)])
+        turn = np.concatenate(
+            [[np.cos(angle / 2)], -np.sin(angle / 2) * omega / np.linalg.norm(omega)]
+        )
         start = pointing_at(*targets[min(k * len(targets) // FRAMES, len(targets) - 1)])
         if name not in TARGETS_DEG and k >= FRAMES // 2:
             start = rng.normal(size=4)
@@ -188,7 +195,9 @@ def hashed(path: Path) -> str:
     """A hash of what a file holds: pixels of a picture, data of a FITS image, a table's text."""
     if path.suffix == ".png":
         width, height, rows, info = png.Reader(filename=str(path)).read()
-        data = repr((width, height, info["planes"])).encode() + b"".join(bytes(np.asarray(row)) for row in rows)
+        data = repr((width, height, info["planes"])).encode() + b"".join(
+            bytes(np.asarray(row)) for row in rows
+        )
     elif path.suffix == ".fits":
         data = path.read_bytes()[2880 * (path.read_bytes().index(b"END" + b" " * 77) // 2880 + 1) :]
     else:
@@ -209,22 +218,67 @@ def drawn_by(program: str, name: str, folder: Path) -> dict[str, str]:
         (folder / file).write_text(text)
     write_log(folder / "log.csv", name)
     faults = ["--scenario", "faults.toml"] if name == "faults" else []
-    replay = ["replay", "bench.toml", "log.csv", "--headless", "--speed", "max", "--step", str(STEP_S), "-o", "frames", *faults]
+    replay = [
+        "replay",
+        "bench.toml",
+        "log.csv",
+        "--headless",
+        "--speed",
+        "max",
+        "--step",
+        str(STEP_S),
+        "-o",
+        "frames",
+        *faults,
+    ]
     commands = [replay]
     first = ",".join((folder / "log.csv").read_text().splitlines()[1].split(",")[1:5])
-    commands.append(["frame", "bench.toml", "--quaternion", first, "-o", "linear.fits", "--truth", "truth.csv", *faults])
-    commands.append(["simulate", "bench.toml", "--quaternion", first, "--rate", "0.1,0.2,0.3", "-o", "dn.fits", *faults])
+    commands.append(
+        [
+            "frame",
+            "bench.toml",
+            "--quaternion",
+            first,
+            "-o",
+            "linear.fits",
+            "--truth",
+            "truth.csv",
+            *faults,
+        ]
+    )
+    commands.append(
+        [
+            "simulate",
+            "bench.toml",
+            "--quaternion",
+            first,
+            "--rate",
+            "0.1,0.2,0.3",
+            "-o",
+            "dn.fits",
+            *faults,
+        ]
+    )
     for words in commands:
-        done = subprocess.run([program, *words], cwd=folder, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [program, *words], cwd=folder, capture_output=True, text=True, check=False
+        )
         if done.returncode:
-            sys.exit(f"{program} {' '.join(words)} ({name}): exit {done.returncode}: {done.stderr.strip()}")
-    files = [*sorted((folder / "frames").glob("*.png")), *(folder / file for file in ("linear.fits", "truth.csv", "dn.fits"))]
+            sys.exit(
+                f"{program} {' '.join(words)} ({name}): exit {done.returncode}: {done.stderr.strip()}"
+            )
+    files = [
+        *sorted((folder / "frames").glob("*.png")),
+        *(folder / file for file in ("linear.fits", "truth.csv", "dn.fits")),
+    ]
     return {file.name: hashed(file) for file in files}
 
 
 def main() -> None:
     """Compare two installations bench by bench."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("before")
     parser.add_argument("after")
     given = parser.parse_args()
@@ -235,9 +289,13 @@ def main() -> None:
                 drawn_by(str(Path(program).absolute()), name, Path(scratch, side, name))
                 for side, program in (("before", given.before), ("after", given.after))
             )
-            others = sorted(file for file in before.keys() | after.keys() if before.get(file) != after.get(file))
+            others = sorted(
+                file for file in before.keys() | after.keys() if before.get(file) != after.get(file)
+            )
             different += len(others)
-            print(f"{name}: {len(before)} files, {f'{len(others)} differ: ' + ', '.join(others) if others else 'the same'}")
+            print(
+                f"{name}: {len(before)} files, {f'{len(others)} differ: ' + ', '.join(others) if others else 'the same'}"
+            )
     sys.exit(1 if different else 0)
 
 

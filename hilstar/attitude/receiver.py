@@ -11,7 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
+from hilstar.attitude.clock.jumps import (
+    MIN_LIMIT_NS,
+    WAITED_UNKNOWN_NS,
+    JumpFilter,
+    KnownClockFilter,
+)
 from hilstar.attitude.clock.losses import LossCount, TimeUnit
 from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
@@ -69,7 +74,9 @@ class BackChannel:
     The receiver's thread calls it, but for `post` and `pass_on`.
     """
 
-    def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns) -> None:
+    def __init__(
+        self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns
+    ) -> None:
         self._link, self._now_ns = link, now_ns
         self._send: Callable[[wire.Packet], None] = link.send
         self._traffic = traffic
@@ -102,7 +109,11 @@ class BackChannel:
         if ask and self._traffic.time_requests and now_ns >= self._next_ask_ns:
             self._asks += 1
             request = wire.TimeRequest(self._asks, self._now_ns())
-            self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
+            self._asked = {
+                sequence: asked
+                for sequence, asked in self._asked.items()
+                if self._asks - sequence < FIRST_ASKS
+            }
             self._asked[self._asks] = request
             self._quick_asks -= 1
             self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
@@ -140,7 +151,14 @@ class BackChannel:
         if request is None or request.t1_ns != reply.t1_ns:
             return None
         there_ns, back_ns = self._link.wire_ns(request), self._link.wire_ns(reply)
-        return Exchange(request.t1_ns, reply.t2_ns + correction_ns, reply.t3_ns + correction_ns, t4_ns, there_ns, back_ns)
+        return Exchange(
+            request.t1_ns,
+            reply.t2_ns + correction_ns,
+            reply.t3_ns + correction_ns,
+            t4_ns,
+            there_ns,
+            back_ns,
+        )
 
 
 @dataclass(slots=True)
@@ -154,7 +172,9 @@ class PacketCounts:
 
     received: int = 0
     lost: int = 0
-    refused_by: dict[wire.Reason, int] = field(default_factory=lambda: dict.fromkeys(wire.REASONS, 0))
+    refused_by: dict[wire.Reason, int] = field(
+        default_factory=lambda: dict.fromkeys(wire.REASONS, 0)
+    )
     shown: dict[wire.Reason, str] = field(default_factory=dict)
 
     def refuse(self, refusal: wire.Refusal) -> bool:
@@ -252,7 +272,9 @@ class Receiver:
             self._retry_ns = now_ns + self._back_off_ns
             self._back_off_ns = min(2 * self._back_off_ns, MAX_BACK_OFF_NS)
             why = self._failure or "no reason given"
-            self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")
+            self._notices.tell(
+                "receiver-failed", f"the attitude receiver stopped ({why}); restarting it"
+            )
         if now_ns >= self._retry_ns:
             self._retry_ns, self._failure = 0, ""
             self.start()
@@ -306,7 +328,11 @@ class Receiver:
         if not waits:
             self._empty_ns = now_ns
         begun_ns = self._begun_ns
-        if begun_ns is not None and self._learn_from_ns is None and (not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS):
+        if (
+            begun_ns is not None
+            and self._learn_from_ns is None
+            and (not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS)
+        ):
             self._learn_from_ns = now_ns + QUEUED_NS
         arrivals = self._link.receive(POLL_MS)
         for k, arrival in enumerate(arrivals):
@@ -328,7 +354,11 @@ class Receiver:
     def _doubt(self, known: UnixOffset) -> None:
         """Say while nothing keeps this machine's clock of Unix time."""
         if known.error_ns < UNDISCIPLINED_NS:
-            self._notices.end(UNDISCIPLINED, "clock-disciplined", "this machine's clock of Unix time is kept again")
+            self._notices.end(
+                UNDISCIPLINED,
+                "clock-disciplined",
+                "this machine's clock of Unix time is kept again",
+            )
         else:
             self._notices.begin(UNDISCIPLINED, UNDISCIPLINED_LINE)
 
@@ -355,7 +385,9 @@ class Receiver:
                 self._take_decided(self._senders.take(own))
             case other:
                 self.counts.received += 1
-                refusal = wire.Refusal("format", f"a {type(other).__name__} packet is not an attitude")
+                refusal = wire.Refusal(
+                    "format", f"a {type(other).__name__} packet is not an attitude"
+                )
                 self._refuse(arrival, other if isinstance(other, wire.Refusal) else refusal)
 
     def _take_decided(self, arrivals: list[SampleArrival]) -> None:
@@ -395,7 +427,10 @@ class Receiver:
         if self.jumps.jumps > self._jumps_told:
             self._jumps_told = self.jumps.jumps
             total_s = self.jumps.correction_ns / NS_PER_S
-            self._notices.tell("jump", f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues")
+            self._notices.tell(
+                "jump",
+                f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues",
+            )
 
     def _refuse(self, arrival: Arrival[wire.Event], refusal: wire.Refusal) -> None:
         if self.counts.refuse(refusal):

@@ -40,7 +40,14 @@ ENDINGS = (".png", ".svg")
 
 # The colours of a chart, and of each its colour on a dark page.
 INK, MUTED, GRID, PAPER = "#1f2328", "#5c6570", "#d8dde3", "#ffffff"
-BLUE, ORANGE, GREEN, PURPLE, TEAL, RED = "#0b62a4", "#c2500b", "#1a7f37", "#7b3fa0", "#0f7b8a", "#c0182b"
+BLUE, ORANGE, GREEN, PURPLE, TEAL, RED = (
+    "#0b62a4",
+    "#c2500b",
+    "#1a7f37",
+    "#7b3fa0",
+    "#0f7b8a",
+    "#c0182b",
+)
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, RED)
 DARK = {
     INK: "#e6e8eb",
@@ -104,7 +111,9 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 
 
 @contextmanager
-def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> "Iterator[list[Axes]]":
+def chart(
+    path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any
+) -> "Iterator[list[Axes]]":
     """Panels titled by their finding, laid out as `panels_of` says, and written when they are
     drawn.
 
@@ -140,10 +149,14 @@ def panels_of(
         high = MARGIN_INCH + PANEL_INCH * rows if height_inch is None else height_inch
         figure = Figure(figsize=(WIDTH_INCH, high), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.07)  # type: ignore[call-arg,union-attr]
-        grid = figure.subplots(rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights)
+        grid = figure.subplots(
+            rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights
+        )
         figure.suptitle(title_lines(capital(finding)), x=0.01, ha="left", fontsize=TITLE_PT)
         if note:
-            figure.supxlabel(title_lines(note, NOTE_COLUMNS), x=0.01, ha="left", fontsize=SMALL_PT, color=MUTED)
+            figure.supxlabel(
+                title_lines(note, NOTE_COLUMNS), x=0.01, ha="left", fontsize=SMALL_PT, color=MUTED
+            )
         yield list(grid.flat)
         finish(figure)
 
@@ -168,7 +181,10 @@ def finish(figure: "Figure") -> None:
         panels.
         """
         for axis in log_axes:
-            log_ticks(axis, axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25)
+            log_ticks(
+                axis,
+                axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25,
+            )
         for text in texts:
             text.remove()
         texts[:] = [text for axes, named in side_names for text in _name_at_side(axes, named)]
@@ -193,13 +209,17 @@ def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
     and its unit.
     """
     finding = re.sub(r"\d(\.\d+)?e[+-]\d+", lambda found: two_digits(float(found[0])), finding)
-    bound = re.sub(r"(?<=\d) (?=%|(K|mag|mm|px|ms|s|deg/s|arcsec)\b)", "\N{NO-BREAK SPACE}", finding)
+    bound = re.sub(
+        r"(?<=\d) (?=%|(K|mag|mm|px|ms|s|deg/s|arcsec)\b)", "\N{NO-BREAK SPACE}", finding
+    )
 
     def wrapped(width: int) -> list[str]:
         return textwrap.wrap(bound, width, break_on_hyphens=False)
 
     count = len(wrapped(columns))
-    narrowest = next((w for w in range(len(bound) // count, columns) if len(wrapped(w)) == count), columns)
+    narrowest = next(
+        (w for w in range(len(bound) // count, columns) if len(wrapped(w)) == count), columns
+    )
     return "\n".join(wrapped(narrowest))
 
 
@@ -232,11 +252,26 @@ def log_ticks(axis: "Axis", room: float) -> None:
     """
     low, high = sorted(axis.get_view_interval())
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    within_decades: tuple[tuple[float, ...], ...] = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 3, 5), (1, 2, 5), (1, 3))
-    for steps, every in [*((steps, 1) for steps in within_decades), *(((1.0,), every) for every in range(1, 20))]:
-        ticks = [step * 10.0**power for power in range(first, last + 1) if power % every == 0 for step in steps]
+    within_decades: tuple[tuple[float, ...], ...] = (
+        (1, 1.5, 2, 3, 4, 5, 7),
+        (1, 2, 3, 5),
+        (1, 2, 5),
+        (1, 3),
+    )
+    for steps, every in [
+        *((steps, 1) for steps in within_decades),
+        *(((1.0,), every) for every in range(1, 20)),
+    ]:
+        ticks = [
+            step * 10.0**power
+            for power in range(first, last + 1)
+            if power % every == 0
+            for step in steps
+        ]
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-        if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (1 / room):
+        if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (
+            1 / room
+        ):
             break
     plain_ticks(axis, ticks)
 
@@ -265,7 +300,9 @@ def _line_ends(axes: "Axes") -> Iterator[tuple[str, tuple[float, float], str]]:
         # an axhline's x is not
         x_is_data, _ = line.get_transform().contains_branch_seperately(axes.transData)
         xy = np.asarray(line.get_xydata(), dtype=float)
-        ends = xy[np.isfinite(xy[:, 1]) & ((low <= xy[:, 0]) & (xy[:, 0] <= high) | (not x_is_data))]
+        ends = xy[
+            np.isfinite(xy[:, 1]) & ((low <= xy[:, 0]) & (xy[:, 0] <= high) | (not x_is_data))
+        ]
         if len(ends) and not str(line.get_label()).startswith("_"):
             x, y = (float(value) for value in ends[ends[:, 0].argmax()])
             place = (x if x_is_data else high), y
@@ -276,12 +313,24 @@ def _name_at_side(axes: "Axes", named: SideNames) -> "list[Annotation]":
     """The names of a panel, kept apart at its present height, with arrows to far points."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     texts: list[Annotation] = []
-    at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named or _line_ends(axes)}
+    at = {
+        each: axes.transAxes.inverted().transform(axes.transData.transform(each[1]))
+        for each in named or _line_ends(axes)
+    }
     falling = sorted(at, key=lambda each: -at[each][1])
-    for each, height in zip(falling, spread([float(at[one][1]) for one in falling], gap), strict=True):
+    for each, height in zip(
+        falling, spread([float(at[one][1]) for one in falling], gap), strict=True
+    ):
         name, place, colour = each
         far = abs(height - at[each][1]) > gap / 3 or at[each][0] < 0.93
-        arrow = {"arrowstyle": "-", "color": colour, "alpha": 0.5, "lw": 0.8, "shrinkB": 3, "relpos": (0, 0.5)}
+        arrow = {
+            "arrowstyle": "-",
+            "color": colour,
+            "alpha": 0.5,
+            "lw": 0.8,
+            "shrinkB": 3,
+            "relpos": (0, 0.5),
+        }
         texts.append(
             axes.annotate(
                 name,
@@ -310,7 +359,9 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
     return placed
 
 
-def value_bars(axes: "Axes", names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str) -> None:
+def value_bars(
+    axes: "Axes", names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str
+) -> None:
     """Horizontal bars, the first on top, each with its figure at its end in the place of an
     axis.
     """
@@ -329,7 +380,11 @@ def save(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG, as SVG, or where its path has no ending as both. Raises InputError
     where one cannot be written.
     """
-    for target in [path] if path.suffix in ENDINGS else [path.with_name(path.name + ending) for ending in ENDINGS]:
+    for target in (
+        [path]
+        if path.suffix in ENDINGS
+        else [path.with_name(path.name + ending) for ending in ENDINGS]
+    ):
         data = svg(figure).encode() if target.suffix == ".svg" else png(figure)
         write_whole(target, data)
 
@@ -351,6 +406,10 @@ def svg(figure: "Figure") -> str:
     with rc_context({"svg.hashsalt": "hilstar"}):  # the same figure is the same file
         figure.savefig(data, format="svg", metadata={"Date": None})
     rules = "".join(
-        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}' for light, dark in DARK.items() for what in ("fill", "stroke")
+        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
+        for light, dark in DARK.items()
+        for what in ("fill", "stroke")
     )
-    return data.getvalue().replace("</style>", f"@media (prefers-color-scheme: dark){{{rules}}}</style>", 1)
+    return data.getvalue().replace(
+        "</style>", f"@media (prefers-color-scheme: dark){{{rules}}}</style>", 1
+    )

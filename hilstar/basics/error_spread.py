@@ -21,4 +21,6 @@ def error_spread(errors: FloatArray) -> ErrorSpread:
     finite = errors[np.isfinite(errors)]
     if not len(finite):
         return ErrorSpread(None, None, None)
-    return ErrorSpread(float(np.sqrt(np.mean(finite**2))), float(np.percentile(finite, 95)), float(finite.max()))
+    return ErrorSpread(
+        float(np.sqrt(np.mean(finite**2))), float(np.percentile(finite, 95)), float(finite.max())
+    )

@@ -25,7 +25,14 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from hilstar.basics.errors import InputError, cannot_write
-from hilstar.basics.reading import CHUNK_BYTES, MAX_TOML_BYTES, exists, open_regular, parse_toml, read_text
+from hilstar.basics.reading import (
+    CHUNK_BYTES,
+    MAX_TOML_BYTES,
+    exists,
+    open_regular,
+    parse_toml,
+    read_text,
+)
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
@@ -48,8 +55,27 @@ TOML = (".toml",)
 MCAP = (".mcap",)
 # Every ending by which a name says what it holds: of pictures, of text, of archives and arrays.
 KNOWN = {
-    *(FITS + PNG_OR_TIFF + (".jpg", ".jpeg", ".gif", ".bmp", ".webp", ".svg", ".pdf", ".ps", ".eps")),
-    *(".csv", ".tsv", ".json", ".jsonl", ".toml", ".yaml", ".yml", ".xml", ".aem", ".kvn", ".mcap", ".html", ".md", ".txt"),
+    *(
+        FITS
+        + PNG_OR_TIFF
+        + (".jpg", ".jpeg", ".gif", ".bmp", ".webp", ".svg", ".pdf", ".ps", ".eps")
+    ),
+    *(
+        ".csv",
+        ".tsv",
+        ".json",
+        ".jsonl",
+        ".toml",
+        ".yaml",
+        ".yml",
+        ".xml",
+        ".aem",
+        ".kvn",
+        ".mcap",
+        ".html",
+        ".md",
+        ".txt",
+    ),
     *(".npy", ".npz", ".h5", ".hdf5", ".mat", ".zip", ".tar", ".parquet", ".xlsx", ".py"),
 }
 
@@ -100,7 +126,9 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
             continue
         if place in taken:
             other = "" if taken[place] == path else f", the same file as {taken[place]}"
-            raise InputError(f"{path}{other}: is read or written by this command already; write another name for the output")
+            raise InputError(
+                f"{path}{other}: is read or written by this command already; write another name for the output"
+            )
         taken[place] = path
 
 
@@ -150,7 +178,9 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
                 yield file
             return
         refuse_ledger(path)
-        with _part_of(Path(os.path.realpath(path)), None if status is None else stat.S_IMODE(status.st_mode)) as file:
+        with _part_of(
+            Path(os.path.realpath(path)), None if status is None else stat.S_IMODE(status.st_mode)
+        ) as file:
             yield file
     except OSError as error:
         raise cannot_write(path, error) from error
@@ -236,7 +266,9 @@ def refuse_ledger(path: Path) -> None:
     with contextlib.suppress(InputError, OSError), open_regular(path, "") as file:
         head = file.read(HEAD_BYTES)
     if head.startswith(MCAP_MAGIC) and LEDGER_MARK in head:
-        raise InputError(f"{path}: is the ledger of a run, which cannot be made again; write another name")
+        raise InputError(
+            f"{path}: is the ledger of a run, which cannot be made again; write another name"
+        )
 
 
 class NewFile:
@@ -296,7 +328,10 @@ class NewFile:
             return "overwritten"
         # It was only touched, or its file system keeps other times than it says: it is not read
         # over and over.
-        self._look_s, self._rest_s = time.monotonic() + self._rest_s, min(2 * self._rest_s, MAX_REST_S)
+        self._look_s, self._rest_s = (
+            time.monotonic() + self._rest_s,
+            min(2 * self._rest_s, MAX_REST_S),
+        )
         return None
 
     def discard(self) -> None:
@@ -312,7 +347,9 @@ class NewFile:
 
 def _crc_of(fd: int, size_bytes: int) -> int:
     crc = place = 0
-    while place < size_bytes and (data := os.pread(fd, min(CHUNK_BYTES, size_bytes - place), place)):
+    while place < size_bytes and (
+        data := os.pread(fd, min(CHUNK_BYTES, size_bytes - place), place)
+    ):
         crc, place = zlib.crc32(data, crc), place + len(data)
     return crc
 
@@ -435,20 +472,26 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
     if path == STDOUT:
         if endings in (CSV, TOML):
             return
-        raise InputError(f"{option} -: {_article(endings)} is no text, so it does not go to stdout; write OUT{endings[0]}")
+        raise InputError(
+            f"{option} -: {_article(endings)} is no text, so it does not go to stdout; write OUT{endings[0]}"
+        )
     ending = path.suffix.lower()
     if endings is FITS and ending == ".gz":
         ending = path.with_suffix("").suffix.lower()
     if ending not in endings and (ending in KNOWN or path.suffix.lower() == ".gz"):
         # A valid name on this file system, so that it can be copied from the line.
         better = path.with_suffix("").name or "OUT"
-        raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
+        raise InputError(
+            f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}"
+        )
 
 
 def refuse_stdout(option: str, path: Path) -> None:
     """Refuse (InputError) stdout where several files are written."""
     if path == STDOUT:
-        raise InputError(f"{option} -: several files are written, which stdout cannot take; write a name")
+        raise InputError(
+            f"{option} -: several files are written, which stdout cannot take; write a name"
+        )
 
 
 def check_directory(option: str, path: Path | None) -> None:
@@ -472,6 +515,11 @@ def check_directory(option: str, path: Path | None) -> None:
 
 
 def _article(endings: tuple[str, ...]) -> str:
-    names = {FITS: "a FITS file", PNG: "a PNG picture", PNG_OR_TIFF: "a PNG or TIFF picture", CSV: "a CSV table"}
+    names = {
+        FITS: "a FITS file",
+        PNG: "a PNG picture",
+        PNG_OR_TIFF: "a PNG or TIFF picture",
+        CSV: "a CSV table",
+    }
     names |= {TOML: "a TOML file", MCAP: "an MCAP file"}
     return names.get(endings, f"a {endings[0]} file")

@@ -81,7 +81,9 @@ VAGUE_PATTERN_KEYS = (
     "FILTER",
 )  # hold a pattern in some software, another word in other
 PATTERNS = frozenset({"RGGB", "BGGR", "GRBG", "GBRG"})
-NO_PATTERN = frozenset({"", "NONE", "NO", "N/A", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0"})
+NO_PATTERN = frozenset(
+    {"", "NONE", "NO", "N/A", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0"}
+)
 OFFSET_KEYS = (("XBAYROFF", "BAYOFFX", "XBAYOFF"), ("YBAYROFF", "BAYOFFY", "YBAYOFF"))
 TOP_DOWN, BOTTOM_UP = "TOP-DOWN", "BOTTOM-UP"
 PATTERN_ADVICE = "write RGGB, BGGR, GRBG or GBRG, or give one colour's pixels as a grey image"

@@ -55,15 +55,21 @@ def measured(value: float, error: float | None, unit: str = "") -> str:
     if error is None or not math.isfinite(error) or error <= 0:
         return f"{value:.4g} {unit}".rstrip()
     digits = 1 - math.floor(math.log10(error))
-    both = " \N{PLUS-MINUS SIGN} ".join(f"{round(each, digits):,.{max(digits, 0)}f}" for each in (value, error))
+    both = " \N{PLUS-MINUS SIGN} ".join(
+        f"{round(each, digits):,.{max(digits, 0)}f}" for each in (value, error)
+    )
     return f"{both.replace(',', chr(0x202F))} {unit}".rstrip()
 
 
-def table_of(rows: Iterable[Sequence[object]], header: Sequence[str] = (), digits: int = DIGITS) -> str:
+def table_of(
+    rows: Iterable[Sequence[object]], header: Sequence[str] = (), digits: int = DIGITS
+) -> str:
     """A table; None is a dash, and numbers stand at the right."""
     head = "".join(f"<th>{escaped(name)}</th>" for name in header)
     body = "".join(f"<tr>{''.join(_cell(value, digits) for value in row)}</tr>" for row in rows)
-    return f'<div class="wide-table"><table>{f"<tr>{head}</tr>" if header else ""}{body}</table></div>'
+    return (
+        f'<div class="wide-table"><table>{f"<tr>{head}</tr>" if header else ""}{body}</table></div>'
+    )
 
 
 def _cell(value: object, digits: int) -> str:

@@ -29,7 +29,10 @@ FORMATS = ("PNG", "TIFF", "JPEG", "WEBP", "BMP", "PPM")
 MAX_PIXELS = 1 << 26  # where no size is known: 8192 x 8192, half a GB as float64
 MAX_UNPACKED_BYTES = 8 * MAX_PIXELS
 FITS_MAGIC, GZIP_MAGIC = b"SIMPLE", b"\x1f\x8b"
-NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+NPY_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 class ImageSizeError(Exception):
@@ -42,9 +45,13 @@ def _check_size(size_px: tuple[int, int], wanted_px: tuple[int, int] | None) -> 
     if wanted_px is not None and size_px != tuple(wanted_px):
         size, wanted = (f"{width} x {height} px" for width, height in (size_px, wanted_px))
         key = f"resolution_px = [{size_px[0]}, {size_px[1]}]"
-        raise ImageSizeError(f"is {size}, and [tracker] resolution_px is {wanted}; give whole images, or write {key}")
+        raise ImageSizeError(
+            f"is {size}, and [tracker] resolution_px is {wanted}; give whole images, or write {key}"
+        )
     if wanted_px is None and math.prod(size_px) > MAX_PIXELS:
-        raise ImageSizeError(f"is {size_px[0]} x {size_px[1]} px, and at most {MAX_PIXELS} pixels are decoded")
+        raise ImageSizeError(
+            f"is {size_px[0]} x {size_px[1]} px, and at most {MAX_PIXELS} pixels are decoded"
+        )
 
 
 @contextmanager
@@ -102,7 +109,9 @@ def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator
 
     data = unpacked(data)
     if not data.startswith(FITS_MAGIC):
-        raise ImageSizeError("is not a FITS image: it does not begin as FITS does; unpack it first, if it is a compressed one")
+        raise ImageSizeError(
+            "is not a FITS image: it does not begin as FITS does; unpack it first, if it is a compressed one"
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # astropy's about a cut file or keywords of older standards
         with fits.open(io.BytesIO(data), memmap=False) as hdus:
@@ -111,7 +120,9 @@ def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator
                 shape = _image_shape(hdu)
                 unpacked_bytes = math.prod(shape) * abs(int(hdu.header.get("BITPIX", 8))) // 8
                 if unpacked_bytes > max(len(data), MAX_UNPACKED_BYTES):
-                    raise ImageSizeError(f"unpacks to {unpacked_bytes / 1e9:.3g} GB, and at most 0.5 GB are unpacked")
+                    raise ImageSizeError(
+                        f"unpacks to {unpacked_bytes / 1e9:.3g} GB, and at most 0.5 GB are unpacked"
+                    )
                 if shape and wanted_px is not None and len(shape) == 2:
                     _check_size((shape[0], shape[1]), wanted_px)
                     wanted_px = None

@@ -47,7 +47,13 @@ class Notice:
         """An event of this moment, in text that JSON and a terminal hold, whatever a file in it
         is called.
         """
-        return cls(time.monotonic_ns(), kind, printable(detail)[:MAX_DETAIL_CHARACTERS], printable(who), since_ns)
+        return cls(
+            time.monotonic_ns(),
+            kind,
+            printable(detail)[:MAX_DETAIL_CHARACTERS],
+            printable(who),
+            since_ns,
+        )
 
 
 def at_now(line: str) -> str:
@@ -121,7 +127,12 @@ class Notices:
             known = self._kinds.setdefault(kind, _Kind(deque(maxlen=MAX_SAID)))
             known.detail = notice.detail
             words = known.words(notice)
-            recorded = words is not None or known.recorded < MAX_RECORDED or bool(who) or kind in ALWAYS_RECORDED
+            recorded = (
+                words is not None
+                or known.recorded < MAX_RECORDED
+                or bool(who)
+                or kind in ALWAYS_RECORDED
+            )
             known.recorded += recorded
         if words is not None:
             log.warning("%s", at_now(words))
@@ -135,7 +146,10 @@ class Notices:
             for known in self._kinds.values():
                 known.unsaid = 0
         if unsaid:
-            told = ", ".join(f"{kind} {self._counts[kind]} ({count} of them not said)" for kind, count in unsaid.items())
+            told = ", ".join(
+                f"{kind} {self._counts[kind]} ({count} of them not said)"
+                for kind, count in unsaid.items()
+            )
             log.warning("%s", at_now(f"events in all: {told}"))
 
     def _hand_on(self, notice: Notice) -> None:

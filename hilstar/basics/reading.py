@@ -29,7 +29,9 @@ MAX_LINE_CHARACTERS = 1_000_000
 CHUNK_BYTES = 1 << 20
 MAX_TOML_BYTES = 200_000
 MAX_KEY_PARTS = 32  # tomllib's time and memory grow as their square
-DEEP_KEY = re.compile(rf"(?<![\w-])(?:[\"']?[\w-]{{0,40}}[\"']?[ \t]*\.[ \t]*){{{MAX_KEY_PARTS - 1}}}")
+DEEP_KEY = re.compile(
+    rf"(?<![\w-])(?:[\"']?[\w-]{{0,40}}[\"']?[ \t]*\.[ \t]*){{{MAX_KEY_PARTS - 1}}}"
+)
 NOT_FILES = {
     stat.S_ISDIR: "is a directory",
     stat.S_ISFIFO: "is a pipe; write it to a file first",
@@ -197,7 +199,9 @@ def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[s
             text = io.TextIOWrapper(file, encoding=encoding, errors="surrogateescape", newline="")
             yield _bounded(path, text, advice)
         except UnicodeDecodeError as error:
-            raise cannot_read(path, "it is cut off or damaged: not UTF-16 to its end", advice) from error
+            raise cannot_read(
+                path, "it is cut off or damaged: not UTF-16 to its end", advice
+            ) from error
         except OSError as error:
             raise cannot_read(path, error, advice) from error
 
@@ -207,7 +211,9 @@ def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
     while line := text.readline(MAX_LINE_CHARACTERS):
         number += 1
         if len(line) == MAX_LINE_CHARACTERS and line[-1] not in "\r\n":
-            raise InputError(f"{path}:{number}: the line has {MAX_LINE_CHARACTERS} characters or more; {advice}")
+            raise InputError(
+                f"{path}:{number}: the line has {MAX_LINE_CHARACTERS} characters or more; {advice}"
+            )
         if not line.isascii():
             line = _decoded(path, number, line, advice)
         yield line
@@ -224,8 +230,12 @@ def _decoded(path: Path, number: int, line: str, advice: str) -> str:
         wrong = NO_TEXT.search(raw.decode("latin-1"))
         if wrong:
             byte = ord(wrong[0])
-            raise cannot_read(path, f"it is no text: line {number} has a byte 0x{byte:02x}", advice) from None
-        warn_once(f"{path}: line {number} is not UTF-8, and is read as Windows-1252; save the file as UTF-8")
+            raise cannot_read(
+                path, f"it is no text: line {number} has a byte 0x{byte:02x}", advice
+            ) from None
+        warn_once(
+            f"{path}: line {number} is not UTF-8, and is read as Windows-1252; save the file as UTF-8"
+        )
         return raw.decode("cp1252")
     return line
 
@@ -252,13 +262,17 @@ def _not_text(file: IO[bytes]) -> str:
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """The tables of a TOML file's text. Raises InputError with the line."""
     if DEEP_KEY.search(text):
-        raise InputError(f"{path}: not TOML that anybody wrote: a key has {MAX_KEY_PARTS} parts or more")
+        raise InputError(
+            f"{path}: not TOML that anybody wrote: a key has {MAX_KEY_PARTS} parts or more"
+        )
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not TOML: {shortened(error)}") from error
     except RecursionError as error:
-        raise InputError(f"{path}: not TOML that anybody wrote: its values are nested too deep") from error
+        raise InputError(
+            f"{path}: not TOML that anybody wrote: its values are nested too deep"
+        ) from error
     except ValueError as error:  # Python reads no integer of more than 4300 digits
         raise InputError(f"{path}: not TOML: a whole number has thousands of digits") from error
 

@@ -67,7 +67,9 @@ def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:
 def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
     """The rotations (n, 4) of rotation vectors (n, 3), as `from_rotation_vector` has one."""
     angle = np.linalg.norm(vectors_rad, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vectors_rad], axis=-1)
+    return np.concatenate(
+        [np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vectors_rad], axis=-1
+    )
 
 
 def rotate(q: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -91,7 +93,9 @@ def to_rotation_vector(q: FloatArray) -> FloatArray:
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     tiny = sine < SMALL_RAD
     angle = 2 * np.arctan2(sine, q[..., :1])
-    return np.asarray(q[..., 1:] * np.where(tiny, 2.0 + sine * sine / 3.0, angle / np.where(tiny, 1.0, sine)))
+    return np.asarray(
+        q[..., 1:] * np.where(tiny, 2.0 + sine * sine / 3.0, angle / np.where(tiny, 1.0, sine))
+    )
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
@@ -101,7 +105,9 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
     trace = float(np.trace(matrix))
     squares = np.array([trace, *np.diag(matrix)])
     k = int(np.argmax(squares))
-    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    skew = np.array(
+        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    )
     if k == 0:
         q = np.array([1 + trace, *skew])
     else:
@@ -127,7 +133,8 @@ def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> Float
     At roll 0 the image has north up and east left.
     """
     q_cam_to_icrs = multiply(
-        multiply(_about_z(np.radians(ra_deg - 90.0)), _about_x(np.radians(dec_deg - 90.0))), _about_z(np.radians(roll_deg))
+        multiply(_about_z(np.radians(ra_deg - 90.0)), _about_x(np.radians(dec_deg - 90.0))),
+        _about_z(np.radians(roll_deg)),
     )
     q = conjugate(q_cam_to_icrs)
     return -q if q[0] < 0 else q
@@ -167,7 +174,9 @@ def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
     half = 2 * np.arctan2(np.linalg.norm(b - a), np.linalg.norm(b + a))
     if half < SMALL_RAD:
         return normalise(a + fraction * (b - a))
-    return np.asarray((np.sin((1 - fraction) * half) * a + np.sin(fraction * half) * b) / np.sin(half))
+    return np.asarray(
+        (np.sin((1 - fraction) * half) * a + np.sin(fraction * half) * b) / np.sin(half)
+    )
 
 
 def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: float) -> FloatArray:

@@ -23,7 +23,9 @@ class Percentiles(msgspec.Struct, frozen=True):
 
     def times(self, factor: float) -> "Percentiles":
         """The same in another unit."""
-        return Percentiles(*(None if value is None else value * factor for value in (self.p50, self.p99, self.max)))
+        return Percentiles(
+            *(None if value is None else value * factor for value in (self.p50, self.p99, self.max))
+        )
 
 
 class RunningStatistics:
@@ -54,10 +56,17 @@ class RunningStatistics:
             return
         count, step = self.count + len(values), float(values.mean()) - self._mean
         # Chan 1979
-        self._squares += float(((values - values.mean()) ** 2).sum()) + step**2 * self.count * len(values) / count
+        self._squares += (
+            float(((values - values.mean()) ** 2).sum())
+            + step**2 * self.count * len(values) / count
+        )
         self._mean += step * len(values) / count
         self.count, self.max = count, max(self.max, float(values.max()))
-        place = (1 + np.log(np.maximum(np.abs(values) / MIN_SIZE, 1.0)) / STEP).astype(np.intp).clip(max=BINS)
+        place = (
+            (1 + np.log(np.maximum(np.abs(values) / MIN_SIZE, 1.0)) / STEP)
+            .astype(np.intp)
+            .clip(max=BINS)
+        )
         place[np.abs(values) < MIN_SIZE] = 0
         np.add.at(self._counts, BINS + np.where(values >= 0, place, -place), 1)
 
@@ -82,4 +91,6 @@ class RunningStatistics:
 
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and maximum."""
-        return Percentiles(self.percentile(50), self.percentile(99), self.max if self.count else None)
+        return Percentiles(
+            self.percentile(50), self.percentile(99), self.max if self.count else None
+        )

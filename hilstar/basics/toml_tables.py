@@ -14,7 +14,11 @@ import msgspec
 from hilstar.basics.errors import did_you_mean, shortened
 
 # by length
-EXAMPLES: dict[int, tuple[float, ...]] = {2: (1024, 1024), 3: (0.0, 0.0, 0.0), 4: (1.0, 0.0, 0.0, 0.0)}
+EXAMPLES: dict[int, tuple[float, ...]] = {
+    2: (1024, 1024),
+    3: (0.0, 0.0, 0.0),
+    4: (1.0, 0.0, 0.0, 0.0),
+}
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -68,7 +72,13 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
     if choices and not isinstance(value, list):
         wanted = " or ".join(map(_toml, choices))
         return f"{_place(table)}{key} = {_toml(value)}; {did_you_mean(value, map(str, choices))}{wanted} is wanted"
-    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0].removesuffix(" | null").replace(" | ", " or ")
+    wanted = (
+        fault.removeprefix("Expected ")
+        .replace("`", "")
+        .split(", got ")[0]
+        .removesuffix(" | null")
+        .replace(" | ", " or ")
+    )
     for type_name, word in kind.type_words.items():
         wanted = re.sub(rf"\b{type_name}\b", word, wanted)
     return f"{_place(table)}{key} = {_toml(value)}; {wanted} is wanted{_such_as(field, value)}"
@@ -82,7 +92,9 @@ def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
         return f", such as {field.name} = {shortened(value)}"
     kind = plain(field.type)
     # X of `X | None`
-    parts = next((part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None)
+    parts = next(
+        (part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None
+    )
     if parts is None:
         return ""
     kinds = [plain(kind) for kind in get_args(parts)]
@@ -102,10 +114,14 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     by row.
     """
     plain_keys = {key: value for key, value in tables.items() if not isinstance(value, dict)}
-    parts = {"": plain_keys} | {f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)}
+    parts = {"": plain_keys} | {
+        f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)
+    }
     texts = []
     for head, part in parts.items():
-        rows = "".join(f"{key} = {_written(value)}\n" for key, value in part.items() if value is not None)
+        rows = "".join(
+            f"{key} = {_written(value)}\n" for key, value in part.items() if value is not None
+        )
         texts += [head + rows] if rows else []
     return "\n".join(texts)
 

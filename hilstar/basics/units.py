@@ -74,7 +74,11 @@ MOTION = {
     "arcmin/yr": "6e4",
     "deg/yr deg/y deg/a deg/year degyr-1": "3.6e6",
 }
-SHARE = {"1 fraction frac ratio unitless none -": "1", "% percent pct perc": "1e-2", "permille": "1e-3"}
+SHARE = {
+    "1 fraction frac ratio unitless none -": "1",
+    "% percent pct perc": "1e-2",
+    "permille": "1e-3",
+}
 PIXELS = {"px pix pixel pixels": "1"}
 MAGNITUDE = {"mag mags magnitude": "1", "mmag": "1e-3"}
 DIMENSIONS = (TIME, LENGTH, ANGLE, RATE, MOTION, SHARE, PIXELS, MAGNITUDE)

@@ -83,7 +83,10 @@ class WrongSky:
             if kind in ENDS:
                 self.any = True
                 self._texts.setdefault(kind, text)
-                self._now.setdefault(kind, Condition(kind, text, host_ns if since_ns is None else min(since_ns, host_ns)))
+                self._now.setdefault(
+                    kind,
+                    Condition(kind, text, host_ns if since_ns is None else min(since_ns, host_ns)),
+                )
                 return
             ended = self._now.pop(BEGINS[kind], None)
             if ended is not None:
@@ -98,7 +101,11 @@ class WrongSky:
     def at(self, host_ns: int) -> list[tuple[str, str]]:
         """Kind and first line of each condition that held at a host time."""
         with self._lock:
-            return [(kind, self._texts[kind]) for kind, spans in self._spans() if _covers(spans, host_ns)]
+            return [
+                (kind, self._texts[kind])
+                for kind, spans in self._spans()
+                if _covers(spans, host_ns)
+            ]
 
     def spans_ns(self) -> list[tuple[int, int]]:
         """Begin and end of each time of a wrong sky, in order and apart; the end of one that

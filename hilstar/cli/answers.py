@@ -28,15 +28,31 @@ MAX_ROWS = 100_000  # the newest, in the JSON object
 def answers(
     bench: options.BenchFile,
     recorded: Annotated[
-        Path | None, Option("--from", metavar="FILE", help="Bytes recorded from the tracker's line; by default the live link.")
+        Path | None,
+        Option(
+            "--from",
+            metavar="FILE",
+            help="Bytes recorded from the tracker's line; by default the live link.",
+        ),
     ] = None,
     explain: Annotated[
-        bool, Option("--explain", help="Show which bytes became which field, and each answer under every convention.")
+        bool,
+        Option(
+            "--explain",
+            help="Show which bytes became which field, and each answer under every convention.",
+        ),
     ] = False,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
     seconds: Annotated[
-        float | None, Option("--seconds", metavar="S", help="End after so long; by default with Ctrl-C.", min=0.1, max=1e7)
+        float | None,
+        Option(
+            "--seconds",
+            metavar="S",
+            help="End after so long; by default with Ctrl-C.",
+            min=0.1,
+            max=1e7,
+        ),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -56,7 +72,9 @@ def answers(
 
     file = read_bench_file(bench)
     if file.config.answers is None:
-        raise InputError(f'{bench}: has no [answers]; write the table, with source = "serial" or the like')
+        raise InputError(
+            f'{bench}: has no [answers]; write the table, with source = "serial" or the like'
+        )
     shown = options.parse_attitude("answers", radec, quaternion) if radec or quaternion else None
     plan = ReadPlan(file.config.answers, file.folder, file.config.tracker.q_body_to_cam)
     counts: Counter[str] = Counter()
@@ -71,7 +89,10 @@ def answers(
     for each in found:
         if isinstance(each, RefusedAnswer):
             counts[each.reason] += 1
-            row, line = {"refused": each.reason, "detail": each.detail}, f"refused ({each.reason}): {each.detail}"
+            row, line = (
+                {"refused": each.reason, "detail": each.detail},
+                f"refused ({each.reason}): {each.detail}",
+            )
         else:
             counts["answers"] += 1
             counts["valid"] += each.valid
@@ -85,8 +106,15 @@ def answers(
     if as_json:
         print_json({"answers": list(rows), "counts": dict(counts)})
     else:
-        refused = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason not in {"answers", "valid"})
-        say(f"{counts['answers']} answers, {counts['valid']} valid" + (f"; refused: {refused}" if refused else ""))
+        refused = ", ".join(
+            f"{count} {reason}"
+            for reason, count in counts.items()
+            if reason not in {"answers", "valid"}
+        )
+        say(
+            f"{counts['answers']} answers, {counts['valid']} valid"
+            + (f"; refused: {refused}" if refused else "")
+        )
 
 
 def _shown_now(file: "BenchFile") -> "FloatArray | None":
@@ -130,11 +158,15 @@ def _shown_by_page() -> "FloatArray | None":
         shown = msgspec.convert(said["state"]["attitude"], ShownAttitude)
     except (OSError, http.client.HTTPException, *NOT_JSON, LookupError, TypeError):
         return None  # no run, one without an attitude, or another program
-    say(f"what is shown: RA {shown.ra_deg:.4f}, Dec {shown.dec_deg:.4f}, by the page at {HOST}:{PORT}")
+    say(
+        f"what is shown: RA {shown.ra_deg:.4f}, Dec {shown.dec_deg:.4f}, by the page at {HOST}:{PORT}"
+    )
     return np.array(shown.q)
 
 
-def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
+def _live(
+    plan: "ReadPlan", seconds: float | None
+) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
     import threading
 
     from hilstar.basics.notices import Notices
@@ -147,7 +179,9 @@ def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iter
 
     def found() -> "Iterator[Answer | RefusedAnswer]":
         with link, stop_on_signal(stop):
-            yield from live_answers(plan, link, decoder, math.inf if seconds is None else seconds, stop.is_set)
+            yield from live_answers(
+                plan, link, decoder, math.inf if seconds is None else seconds, stop.is_set
+            )
 
     return decoder, found()
 

@@ -27,7 +27,11 @@ OPTICS = "A tracker's glass for `[tracker.optics] psf`: point spread functions b
 SERVICE = "A run that this machine starts, watches, and starts again."
 # The same of files with several commands.
 GROUPS = {
-    "calibrate": ("Calibrate", CALIBRATE, ("dots", "geometric", "psf", "alignment", "plan", "photometric", "scale")),
+    "calibrate": (
+        "Calibrate",
+        CALIBRATE,
+        ("dots", "geometric", "psf", "alignment", "plan", "photometric", "scale"),
+    ),
     "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
     "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),
     "service": ("This machine", SERVICE, ("install", "uninstall")),
@@ -70,7 +74,12 @@ def print_version(wanted: bool) -> None:
 
 
 def hilstar(
-    _: Annotated[bool, Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")] = False,
+    _: Annotated[
+        bool,
+        Option(
+            "--version", callback=print_version, is_eager=True, help="Print the version and quit."
+        ),
+    ] = False,
 ) -> None:
     """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values
     out.

@@ -15,7 +15,10 @@ MAX_LATENCY_MS = 1e7
 
 def assess(
     ledger: RunFile,
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
+    output: Annotated[
+        Path,
+        Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables."),
+    ],
     telemetry: Annotated[
         Path | None,
         Argument(
@@ -34,10 +37,19 @@ def assess(
         ),
     ] = None,
     latency_ms: Annotated[
-        float, Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")
+        float,
+        Option(
+            "--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known."
+        ),
     ] = 0.0,
     display_attitudes: Annotated[
-        int, Option(metavar="N", min=0, max=1000, help="Attitudes at which the twin measures the display; 0 for none.")
+        int,
+        Option(
+            metavar="N",
+            min=0,
+            max=1000,
+            help="Attitudes at which the twin measures the display; 0 for none.",
+        ),
     ] = 12,
     as_json: Json = False,
 ) -> None:
@@ -49,14 +61,24 @@ def assess(
 
     check_directory("-o", output)
     if not abs(latency_ms) < MAX_LATENCY_MS:
-        raise InputError(f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way")
+        raise InputError(
+            f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way"
+        )
     names = ("budget.html", "budget.csv", "slices.csv", "wrong.csv", "outages.csv")
-    check_files([ledger, *([] if telemetry is None else [telemetry])], [output / name for name in names])
-    found = assess_files(ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes))
+    check_files(
+        [ledger, *([] if telemetry is None else [telemetry])], [output / name for name in names]
+    )
+    found = assess_files(
+        ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes)
+    )
     make_directory(output)
     write_tables(output, found)
     write_page(output / "budget.html", found)
-    rows = [*lines_of(found), *(("note", note) for note in found.notes), ("page", output / "budget.html")]
+    rows = [
+        *lines_of(found),
+        *(("note", note) for note in found.notes),
+        ("page", output / "budget.html"),
+    ]
     print_found(as_json, budget_of(found), (f"{what:24}{text}" for what, text in rows))
     for note in found.notes if as_json else ():
         say(note)

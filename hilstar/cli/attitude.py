@@ -22,7 +22,11 @@ SHOWN_STARS = 3
 @options.log_statements
 def attitude(
     source: Annotated[
-        Path, Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
+        Path,
+        Argument(
+            metavar="INPUT",
+            help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.",
+        ),
     ],
     at: Annotated[
         str | None,
@@ -33,12 +37,22 @@ def attitude(
         ),
     ] = None,
     bench: Annotated[
-        Path | None, Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker.")
+        Path | None,
+        Option(
+            metavar="BENCH.toml",
+            help="Whose tracker, mounting and sky to use; by default the demo's tracker.",
+        ),
     ] = None,
-    wait: Annotated[float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
+    wait: Annotated[
+        float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)
+    ] = 10.0,
     statements: options.LogStatements = options.NOTHING_STATED,
     explain: Annotated[
-        bool, Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
+        bool,
+        Option(
+            "--explain",
+            help="Explain what the source's numbers mean: frames, scalar order, time scale.",
+        ),
     ] = False,
     as_json: options.Json = False,
 ) -> None:
@@ -53,9 +67,13 @@ def attitude(
     if live:
         written = "write it into"
         if statements.mounting is not None:
-            raise InputError(f"--mounting {statements.mounting}: {written} {source} as [tracker] q_body_to_cam")
+            raise InputError(
+                f"--mounting {statements.mounting}: {written} {source} as [tracker] q_body_to_cam"
+            )
         if statements.convention is not None:
-            raise InputError(f"--convention {statements.convention}: {written} {source} as [attitude] convention")
+            raise InputError(
+                f"--convention {statements.convention}: {written} {source} as [attitude] convention"
+            )
         statements.refuse(f"it is for a log, and {source} names a live stream; leave it out")
     stated = statements.stated(first.config)
     if live:
@@ -67,7 +85,9 @@ def attitude(
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(stated.mounting)
-    print_found(as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)])
+    print_found(
+        as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)]
+    )
 
 
 class _Found(NamedTuple):
@@ -80,10 +100,14 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
     from hilstar.server.open_link import first_attitude, open_link
 
     if at is not None:
-        raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
+        raise InputError(
+            f"--at {at}: a live stream has only its present; leave --at out, or give a log"
+        )
     with open_link(file.config, file.folder) as link:
         if link.steps:
-            raise InputError(f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain")
+            raise InputError(
+                f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain"
+            )
         return _Found(first_attitude(link, patience_s), link.conventions)
 
 
@@ -122,7 +146,10 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
         "dec_deg": dec_deg,
         "roll_deg": roll_deg,
         "rate_deg_s": None if rate is None else np.degrees(rate).tolist(),
-        "tracker": {"file": file.path.name, "resolution_px": list(file.config.tracker.resolution_px)},
+        "tracker": {
+            "file": file.path.name,
+            "resolution_px": list(file.config.tracker.resolution_px),
+        },
         "stars": stars,
     }
 
@@ -133,16 +160,21 @@ def _lines(told: dict[str, Any]) -> list[str]:
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]
     lines = [
-        f"q_icrs_to_cam {q}, t_ns {told['t_ns']}" + (" (held: in a gap of the log)" if told["held"] else ""),
+        f"q_icrs_to_cam {q}, t_ns {told['t_ns']}"
+        + (" (held: in a gap of the log)" if told["held"] else ""),
         f"RA {turn_text(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {turn_text(told['roll_deg'])} deg",
     ]
     if told["rate_deg_s"] is not None:
-        lines.append("rate " + ", ".join(f"{c:z.6f}" for c in told["rate_deg_s"]) + " deg/s about x, y, z of the camera")
+        lines.append(
+            "rate "
+            + ", ".join(f"{c:z.6f}" for c in told["rate_deg_s"])
+            + " deg/s about x, y, z of the camera"
+        )
     if not told["stars"]:
         lines.append("no star of the catalogue is in view")
     for star in told["stars"]:
-        where = (
-            f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from the middle"
+        where = f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from the middle"
+        lines.append(
+            f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}: {where}"
         )
-        lines.append(f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}: {where}")
     return lines

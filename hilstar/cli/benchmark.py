@@ -11,17 +11,29 @@ from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
 from hilstar.server.console.terminal import print_found, progress
 
-OwnBench = Annotated[Path | None, Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
+OwnBench = Annotated[
+    Path | None, Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")
+]
 
 
 def benchmark(
     bench_file: OwnBench = None,
-    quick: Annotated[bool, Option("--quick", help="1920x1080 only, up to 10000 stars: at most half a minute.")] = False,
+    quick: Annotated[
+        bool, Option("--quick", help="1920x1080 only, up to 10000 stars: at most half a minute.")
+    ] = False,
     stars: Annotated[str | None, Option(metavar="N,N,...", help="Stars in view.")] = None,
     sizes: Annotated[str | None, Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
-    seed: Annotated[int, Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
+    seed: Annotated[
+        int, Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)
+    ] = 1,
     output: Annotated[
-        Path | None, Option("-o", "--output", metavar="DIR", help="Directory for bench.csv, tracker.csv and bench.png.")
+        Path | None,
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Directory for bench.csv, tracker.csv and bench.png.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -39,7 +51,9 @@ def benchmark(
         plan = replace(plan, counts=parse_counts(stars, speed.MAX_STARS))
     if bench_file is not None:
         if sizes is not None:
-            raise InputError(f"benchmark --sizes: {bench_file} has a size of its own; leave out one of them")
+            raise InputError(
+                f"benchmark --sizes: {bench_file} has a size of its own; leave out one of them"
+            )
         file = read_bench_file(bench_file)
         plan = replace(plan, file=file, sizes=(file.config.monitor.resolution_px,))
     elif sizes is not None:

@@ -16,7 +16,10 @@ from hilstar.server.console.terminal import print_found, say
 
 def budget(
     bench_file: BenchFile,
-    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")] = None,
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table."),
+    ] = None,
     centroider: Annotated[
         str | None,
         Option(
@@ -25,7 +28,11 @@ def budget(
         ),
     ] = None,
     noise: Annotated[
-        bool, Option("--noise", help="The noise of the tracker's own stars by source, and the limits that it sets.")
+        bool,
+        Option(
+            "--noise",
+            help="The noise of the tracker's own stars by source, and the limits that it sets.",
+        ),
     ] = False,
     radec: RadecText = None,
     as_json: Json = False,
@@ -45,12 +52,16 @@ def budget(
         star_noise(bench_file, output, radec, as_json)
         return
     if radec is not None:
-        raise InputError("budget --radec: names a field of stars whose noise is wanted; add --noise")
+        raise InputError(
+            "budget --radec: names a field of stars whose noise is wanted; add --noise"
+        )
     choices: tuple[By, ...] = (*FAMILY, "all")
     by = next((choice for choice in choices if choice == centroider), None)
     if centroider is not None and by is None:
         meant = did_you_mean(centroider, choices)
-        raise InputError(f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}")
+        raise InputError(
+            f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}"
+        )
     with load(bench_file) as bench:
         fields = fields_of_view(bench.config, bench.file.folder)
         found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
@@ -71,7 +82,9 @@ def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json
     from hilstar.tracker.centroids import CentroidSettings
 
     attitude = None if radec is None else parse_attitude("budget", radec, None)
-    found = noise_budget(read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0))
+    found = noise_budget(
+        read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0)
+    )
     if output is not None:
         write_noise(make_directory(output), found)
     print_found(as_json, found, noise_lines(found))

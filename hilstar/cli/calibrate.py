@@ -10,8 +10,25 @@ import typer
 from typer import Argument, Option
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory, refuse_stdout
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_files, parse_numbers, parse_reading
+from hilstar.basics.files import (
+    CSV,
+    FITS,
+    PNG,
+    TOML,
+    check_directory,
+    check_ending,
+    make_directory,
+    refuse_stdout,
+)
+from hilstar.cli.options import (
+    MAX_SEED,
+    BenchFile,
+    Json,
+    Overwrite,
+    check_files,
+    parse_numbers,
+    parse_reading,
+)
 from hilstar.cli.running import Windowed
 from hilstar.server.console.terminal import print_found, print_json, say
 
@@ -22,14 +39,27 @@ RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
 
 def dots(
     bench_file: BenchFile,
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")
+    ],
     frames: Annotated[int, Option(help="Number of frames.", min=1, max=1000)] = 20,
     dots_per_frame: Annotated[
         int | None,
-        Option("--dots", help="About how many dots are lit in each. [as many as the field holds, 60 at most]", min=1, max=5000),
+        Option(
+            "--dots",
+            help="About how many dots are lit in each. [as many as the field holds, 60 at most]",
+            min=1,
+            max=5000,
+        ),
     ] = None,
-    show: Annotated[bool, Option("--show", help="Show the frames on the display: space for the next, q to quit.")] = False,
-    seconds: Annotated[float | None, Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)] = None,
+    show: Annotated[
+        bool,
+        Option("--show", help="Show the frames on the display: space for the next, q to quit."),
+    ] = False,
+    seconds: Annotated[
+        float | None,
+        Option(metavar="S", help="With --show: time for each frame, without keys.", min=0),
+    ] = None,
     windowed: Windowed = False,
     seed: Annotated[int, Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
@@ -42,7 +72,13 @@ def dots(
     import numpy as np
 
     from hilstar.instruments.calibrate.geometric.calibration import seen_screen_of
-    from hilstar.instruments.calibrate.geometric.dots import dot_image, lit_for, plan_seen_dots, show_dots, write_plan
+    from hilstar.instruments.calibrate.geometric.dots import (
+        dot_image,
+        lit_for,
+        plan_seen_dots,
+        show_dots,
+        write_plan,
+    )
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.frame_files import write_codes_png
 
@@ -62,7 +98,13 @@ def dots(
     if show:
         shown = show_dots(plan, monitor, seconds, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
-    told = {"frames": plan.frames, "dots": len(plan), "lit": int(plan.lit.sum()), "seed": seed, "written": str(output)}
+    told = {
+        "frames": plan.frames,
+        "dots": len(plan),
+        "lit": int(plan.lit.sum()),
+        "seed": seed,
+        "written": str(output),
+    }
     each = f"{plan.lit.sum() / plan.frames:.0f} lit in each"
     print_found(as_json, told, [f"{len(plan)} dots in {plan.frames} frames, {each}, in {output}"])
 
@@ -70,47 +112,84 @@ def dots(
 def geometric(
     bench_file: BenchFile,
     observed: Annotated[
-        list[Path], Argument(metavar="OBSERVED...", help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.")
+        list[Path],
+        Argument(
+            metavar="OBSERVED...",
+            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.",
+        ),
     ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
+    ],
     tracker_is_ideal: Annotated[
-        bool, Option("--tracker-is-ideal", help="Take the tracker's lens as ideal; the file then holds both lenses.")
+        bool,
+        Option(
+            "--tracker-is-ideal",
+            help="Take the tracker's lens as ideal; the file then holds both lenses.",
+        ),
     ] = False,
-    dark: Annotated[Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
-    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")] = None,
+    dark: Annotated[
+        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+    ] = None,
+    plot: Annotated[
+        Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
     saw.
     """
-    from hilstar.instruments.calibrate.geometric.calibration import calibrate_files, lines_of, summary_of, write_calibrated
+    from hilstar.instruments.calibrate.geometric.calibration import (
+        calibrate_files,
+        lines_of,
+        summary_of,
+        write_calibrated,
+    )
     from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
-    found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
+    found = calibrate_files(
+        file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+    )
     monitor = file.config.monitor
-    written = write_calibrated(output, found, plot, _monitor_of(monitor.display, monitor.resolution_px))
+    written = write_calibrated(
+        output, found, plot, _monitor_of(monitor.display, monitor.resolution_px)
+    )
     print_found(as_json, summary_of(found, written), [*lines_of(found), NAMED.format(output.name)])
 
 
 def psf(
     bench_file: BenchFile,
-    images: Annotated[list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")],
+    images: Annotated[
+        list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")
+    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")],
-    dark: Annotated[Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
-    oversampling: Annotated[int, Option(help="Samples a tracker pixel along each axis.", min=2, max=16)] = 4,
+    output: Annotated[
+        Path,
+        Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf."),
+    ],
+    dark: Annotated[
+        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+    ] = None,
+    oversampling: Annotated[
+        int, Option(help="Samples a tracker pixel along each axis.", min=2, max=16)
+    ] = 4,
     plot: Annotated[Path | None, Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
     as_json: Json = False,
 ) -> None:
     """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate
     geometric`.
     """
-    from hilstar.instruments.calibrate.effective_psf import draw_effective, effective_psf, lines_of, summary_of
+    from hilstar.instruments.calibrate.effective_psf import (
+        draw_effective,
+        effective_psf,
+        lines_of,
+        summary_of,
+    )
     from hilstar.optics.glass.psf_file import write_glass
     from hilstar.server.bench.bench_file import read_bench_file
 
@@ -122,8 +201,17 @@ def psf(
     write_glass(output, found.glass)
     if plot is not None:
         draw_effective(plot, found)
-    told = summary_of(found) | {"written": [str(each) for each in (output, plot) if each is not None]}
-    print_found(as_json, told, [*lines_of(found), f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}"])
+    told = summary_of(found) | {
+        "written": [str(each) for each in (output, plot) if each is not None]
+    }
+    print_found(
+        as_json,
+        told,
+        [
+            *lines_of(found),
+            f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}",
+        ],
+    )
 
 
 def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
@@ -150,7 +238,9 @@ def alignment(
             " tracker's telemetry: t_s,qw,qx,qy,qz[,valid].",
         ),
     ],
-    output: Annotated[Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
+    ],
     ledger: Annotated[
         Path | None,
         Option(
@@ -160,41 +250,70 @@ def alignment(
         ),
     ] = None,
     offset_s: Annotated[
-        float | None, Option("--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.")
+        float | None,
+        Option(
+            "--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default."
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Find how the tracker stands before the screen from the attitudes that it reports, for one
     that gives nothing else.
     """
-    from hilstar.instruments.calibrate.alignment import align_files, lines_of, summary_of, write_alignment
+    from hilstar.instruments.calibrate.alignment import (
+        align_files,
+        lines_of,
+        summary_of,
+        write_alignment,
+    )
     from hilstar.server.bench.bench_file import read_bench_file
 
     check_ending("-o", output, TOML)
     if offset_s is not None and ledger is None:
-        raise InputError("--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's telemetry")
+        raise InputError(
+            "--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's telemetry"
+        )
     if offset_s is not None and not abs(offset_s) < MAX_OFFSET_S:
-        raise InputError(f"--offset-s {offset_s}: write seconds, less than {MAX_OFFSET_S:g} either way")
+        raise InputError(
+            f"--offset-s {offset_s}: write seconds, less than {MAX_OFFSET_S:g} either way"
+        )
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
     found = align_files(file, pairs, ledger, offset_s or 0.0)
     monitor = file.config.monitor
     write_alignment(output, found, file, _monitor_of(monitor.display, monitor.resolution_px))
-    print_found(as_json, summary_of(found) | {"written": [str(output)]}, [*lines_of(found), NAMED.format(output.name)])
+    print_found(
+        as_json,
+        summary_of(found) | {"written": [str(output)]},
+        [*lines_of(found), NAMED.format(output.name)],
+    )
 
 
 def plan(
-    output: Annotated[Path, Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")
+    ],
     bits: Annotated[int, Option(help="Bits per code.", min=1, max=16)] = 8,
-    levels: Annotated[int, Option(help="Levels from black to white; half of white is added.", min=2)] = 32,
-    repeats: Annotated[int, Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)] = 6,
+    levels: Annotated[
+        int, Option(help="Levels from black to white; half of white is added.", min=2)
+    ] = 32,
+    repeats: Annotated[
+        int, Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)
+    ] = 6,
     channels: Annotated[str, Option(help="Channels to measure, of w, r, g, b.")] = "w",
     seed: Annotated[int, Option(help="Seed of the order.", min=0, max=MAX_SEED)] = 0,
-    headless: Annotated[Path | None, Option(metavar="DIR", help="Write the patches to this directory as PNG.")] = None,
+    headless: Annotated[
+        Path | None, Option(metavar="DIR", help="Write the patches to this directory as PNG.")
+    ] = None,
     resolution: Annotated[str, Option(metavar="W,H", help="Size of the pictures.")] = "1920,1080",
-    show: Annotated[bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")] = False,
+    show: Annotated[
+        bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")
+    ] = False,
     display: Annotated[str, Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
-    seconds: Annotated[float | None, Option(metavar="S", help="With --show: time for each patch, without keys.", min=0)] = None,
+    seconds: Annotated[
+        float | None,
+        Option(metavar="S", help="With --show: time for each patch, without keys.", min=0),
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -213,7 +332,9 @@ def plan(
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)
     check_files([], [], None, output if is_filled_in(output) else None, overwrite)
-    width, height = (round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM))
+    width, height = (
+        round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM)
+    )
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
     settings = PlanSettings(bits, levels, repeats, channels)
@@ -229,35 +350,57 @@ def plan(
     told = {"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written}
     print_found(as_json, told, [line, advice])
     if show:
-        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, seconds)
+        shown = show_patches(
+            planned, bits, int(display) if display.isdecimal() else display, seconds
+        )
         say(f"{shown} of {len(planned)} patches shown")
     elif headless is None:
-        say("add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them")
+        say(
+            "add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them"
+        )
 
 
 def photometric(
-    measured: Annotated[Path, Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")],
-    bits: Annotated[int | None, Option(help="Bits per code; by default from the codes measured.", min=1, max=16)] = None,
+    measured: Annotated[
+        Path,
+        Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md."),
+    ],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")
+    ],
+    bits: Annotated[
+        int | None, Option(help="Bits per code; by default from the codes measured.", min=1, max=16)
+    ] = None,
     who: Annotated[str, Option(help="Who made the measurements.")] = "",
     when: Annotated[str, Option(help="Date of the measurements; today by default.")] = "",
     instrument: Annotated[str, Option(help="Instrument used.")] = "",
     unit: Annotated[str, Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
-    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The response and its residuals.")] = None,
+    plot: Annotated[
+        Path | None, Option(metavar="OUT.png", help="The response and its residuals.")
+    ] = None,
     display: Annotated[
-        str, Option(metavar="INDEX|NAME", help="The display that was measured, where this machine has one.")
+        str,
+        Option(
+            metavar="INDEX|NAME", help="The display that was measured, where this machine has one."
+        ),
     ] = "0",
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
-    from hilstar.instruments.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+    from hilstar.instruments.calibrate.photometric import (
+        Provenance,
+        calibrate_photometric,
+        draw_calibration,
+    )
 
     check_ending("-o", output, TOML)
     refuse_stdout("-o", output)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
     identity = _monitor_of(int(display) if display.isdecimal() else display)
-    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits, identity)
+    found = calibrate_photometric(
+        measured, output, Provenance(who, when, instrument, unit), bits, identity
+    )
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))
@@ -267,7 +410,9 @@ def photometric(
     black, held = found["black_level"]["relative"], found["holdout"]
     contrast = f"1 : {1 / black:.0f}" if black > 0 else "unknown: no light at code 0"
     drift = "not known" if found["drift_percent"] is None else f"{found['drift_percent']:+.2f} %"
-    typer.echo(f"{'measured':20}{found['codes']} codes above black, {found['bits']} bits; drift {drift}")
+    typer.echo(
+        f"{'measured':20}{found['codes']} codes above black, {found['bits']} bits; drift {drift}"
+    )
     typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
     typer.echo(f"{'noise':20}{100 * found['noise_relative']:.2f} % of a reading")
     typer.echo(
@@ -276,10 +421,14 @@ def photometric(
     )
     for name, one in found["channels"].items() if len(found["channels"]) > 1 else ():
         rms, under = one["holdout"]["rms_percent"], one["black_level"]["relative"]
-        typer.echo(f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black {under:.3e} of its white")
+        typer.echo(
+            f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black {under:.3e} of its white"
+        )
     for decade, percent in (found["crosstalk_percent"] or {}).items():
         unsure = found["crosstalk_error_percent"][decade]
-        typer.echo(f"{'crosstalk at ' + decade:20}r + g + b is {percent:+.2f} +- {unsure:.2f} % from w")
+        typer.echo(
+            f"{'crosstalk at ' + decade:20}r + g + b is {percent:+.2f} +- {unsure:.2f} % from w"
+        )
     typer.echo(f"{'written':20}{', '.join(found['written'])}")
     typer.echo(f"{'in the bench file':20}[monitor] calibration = {json.dumps(output.name)}")
 
@@ -288,11 +437,20 @@ def scale(
     bench_file: BenchFile,
     reading: Annotated[
         list[str],
-        Option(metavar="HIP,DN[,SIGMA]", help="A star, the sum of its DN above the background, and the noise of that sum."),
+        Option(
+            metavar="HIP,DN[,SIGMA]",
+            help="A star, the sum of its DN above the background, and the noise of that sum.",
+        ),
     ],
-    exposure: Annotated[float | None, Option(metavar="S", help="The tracker's exposure; by default the bench file's.")] = None,
+    exposure: Annotated[
+        float | None,
+        Option(metavar="S", help="The tracker's exposure; by default the bench file's."),
+    ] = None,
     output: Annotated[
-        Path | None, Option("-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set.")
+        Path | None,
+        Option(
+            "-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set."
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -310,15 +468,26 @@ def scale(
         exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
     if found.scatter_mag > UNSURE_MAG:
-        say(f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response")
+        say(
+            f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response"
+        )
     if output is not None:
         with_flux_at_white(file, found, output)
     keys = ("flux_at_white_e_per_s", "assumed_e_per_s", "scatter_mag", "relative_error")
     summary: dict[str, Any] = {key: getattr(found, key) for key in keys}
-    summary |= {"readings": len(reading), "exposure_s": exposure_s, "written": None if output is None else str(output)}
-    lines = [f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:"]
+    summary |= {
+        "readings": len(reading),
+        "exposure_s": exposure_s,
+        "written": None if output is None else str(output),
+    }
+    lines = [
+        f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:"
+    ]
     lines.append(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
     if found.relative_error is not None:
         lines.append("# and how well it is known, under [certify]:")
-        lines += [f"flux_at_white_relative = {found.relative_error:.3g}", f"flux_at_white_dof = {len(found.ratios) - 1}"]
+        lines += [
+            f"flux_at_white_relative = {found.relative_error:.3g}",
+            f"flux_at_white_dof = {len(found.ratios) - 1}",
+        ]
     print_found(as_json, summary, lines)

@@ -31,20 +31,42 @@ LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
 def campaign(
-    plan: Annotated[Path, Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")],
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="DIR", help="Directory of the campaign; it goes on where it was.")
+    plan: Annotated[
+        Path, Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")
     ],
-    workers: Annotated[int | None, Option(help="Processes on this machine; by default one a core.", min=1, max=1024)] = None,
+    output: Annotated[
+        Path,
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Directory of the campaign; it goes on where it was.",
+        ),
+    ],
+    workers: Annotated[
+        int | None,
+        Option(help="Processes on this machine; by default one a core.", min=1, max=1024),
+    ] = None,
     scheduler: Annotated[
         str | None,
-        Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases; off loopback with TLS."),
+        Option(
+            metavar="tcp://HOST:PORT",
+            help="A Dask scheduler, whose workers run the cases; off loopback with TLS.",
+        ),
     ] = None,
     tls_ca_file: Annotated[
-        Path | None, Option(metavar="FILE", help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's.",
+        ),
     ] = None,
-    tls_cert: Annotated[Path | None, Option(metavar="FILE", help="This side's certificate, PEM.")] = None,
-    tls_key: Annotated[Path | None, Option(metavar="FILE", help="Its key, where the certificate's file has none.")] = None,
+    tls_cert: Annotated[
+        Path | None, Option(metavar="FILE", help="This side's certificate, PEM.")
+    ] = None,
+    tls_key: Annotated[
+        Path | None, Option(metavar="FILE", help="Its key, where the certificate's file has none.")
+    ] = None,
     solver: Annotated[
         str,
         Option(
@@ -52,20 +74,33 @@ def campaign(
             help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
         ),
     ] = CENTROIDS,
-    solver_timeout: Annotated[float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
-    images: Annotated[Literal["fits"] | None, Option(help="Keep the images, with their truth.")] = None,
+    solver_timeout: Annotated[
+        float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)
+    ] = 10.0,
+    images: Annotated[
+        Literal["fits"] | None, Option(help="Keep the images, with their truth.")
+    ] = None,
     memory: Annotated[
-        str | None, Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit.")
+        str | None,
+        Option(
+            metavar="SIZE",
+            help="For this process and its workers together, such as 4GB: as many run as fit.",
+        ),
     ] = None,
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
-    frames: Annotated[str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
+    frames: Annotated[
+        str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")
+    ] = None,
     console: running.Console = None,
     token: running.Token = None,
     console_name: running.ConsoleName = None,
     strict: Annotated[
-        bool, Option("--strict", help="Exit with code 1 where one of the plan's requirements is not met.")
+        bool,
+        Option(
+            "--strict", help="Exit with code 1 where one of the plan's requirements is not met."
+        ),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -76,14 +111,22 @@ def campaign(
 
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
-        raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
-    pooled = {"--workers": workers is not None, "--scheduler": scheduler is not None, "--memory": memory is not None}
+        raise InputError(
+            "campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory"
+        )
+    pooled = {
+        "--workers": workers is not None,
+        "--scheduler": scheduler is not None,
+        "--memory": memory is not None,
+    }
     pooled |= {"--images": images is not None, "--solver": solver != CENTROIDS}
     cluster = None if scheduler is None else Scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
     if cluster is not None:
         cluster.check()
     elif tls_ca_file or tls_cert or tls_key:
-        raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
+        raise InputError(
+            "campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it"
+        )
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
     of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
@@ -93,11 +136,15 @@ def campaign(
     try:
         directory.claim(this.about())
         if not directory.table.exists() and this.on_bench:
-            shown_bench = partial(running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True)
+            shown_bench = partial(
+                running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True
+            )
             with running.page_listener(console, False, token, console_name) as listener:
                 show_cases(this, directory, shown_bench, frames, listener)
         elif not directory.table.exists():
-            run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
+            run_cases(
+                this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes
+            )
         # charts and statistics, once there is a table
         from hilstar.instruments.campaign.results import lines_of, write_results
 
@@ -110,7 +157,10 @@ def campaign(
             lines += bench_lines(summary)
         if this.plan.require:
             from hilstar.instruments.campaign.requirements import NOT_MET
-            from hilstar.instruments.campaign.requirements_page import summary_of, write_requirements
+            from hilstar.instruments.campaign.requirements_page import (
+                summary_of,
+                write_requirements,
+            )
 
             verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
             not_met = any(each.verdict == NOT_MET for each in verdicts)
@@ -163,22 +213,38 @@ def show_cases(
 
         @contextmanager
         def display(file: "BenchFile") -> Iterator[OpenDisplay]:
-            with shown_bench(file) as (bench, screen), running.optional_frames(frames, bench, screen) as feed:
+            with (
+                shown_bench(file) as (bench, screen),
+                running.optional_frames(frames, bench, screen) as feed,
+            ):
                 ledger = LedgerSwitch()
                 renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
                 told = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
                 parts = running.page_parts(bench, notices, ledger, screen)
-                page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
-                with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):
+                page, status = (
+                    RunDescription("campaign", "campaign", where),
+                    RunStatus(told, ledger),
+                )
+                with running.followed(listener, False, page, parts, status, frames=feed) as (
+                    sink,
+                    follower,
+                    _,
+                ):
                     yield OpenDisplay(bench, screen, sink, follower)
 
         if not this.show(directory, display, notices, on_done):
-            say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
+            say(
+                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there"
+            )
             raise KeyboardInterrupt
 
 
 def run_cases(
-    this: "Campaign", directory: "Directory", scheduler: "Scheduler | None", workers: int, memory_bytes: int | None
+    this: "Campaign",
+    directory: "Directory",
+    scheduler: "Scheduler | None",
+    workers: int,
+    memory_bytes: int | None,
 ) -> None:
     """Run the missing cases on a cluster or on this machine's cores."""
     from hilstar.instruments.campaign.pool import Pool
@@ -201,7 +267,9 @@ def run_cases(
                 with Pool(this.job, this.identity, workers, memory_bytes) as pool:
                     this.run(directory, pool, on_done)
         except KeyboardInterrupt:
-            say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
+            say(
+                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there"
+            )
             raise
 
 
@@ -222,6 +290,8 @@ def telling(cases: int) -> Iterator[Callable[[int], None]]:
         if now_s - last_s >= LINE_S and done > first[0]:
             last_s = now_s
             a_second = (done - first[0]) / (now_s - first[1])
-            say(f"hilstar: {done} of {cases} cases, {a_second:.3g} a second, {(cases - done) / a_second:.0f} s left")
+            say(
+                f"hilstar: {done} of {cases} cases, {a_second:.3g} a second, {(cases - done) / a_second:.0f} s left"
+            )
 
     yield line

@@ -14,14 +14,27 @@ from hilstar.server.console.terminal import print_found
 def catalogue(
     bench_file: BenchFile,
     output: Annotated[
-        Path, Option("-o", "--output", metavar="STARS.csv|fits|parquet|vot", help="The table; its ending says what it is.")
+        Path,
+        Option(
+            "-o",
+            "--output",
+            metavar="STARS.csv|fits|parquet|vot",
+            help="The table; its ending says what it is.",
+        ),
     ],
     to: Annotated[
-        float | None, Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40)
+        float | None,
+        Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40),
     ] = None,
     epoch: Annotated[
         float | None,
-        Option("--epoch", metavar="JYEAR", help="Julian year of the places; the bench's by default.", min=-10_000, max=10_000),
+        Option(
+            "--epoch",
+            metavar="JYEAR",
+            help="Julian year of the places; the bench's by default.",
+            min=-10_000,
+            max=10_000,
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -32,12 +45,21 @@ def catalogue(
     from hilstar.server.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
 
     if output != STDOUT and output.suffix.lower() not in ENDINGS:
-        raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for CSV on stdout")
+        raise InputError(
+            f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for CSV on stdout"
+        )
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)
     found = bench_catalogue(file, to, epoch)
     write_catalogue(output, found)
-    told = {"file": str(output), "stars": len(found), "epoch_jyear": found.epoch_jyear, "zero_points_mag": found.zero_points}
+    told = {
+        "file": str(output),
+        "stars": len(found),
+        "epoch_jyear": found.epoch_jyear,
+        "zero_points_mag": found.zero_points,
+    }
     vega, ab = found.zero_points["vega"], found.zero_points["ab"]
     worth = f"an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB)"
-    print_found(as_json, told, [f"{len(found)} stars at J{found.epoch_jyear:g}; {worth}; wrote {output}"])
+    print_found(
+        as_json, told, [f"{len(found)} stars at J{found.epoch_jyear:g}; {worth}; wrote {output}"]
+    )

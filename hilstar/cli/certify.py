@@ -25,30 +25,69 @@ CERTIFICATE, REFERENCE, PAGE = "certificate.json", "reference.json", "index.html
 
 def certify(
     bench_file: BenchFile,
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory of the certificate and its checks.")],
-    check: Annotated[bool, Option("--check", help="Has the bench moved since its certificate? A minute's readings.")] = False,
-    again: Annotated[bool, Option("--again", help="Certify anew, in place of the certificate in DIR.")] = False,
+    output: Annotated[
+        Path,
+        Option(
+            "-o", "--output", metavar="DIR", help="Directory of the certificate and its checks."
+        ),
+    ],
+    check: Annotated[
+        bool,
+        Option("--check", help="Has the bench moved since its certificate? A minute's readings."),
+    ] = False,
+    again: Annotated[
+        bool, Option("--again", help="Certify anew, in place of the certificate in DIR.")
+    ] = False,
     grab: Annotated[
         str | None,
-        Option(metavar="CMD", help="Command that takes the tracker's image, as that of first-light ({output}, {pattern})."),
+        Option(
+            metavar="CMD",
+            help="Command that takes the tracker's image, as that of first-light ({output}, {pattern}).",
+        ),
     ] = None,
     virtual: Annotated[
-        Path | None, Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is.")
+        Path | None,
+        Option(
+            metavar="TRUTH.toml",
+            help="Without hardware: a bench file that says how the bench really is.",
+        ),
     ] = None,
     whole: Annotated[
-        bool, Option("--whole", help="With --virtual: draw every image of the tracker; else only figures are drawn.")
+        bool,
+        Option(
+            "--whole",
+            help="With --virtual: draw every image of the tracker; else only figures are drawn.",
+        ),
     ] = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="With --grab: the tracker's image with the monitor switched off.")
+        Path | None,
+        Option(
+            metavar="FILE", help="With --grab: the tracker's image with the monitor switched off."
+        ),
     ] = None,
     diode: Annotated[
-        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="With --grab: photodiode before the display's square.")
+        str | None,
+        Option(
+            metavar="serial:/dev/ttyX@BAUD",
+            help="With --grab: photodiode before the display's square.",
+        ),
     ] = None,
     warm_up: Annotated[
-        float, Option("--warm-up", metavar="MIN", min=0, max=240, help="Watch white for up to so long, until it is stable.")
+        float,
+        Option(
+            "--warm-up",
+            metavar="MIN",
+            min=0,
+            max=240,
+            help="Watch white for up to so long, until it is stable.",
+        ),
     ] = 0.0,
-    quick: Annotated[bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")] = False,
-    seed: Annotated[int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)] = 0,
+    quick: Annotated[
+        bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")
+    ] = False,
+    seed: Annotated[
+        int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)
+    ] = 0,
     as_json: Json = False,
 ) -> None:
     """State how sure a bench is: the light, places, attitude and latency of stars, with the
@@ -63,7 +102,12 @@ def certify(
     file = read_bench_file(bench_file)
     virtual = virtual_truth(virtual)
     check_files([virtual, dark], [], file)
-    for name, given in (("--grab", grab), ("--whole", whole or None), ("--dark", dark), ("--diode", diode)):
+    for name, given in (
+        ("--grab", grab),
+        ("--whole", whole or None),
+        ("--dark", dark),
+        ("--diode", diode),
+    ):
         if given is not None and (virtual is not None) != (name == "--whole"):
             raise InputError(
                 f"{name}: {'is for --virtual' if name == '--whole' else 'a virtual bench has its own'}; leave it out"
@@ -72,7 +116,19 @@ def certify(
         raise InputError("--check: reads the bench; write --grab CMD, or --virtual TRUTH.toml")
     now = datetime.datetime.now(datetime.UTC)
     with ExitStack() as ended:
-        reader = _reader(ended, file, make_directory(output), grab, virtual, whole, dark, diode, seed, check, again)
+        reader = _reader(
+            ended,
+            file,
+            make_directory(output),
+            grab,
+            virtual,
+            whole,
+            dark,
+            diode,
+            seed,
+            check,
+            again,
+        )
         if check and reader is not None:
             _check(file, reader, output, now, warm_up, as_json)
         else:
@@ -98,7 +154,9 @@ def _certify(
     path, replaces = output / CERTIFICATE, None
     if exists(path):
         if not again:
-            raise InputError(f"{path}: exists; write --again to certify anew in its place, --check to check it, or another -o")
+            raise InputError(
+                f"{path}: exists; write --again to certify anew in its place, --check to check it, or another -o"
+            )
         replaces = read_certificate(path).number
     warmed = None
     if warm_up and reader is not None:
@@ -106,7 +164,9 @@ def _certify(
         say(watched.line)
         warmed = None if watched.law == "none" else watched.bound
     checked = largest_changes(output)
-    found, reference = certified(file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces)
+    found, reference = certified(
+        file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
+    )
     raw = msgspec.json.format(msgspec.json.encode(found))
     digest = sha256_of(raw)
     if reference is not None:
@@ -114,31 +174,59 @@ def _certify(
     write_whole(path, raw)
     write_certificate_page(output / PAGE, found, digest)
     told = {**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)}
-    print_found(as_json, told, (f"{name:26}{text}" for name, text in text_lines(found, digest, output)))
+    print_found(
+        as_json, told, (f"{name:26}{text}" for name, text in text_lines(found, digest, output))
+    )
 
 
 def _check(
-    file: "files.BenchFile", reader: "Reader", output: Path, now: datetime.datetime, warm_up: float, as_json: bool
+    file: "files.BenchFile",
+    reader: "Reader",
+    output: Path,
+    now: datetime.datetime,
+    warm_up: float,
+    as_json: bool,
 ) -> None:
-    from hilstar.instruments.certify.check import by_bench_file, compare, read_reference, record, take_check, watch
+    from hilstar.instruments.certify.check import (
+        by_bench_file,
+        compare,
+        read_reference,
+        record,
+        take_check,
+        watch,
+    )
     from hilstar.server.bench.certificate import read_certificate
 
     reference, since = read_reference(output / REFERENCE), "the bench file"
     if exists(output / CERTIFICATE):
         since = read_certificate(output / CERTIFICATE).number
     elif reference is None:
-        say(f"{output}: has no certificate; the check is against the bench file (hilstar certify {file.path.name} -o {output})")
-    warmed = watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up") if warm_up else None
+        say(
+            f"{output}: has no certificate; the check is against the bench file (hilstar certify {file.path.name} -o {output})"
+        )
+    warmed = (
+        watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
+        if warm_up
+        else None
+    )
     figures = compare(file, reference or by_bench_file(file), take_check(file, reader))
     rows = record(output, now, since, figures)
     good = all(each.in_tolerance for each in figures)
     lines = []
     for each in figures:
         u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
-        lines.append(f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance ({each.threshold:.2g})")
+        lines.append(
+            f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance ({each.threshold:.2g})"
+        )
     lines += [f"{'since':16}{since}", *([] if warmed is None else [f"{'warm-up':16}{warmed.line}"])]
-    lines.append(f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}")
-    found = {"certificate": since, "in_tolerance": good, "checks": len({row["made"] for row in rows})}
+    lines.append(
+        f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}"
+    )
+    found = {
+        "certificate": since,
+        "in_tolerance": good,
+        "checks": len({row["made"] for row in rows}),
+    }
     print_found(as_json, found | {"figures": figures, "warm_up": warmed}, lines)
     if not good:
         raise typer.Exit(1)

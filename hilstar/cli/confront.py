@@ -7,24 +7,46 @@ import typer
 from typer import Argument, Option
 
 from hilstar.basics.files import check_directory
-from hilstar.cli.options import BenchFile, Json, QuaternionText, RadecText, check_files, parse_attitude
+from hilstar.cli.options import (
+    BenchFile,
+    Json,
+    QuaternionText,
+    RadecText,
+    check_files,
+    parse_attitude,
+)
 from hilstar.server.console.terminal import print_found, say
 
 
 def confront(
     bench_file: BenchFile,
-    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for the page, tracker.toml, tables.")],
+    images: Annotated[
+        list[Path],
+        Argument(metavar="IMAGE...", help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits."),
+    ],
+    output: Annotated[
+        Path,
+        Option(
+            "-o", "--output", metavar="DIR", help="Directory for the page, tracker.toml, tables."
+        ),
+    ],
     fixed: Annotated[
-        bool, Option("--fixed", help="Fit attitudes and background alone: does the bench file's camera predict these?")
+        bool,
+        Option(
+            "--fixed",
+            help="Fit attitudes and background alone: does the bench file's camera predict these?",
+        ),
     ] = False,
     radec: RadecText = None,
     quaternion: QuaternionText = None,
     at: Annotated[
-        str | None, Option("--at", metavar="UTC", help="When the images were taken, where they do not say it.")
+        str | None,
+        Option("--at", metavar="UTC", help="When the images were taken, where they do not say it."),
     ] = None,
     as_json: Json = False,
-    strict: Annotated[bool, Option("--strict", help="Exit with 1 where an image is beyond the limits.")] = False,
+    strict: Annotated[
+        bool, Option("--strict", help="Exit with 1 where an image is beyond the limits.")
+    ] = False,
 ) -> None:
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts
     against them.
@@ -36,12 +58,18 @@ def confront(
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
-    start = None if radec is None and quaternion is None else parse_attitude("confront", radec, quaternion)
+    start = (
+        None
+        if radec is None and quaternion is None
+        else parse_attitude("confront", radec, quaternion)
+    )
     at_ns = None if at is None else parse_utc(at)
     file: ReadFile = read_tracker_file(bench_file)[0]
     check_files(images, [output / name for name in OUTPUTS], file)
     tell = (lambda line: None) if as_json else typer.echo
-    found = confront_files(bench_file, images, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell)
+    found = confront_files(
+        bench_file, images, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell
+    )
     print_found(as_json, found.figures, [*found.lines, f"page: {output / 'index.html'}"])
     for note in (*found.notes, *found.failures):
         say(note)

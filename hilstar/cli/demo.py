@@ -33,19 +33,35 @@ MAX_MISSED = 0.01  # share of frames from which the budget is no longer the trac
 FREE_PORT = "tcp://127.0.0.1:*"
 # the tracker of --loop
 BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01
-PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
+PLANTED = [
+    "--bias",
+    ",".join(map(str, BIAS_ARCSEC)),
+    "--fov-error",
+    str(FOV_ARCSEC),
+    "--pixel-error",
+    str(PIXEL_ARCSEC),
+]
 PLANTED += ["--wrong", str(WRONG)]
 
 
 def demo(
-    output: Annotated[Path, Option("-o", "--output", help="Directory for the pictures.")] = Path("hilstar-demo"),
+    output: Annotated[Path, Option("-o", "--output", help="Directory for the pictures.")] = Path(
+        "hilstar-demo"
+    ),
     duration: Annotated[
-        float | None, Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600)
+        float | None,
+        Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600),
     ] = None,
     loop: Annotated[
-        bool, Option("--loop", help="A slow scan with a virtual tracker before the display, and its error budget.")
+        bool,
+        Option(
+            "--loop",
+            help="A slow scan with a virtual tracker before the display, and its error budget.",
+        ),
     ] = False,
-    seed: Annotated[int, Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)] = 1,
+    seed: Annotated[
+        int, Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)
+    ] = 1,
     console: running.Console = None,
     control: running.Control = False,
     token: running.Token = None,
@@ -73,10 +89,18 @@ def demo(
         progress("serving", seconds * HZ) as advance,
     ):
 
-        def watching(bench: "Bench", endpoint: str) -> "AbstractContextManager[tuple[FrameSink, Outlet]]":
-            return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker)
+        def watching(
+            bench: "Bench", endpoint: str
+        ) -> "AbstractContextManager[tuple[FrameSink, Outlet]]":
+            return _watching(
+                bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker
+            )
 
-        shows = Shows(demo_file, samples) if tracker is None else Shows(tracker.bench_file, samples, tracker.watches)
+        shows = (
+            Shows(demo_file, samples)
+            if tracker is None
+            else Shows(tracker.bench_file, samples, tracker.watches)
+        )
         result = run_demo(output, seconds, shows, watching)
     if result.kept and caught() is None:  # no pictures after Ctrl-C
         if not as_json:
@@ -91,7 +115,9 @@ def demo(
             line = f"the display missed {missed} frames, and answers that looked while it held a frame are in no figure"
             say(f"hilstar: {line}; the machine is busy: close other programs, and run it again")
     if not as_json:
-        typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
+        typer.echo(
+            f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)"
+        )
     if result.summary.stale_frames and caught() is None:
         line = (
             f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no attitude came in time; "
@@ -118,29 +144,46 @@ def _watching(
     from hilstar.server.serve import Outlet
 
     notices = Notices()
-    status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
+    status = RunStatus(
+        RunSource(
+            f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
+        )
+    )
     with (
-        running.optional_ledger(None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT) as kept,
+        running.optional_ledger(
+            None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT
+        ) as kept,
         running.optional_answers(bench, notices, kept, None) as answers,
         running.optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
         parts = running.page_parts(bench, notices, kept, answers=answers)
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
-        with running.followed(listener, control, page, parts, status, advance, frames) as (sink, follower, requests):
-            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers)
+        with running.followed(listener, control, page, parts, status, advance, frames) as (
+            sink,
+            follower,
+            requests,
+        ):
+            yield (
+                sink,
+                Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers),
+            )
     running.refuse_lost_gpu(notices)
 
 
 @contextmanager
-def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> "Iterator[TrackerBeside]":
+def tracker_beside(
+    folder: Path, demo_file: Path, seconds: float, seed: int
+) -> "Iterator[TrackerBeside]":
     """The demo's tracker, whose answers come by a socket of its own; the bench file that names
     it is in `folder`.
     """
     make_directory(folder)
     with temporary_folder("loop") as place:
         endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
-        answers = f'[answers]\nsource = "zmq"\nformat = "json"\nclock = "host"\nendpoint = "{endpoint}"\n'
+        answers = (
+            f'[answers]\nsource = "zmq"\nformat = "json"\nclock = "host"\nendpoint = "{endpoint}"\n'
+        )
         bench_file.write_text(f"{demo_file.read_text()}\n{answers}")
         yield TrackerBeside(folder, bench_file, endpoint, seconds, seed)
 
@@ -150,9 +193,25 @@ class TrackerBeside:
     found of it.
     """
 
-    def __init__(self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int) -> None:
-        self.ledger, self.bench_file, self._page = folder / "loop.mcap", bench_file, folder / "budget.html"
-        self._words = ["--answer", answers, "--format", "json", "--duration", f"{seconds:g}", "--seed", str(seed), *PLANTED]
+    def __init__(
+        self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int
+    ) -> None:
+        self.ledger, self.bench_file, self._page = (
+            folder / "loop.mcap",
+            bench_file,
+            folder / "budget.html",
+        )
+        self._words = [
+            "--answer",
+            answers,
+            "--format",
+            "json",
+            "--duration",
+            f"{seconds:g}",
+            "--seed",
+            str(seed),
+            *PLANTED,
+        ]
         self._feed: FrameFeed | None = None
         self._process: subprocess.Popen[str] | None = None
 
@@ -160,7 +219,15 @@ class TrackerBeside:
     def before(self, frames: "FrameFeed") -> Iterator[None]:
         """Run it before the frames of a feed; it ends by itself, or with this."""
         self._feed = frames
-        command = [sys.executable, "-m", "hilstar", "tracker", str(self.bench_file), "--watch", frames.endpoint]
+        command = [
+            sys.executable,
+            "-m",
+            "hilstar",
+            "tracker",
+            str(self.bench_file),
+            "--watch",
+            frames.endpoint,
+        ]
         with subprocess.Popen(
             [*command, *self._words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         ) as self._process:
@@ -174,7 +241,9 @@ class TrackerBeside:
         if self._process is None or self._feed is None:
             return False
         if self._process.poll() is not None:
-            said = (self._process.stderr.read().strip().splitlines() if self._process.stderr else []) or ["nothing"]
+            said = (
+                self._process.stderr.read().strip().splitlines() if self._process.stderr else []
+            ) or ["nothing"]
             raise MachineError(f"the demo's tracker ended before the run; it said: {said[-1]}")
         return self._feed.watched
 
@@ -194,16 +263,25 @@ class TrackerBeside:
         write_page(self._page, found)
         parts = found.found
         rows: list[tuple[str, float, float | None, str]] = [
-            ("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec") for k, axis in enumerate("xyz")
+            ("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec")
+            for k, axis in enumerate("xyz")
         ]
         for name, planted, axes in (
             ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
             ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
         ):
-            rows += [(f"{name} across", planted, axes.cross, "arcsec"), (f"{name} about", ROLL * planted, axes.roll, "arcsec")]
+            rows += [
+                (f"{name} across", planted, axes.cross, "arcsec"),
+                (f"{name} about", ROLL * planted, axes.roll, "arcsec"),
+            ]
         if isinstance(live, TrackerFigures) and live.answers:
             rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
-        told = {"loop": [{"quantity": name, "planted": a, "found": b, "unit": unit} for name, a, b, unit in rows]}
+        told = {
+            "loop": [
+                {"quantity": name, "planted": a, "found": b, "unit": unit}
+                for name, a, b, unit in rows
+            ]
+        }
         if as_json:
             say(json.dumps(told))
             return
@@ -212,4 +290,6 @@ class TrackerBeside:
         typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
         for name, planted_value, value, unit in rows:
-            typer.echo(f"{name:28}{planted_value:10.2f}{'unknown' if value is None else f'{value:.2f}':>10} {unit}")
+            typer.echo(
+                f"{name:28}{planted_value:10.2f}{'unknown' if value is None else f'{value:.2f}':>10} {unit}"
+            )

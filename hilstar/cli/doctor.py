@@ -14,12 +14,17 @@ from hilstar.server.console.terminal import print_found
 
 OwnBench = Annotated[
     Path | None,
-    Argument(metavar="[BENCH.toml]", help="A bench file, or one with heads, to be checked too.", show_default=False),
+    Argument(
+        metavar="[BENCH.toml]",
+        help="A bench file, or one with heads, to be checked too.",
+        show_default=False,
+    ),
 ]
 Report = Annotated[
     bool,
     Option(
-        "--report", help="Print this machine as a row of the table of docs/where-it-fails.md, without names or serial numbers."
+        "--report",
+        help="Print this machine as a row of the table of docs/where-it-fails.md, without names or serial numbers.",
     ),
 ]
 

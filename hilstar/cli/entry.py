@@ -33,7 +33,9 @@ NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 # a word that a shell makes of numbers with spaces between them
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")
-ELSEWHERE = dict.fromkeys(("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays")
+ELSEWHERE = dict.fromkeys(
+    ("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays"
+)
 
 
 def main() -> NoReturn:
@@ -65,7 +67,10 @@ def run_command(words: list[str]) -> int:
         if not writes_to_stdout(words):
             return _run(with_values(words))
         if "--json" in words:
-            fail("--json and an output to -: both are for stdout; give a name for the output", InputError.exit_code)
+            fail(
+                "--json and an output to -: both are for stdout; give a name for the output",
+                InputError.exit_code,
+            )
         with contextlib.redirect_stdout(sys.stderr):  # stdout is the file's alone
             return _run(with_values(words))
     except SystemExit as end:  # raised by `fail`
@@ -75,7 +80,9 @@ def run_command(words: list[str]) -> int:
 def writes_to_stdout(words: list[str]) -> bool:
     """Whether an option of a command line has the value "-", as in -o - or --truth=-."""
     joined = any(re.fullmatch(r"--[a-z][a-z-]*=-|-o-", word) for word in words)
-    return joined or any(word == "-" and before.startswith("-") and before != "-" for before, word in pairwise(words))
+    return joined or any(
+        word == "-" and before.startswith("-") and before != "-" for before, word in pairwise(words)
+    )
 
 
 def _run(words: list[str]) -> int:
@@ -108,7 +115,11 @@ def _run(words: list[str]) -> int:
 def usage_line(error: Any, words: list[str]) -> str:
     """The line for a wrong command line: typer's `error`, and what to write instead."""
     said = str(error.format_message()).replace("Value error, ", "").rstrip(".")
-    said = re.sub(r"a valid (float|int)\w*( range)?", lambda m: "a number" if m[1] == "float" else "a whole number", said)
+    said = re.sub(
+        r"a valid (float|int)\w*( range)?",
+        lambda m: "a number" if m[1] == "float" else "a whole number",
+        said,
+    )
     at = getattr(error, "ctx", None)
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
     if (spaced := _spaced_numbers(words)) is not None:
@@ -117,11 +128,22 @@ def usage_line(error: Any, words: list[str]) -> str:
         return f"{missing}: no such file; give one that is there {see}"
     if (other := re.match(r"No such command '(.*?)'", said)) and at is not None:
         known = list(getattr(at.command, "commands", {}))
-        advice = ELSEWHERE.get(other[1]) or did_you_mean(other[1], known).strip() or f"the commands are {', '.join(known)}"
+        advice = (
+            ELSEWHERE.get(other[1])
+            or did_you_mean(other[1], known).strip()
+            or f"the commands are {', '.join(known)}"
+        )
         return f"No such command '{shortened(other[1])}'; {advice} {see}"
     if said.startswith("No such option") and at is not None:
-        known = [name for one in at.command.params for name in (*one.opts, *one.secondary_opts) if name.startswith("-")]
-        advice = did_you_mean(error.option_name, known).strip() or f"its options are {', '.join(known)}"
+        known = [
+            name
+            for one in at.command.params
+            for name in (*one.opts, *one.secondary_opts)
+            if name.startswith("-")
+        ]
+        advice = (
+            did_you_mean(error.option_name, known).strip() or f"its options are {', '.join(known)}"
+        )
         return f"No such option: {shortened(error.option_name)}; {advice} {see}"
     if choice := re.search(r"'([^']*)' is not one of (.*)", said):
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
@@ -135,7 +157,11 @@ def _missing_file(words: list[str]) -> str | None:
     It is said before an option that is missing too: with another file the option may be another.
     """
     for before, word in pairwise(words):
-        if not before.startswith("-") and Path(word).suffix.lower() in INPUT_ENDINGS and not exists(Path(word)):
+        if (
+            not before.startswith("-")
+            and Path(word).suffix.lower() in INPUT_ENDINGS
+            and not exists(Path(word))
+        ):
             return word
     return None
 
@@ -164,7 +190,10 @@ def _fail_for_the_machine(error: Exception) -> None:
             what = os.fsdecode(error.filename)
         else:
             _let_go_of_stdout()
-        fail(f"{what}: cannot be written or read ({error.strerror}); choose another place", InputError.exit_code)
+        fail(
+            f"{what}: cannot be written or read ({error.strerror}); choose another place",
+            InputError.exit_code,
+        )
     if isinstance(error, MemoryError):
         fail("not enough memory for this; give smaller files or sizes", MachineError.exit_code)
 

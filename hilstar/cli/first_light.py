@@ -30,7 +30,13 @@ EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 def first_light(
     bench_file: BenchFile,
     output: Annotated[
-        Path, Option("-o", "--output", metavar="SESSION", help="Directory of the session; an older one is gone on with.")
+        Path,
+        Option(
+            "-o",
+            "--output",
+            metavar="SESSION",
+            help="Directory of the session; an older one is gone on with.",
+        ),
     ],
     grab: Annotated[
         str | None,
@@ -50,14 +56,25 @@ def first_light(
     ] = None,
     dark: Annotated[
         Path | None,
-        Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
+        Option(
+            metavar="FILE",
+            help="The tracker's image with the monitor switched off, for the monitor's black level.",
+        ),
     ] = None,
     diode: Annotated[
-        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay.")
+        str | None,
+        Option(
+            metavar="serial:/dev/ttyX@BAUD",
+            help="Photodiode before the display's square, for its delay.",
+        ),
     ] = None,
     patches: Annotated[
         int | None,
-        Option(metavar="N", help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]", min=0),
+        Option(
+            metavar="N",
+            help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]",
+            min=0,
+        ),
     ] = None,
     warm_up: Annotated[
         float | None,
@@ -77,8 +94,12 @@ def first_light(
             max=1000,
         ),
     ] = None,
-    again: Annotated[list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
-    seed: Annotated[int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
+    again: Annotated[
+        list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")
+    ] = None,
+    seed: Annotated[
+        int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)
+    ] = 0,
     force: Force = False,
     console: Console = None,
     control: Control = False,
@@ -93,13 +114,20 @@ def first_light(
     session.json and first-light.html.
     """
     from hilstar.instruments.calibrate.first_light.page import write_page
-    from hilstar.instruments.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
+    from hilstar.instruments.calibrate.first_light.session import (
+        BEFORE_FILE,
+        NAMES,
+        FirstLightSession,
+        alone_in,
+    )
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.sync import beat_line
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:
-        raise InputError(f"--again {wrong[0]}: {did_you_mean(wrong[0], NAMES)}write one of {', '.join(NAMES)}")
+        raise InputError(
+            f"--again {wrong[0]}: {did_you_mean(wrong[0], NAMES)}write one of {', '.join(NAMES)}"
+        )
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     virtual = virtual_truth(virtual)
@@ -107,8 +135,12 @@ def first_light(
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     if by_hand and warm_up:
-        raise InputError("--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave it out")
-    watched_s = SECONDS * ((0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up)
+        raise InputError(
+            "--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave it out"
+        )
+    watched_s = SECONDS * (
+        (0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up
+    )
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
@@ -119,7 +151,14 @@ def first_light(
         for line in source.forced:
             tell(f"{FORCED:12} {line}")
         session = FirstLightSession(
-            output, file, source, readings, watch, watched_s=watched_s, frames=frames or 0, progress=say
+            output,
+            file,
+            source,
+            readings,
+            watch,
+            watched_s=watched_s,
+            frames=frames or 0,
+            progress=say,
         )
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())
@@ -128,7 +167,9 @@ def first_light(
         page = write_page(output, session.as_file(), output / BEFORE_FILE)
     found = session.as_file()
     lines = [f"{record.name:12} {record.verdict:8} {record.line}" for record in found.steps]
-    print_found(as_json, msgspec.to_builtins(found) | {"page": str(page)}, [*lines, f"{'page':12} {page}"])
+    print_found(
+        as_json, msgspec.to_builtins(found) | {"page": str(page)}, [*lines, f"{'page':12} {page}"]
+    )
     if code:
         raise typer.Exit(code)
 
@@ -162,17 +203,29 @@ def virtual_truth(path: Path | None) -> Path | None:
 
 
 def image_source(
-    file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
+    file: "files.BenchFile",
+    grab: str | None,
+    virtual: Path | None,
+    dark: Path | None,
+    diode: str | None,
+    seed: int,
 ) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""
-    from hilstar.instruments.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench
+    from hilstar.instruments.calibrate.first_light.image_sources import (
+        ByHand,
+        GrabCommand,
+        SerialDiode,
+        VirtualBench,
+    )
     from hilstar.instruments.calibrate.geometric.observed import read_image
     from hilstar.server.bench.bench_file import read_bench_file
 
     if virtual is not None:
         for name, given in (("grab", grab), ("dark", dark), ("diode", diode)):
             if given is not None:
-                raise InputError(f"--{name} and --virtual: a virtual bench has its own; leave one of them out")
+                raise InputError(
+                    f"--{name} and --virtual: a virtual bench has its own; leave one of them out"
+                )
         return VirtualBench(file, read_bench_file(virtual), seed)
     if dark is not None:
         read_image(dark, file.config.tracker.resolution_px)

@@ -22,7 +22,8 @@ EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 
 
 def fmu(
-    bench_file: BenchFile, output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")]
+    bench_file: BenchFile,
+    output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")],
 ) -> None:
     """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and
     answered attitude out.
@@ -44,12 +45,18 @@ def _address(path: Path, settings: object) -> str:
 
     assert isinstance(settings, AttitudeSettings)
     if settings.source != "udp":
-        raise InputError(f'{path}: [attitude] source = "{settings.source}"; an FMU sends over UDP: write source = "udp"')
+        raise InputError(
+            f'{path}: [attitude] source = "{settings.source}"; an FMU sends over UDP: write source = "udp"'
+        )
     place, _ = udp_road(settings)
     if not place.port:
-        raise InputError(f"{path}: [attitude] port 0 is another one at each start; write the port to which the FMU sends")
+        raise InputError(
+            f"{path}: [attitude] port 0 is another one at each start; write the port to which the FMU sends"
+        )
     if not settings.status_hz:
-        raise InputError(f"{path}: [attitude] status_hz = 0, by which an FMU hears nothing; write 10 or more")
+        raise InputError(
+            f"{path}: [attitude] status_hz = 0, by which an FMU hears nothing; write 10 or more"
+        )
     host = "[::1]" if place.host.version == 6 else "127.0.0.1"
     named = f"[{place.host}]" if place.host.version == 6 else str(place.host)
     return f"{host if place.host.is_unspecified else named}:{place.port}"

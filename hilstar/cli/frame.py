@@ -17,11 +17,19 @@ def frame(
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
     output: Annotated[
-        Path | None, Option("-o", "--output", metavar="OUT.fits", help="The linear image, electrons per second.")
+        Path | None,
+        Option(
+            "-o", "--output", metavar="OUT.fits", help="The linear image, electrons per second."
+        ),
     ] = None,
-    truth: Annotated[Path | None, Option(metavar="OUT.csv", help="The truth table: one row for each star in view.")] = None,
+    truth: Annotated[
+        Path | None,
+        Option(metavar="OUT.csv", help="The truth table: one row for each star in view."),
+    ] = None,
     codes: Annotated[Path | None, Option(metavar="OUT.png", help="The code values.")] = None,
-    preview: Annotated[Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
+    preview: Annotated[
+        Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")
+    ] = None,
     at: options.AtSeconds = None,
     scenario: options.ScenarioFile = None,
     explain: options.Explain = False,
@@ -40,7 +48,10 @@ def frame(
     file = read_bench_file(bench_file)
     q = options.parse_attitude("frame", radec, quaternion)
     targets = _targets(output, truth, codes, preview)
-    t_ns, wrong = options.parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
+    t_ns, wrong = (
+        options.parse_at("frame", at, file.config, scenario is not None),
+        optional_scenario(scenario),
+    )
     file = at_moment(file, t_ns)
     options.check_files([scenario], targets, file)
     fields = fields_of_view(file.config, file.folder)
@@ -82,7 +93,9 @@ def frame(
     names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
     missing = summary["left_out"]
     if missing["stars"]:
-        names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
+        names += (
+            f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
+        )
     if summary["faults"]:
         names += f", faults: {', '.join(summary['faults'])}"
     drawn = f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}"
@@ -90,7 +103,9 @@ def frame(
     say_optics(fields, star)  # after the refusals: a failing command prints one line
 
 
-def _targets(output: Path | None, truth: Path | None, codes: Path | None, preview: Path | None) -> list[Path]:
+def _targets(
+    output: Path | None, truth: Path | None, codes: Path | None, preview: Path | None
+) -> list[Path]:
     """The files to write. Raises InputError for none, and for one of another kind."""
     check_ending("-o", output, FITS)
     check_ending("--truth", truth, CSV)
@@ -98,13 +113,17 @@ def _targets(output: Path | None, truth: Path | None, codes: Path | None, previe
     check_ending("--preview", preview, PNG)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     if not targets:
-        raise InputError("frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
+        raise InputError(
+            "frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png"
+        )
     return targets
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:
     """ "HIP 24436 by 0.12 mag, 27989 by 0.50 mag, Moon by 9.81 mag"."""
-    stars = ", ".join(f"{hip} by {mag:.2f} mag" for hip, mag in loss_mag.items() if isinstance(hip, int))
+    stars = ", ".join(
+        f"{hip} by {mag:.2f} mag" for hip, mag in loss_mag.items() if isinstance(hip, int)
+    )
     bodies = [f"{name} by {mag:.2f} mag" for name, mag in loss_mag.items() if isinstance(name, str)]
     return ", ".join([*([f"HIP {stars}"] if stars else []), *bodies])
 

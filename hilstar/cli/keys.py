@@ -11,7 +11,9 @@ from hilstar.server.console.terminal import say
 
 
 def keys(
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for the keys.")] = Path("hilstar-keys"),
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="DIR", help="Directory for the keys.")
+    ] = Path("hilstar-keys"),
 ) -> None:
     """Make CURVE keys for ZeroMQ: non-loopback endpoints require them."""
     from hilstar.attitude.wire.keys import make_keys

@@ -16,14 +16,27 @@ LEDGER_BEHIND_S = 0.5  # the newest part of a running ledger may not be on the d
 
 def latency(
     ledger: RunFile,
-    edges: Annotated[Path | None, Option(metavar="EDGES.csv", help="Edges from a file: host_ns,level.")] = None,
-    diode: Annotated[
-        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="Read edges from this device while serve runs.")
+    edges: Annotated[
+        Path | None, Option(metavar="EDGES.csv", help="Edges from a file: host_ns,level.")
     ] = None,
-    duration: Annotated[float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)] = 10.0,
-    save: Annotated[Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")] = None,
-    write: Annotated[Path | None, Option(metavar="BENCH.toml", help="Set panel_delay_ms in this bench file.")] = None,
-    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for the chart.")] = None,
+    diode: Annotated[
+        str | None,
+        Option(
+            metavar="serial:/dev/ttyX@BAUD", help="Read edges from this device while serve runs."
+        ),
+    ] = None,
+    duration: Annotated[
+        float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)
+    ] = 10.0,
+    save: Annotated[
+        Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")
+    ] = None,
+    write: Annotated[
+        Path | None, Option(metavar="BENCH.toml", help="Set panel_delay_ms in this bench file.")
+    ] = None,
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="DIR", help="Directory for the chart.")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -34,9 +47,17 @@ def latency(
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)
-    check_files([ledger, edges], [write, None if output is None else output / "latency.png"], None, save, overwrite)
+    check_files(
+        [ledger, edges],
+        [write, None if output is None else output / "latency.png"],
+        None,
+        save,
+        overwrite,
+    )
     if (edges is None) == (diode is None):
-        raise InputError("latency: give the edges with either --edges EDGES.csv or --diode serial:/dev/ttyX@115200")
+        raise InputError(
+            "latency: give the edges with either --edges EDGES.csv or --diode serial:/dev/ttyX@115200"
+        )
     if diode is None:
         found = by_diode.read_edges(edges or Path())
     else:

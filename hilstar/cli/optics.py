@@ -17,18 +17,35 @@ if TYPE_CHECKING:
     from hilstar.optics.glass.psf_file import Glass
 
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1024,1024"
-Output = Annotated[Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")]
-Oversampling = Annotated[int, Option(help="Samples a tracker pixel along each axis.", min=1, max=64)]
-Tolerance = Annotated[float, Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1)]
+Output = Annotated[
+    Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")
+]
+Oversampling = Annotated[
+    int, Option(help="Samples a tracker pixel along each axis.", min=1, max=64)
+]
+Tolerance = Annotated[
+    float,
+    Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1),
+]
 
 
 def map_(
-    stack: Annotated[Path, Argument(metavar="STACK.fits", help="Images (n, height, width), the chief ray in the middle.")],
-    points: Annotated[Path, Argument(metavar="POINTS.csv", help="x_px,y_px[,wavelength_nm,...] of each image.")],
+    stack: Annotated[
+        Path,
+        Argument(
+            metavar="STACK.fits", help="Images (n, height, width), the chief ray in the middle."
+        ),
+    ],
+    points: Annotated[
+        Path, Argument(metavar="POINTS.csv", help="x_px,y_px[,wavelength_nm,...] of each image.")
+    ],
     output: Output,
     oversampling: Oversampling = 1,
     pixel_integrated: Annotated[
-        bool, Option("--pixel-integrated", help="The pixel is integrated in the images, as in measured ones.")
+        bool,
+        Option(
+            "--pixel-integrated", help="The pixel is integrated in the images, as in measured ones."
+        ),
     ] = False,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -44,10 +61,20 @@ def map_(
 
 
 def zernike(
-    pupil: Annotated[Path, Argument(metavar="FILE.toml", help="Aperture, aberrations, field points, wavelengths, focus.")],
+    pupil: Annotated[
+        Path,
+        Argument(
+            metavar="FILE.toml", help="Aperture, aberrations, field points, wavelengths, focus."
+        ),
+    ],
     output: Output,
     oversampling: Annotated[
-        int | None, Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64)
+        int | None,
+        Option(
+            help="Samples a tracker pixel along each axis; by default as diffraction needs.",
+            min=1,
+            max=64,
+        ),
     ] = None,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -64,24 +91,49 @@ def zernike(
 
 def lens(
     prescription: Annotated[
-        Path, Argument(metavar="PRESCRIPTION", help="A lens: .zmx of Zemax, .seq of CODE V, .json of optiland.")
+        Path,
+        Argument(
+            metavar="PRESCRIPTION", help="A lens: .zmx of Zemax, .seq of CODE V, .json of optiland."
+        ),
     ],
     output: Output,
     bench: Annotated[
-        Path | None, Option(metavar="BENCH.toml", help="A bench whose tracker has the pixel pitch and resolution.")
+        Path | None,
+        Option(
+            metavar="BENCH.toml", help="A bench whose tracker has the pixel pitch and resolution."
+        ),
     ] = None,
     pitch_um: Annotated[
-        float | None, Option("--pitch-um", help="The tracker's pixel pitch, in place of the bench's.", min=0.1, max=1000)
+        float | None,
+        Option(
+            "--pitch-um",
+            help="The tracker's pixel pitch, in place of the bench's.",
+            min=0.1,
+            max=1000,
+        ),
     ] = None,
     resolution: Annotated[
-        str | None, Option(metavar="W,H", help="The tracker's resolution, px, in place of the bench's.")
+        str | None,
+        Option(metavar="W,H", help="The tracker's resolution, px, in place of the bench's."),
     ] = None,
     focuses_um: Annotated[
-        str, Option("--focuses-um", metavar="UM[,...]", help="Focus positions; positive: farther from the lens.")
+        str,
+        Option(
+            "--focuses-um",
+            metavar="UM[,...]",
+            help="Focus positions; positive: farther from the lens.",
+        ),
     ] = "0",
-    half_px: Annotated[int, Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)] = 8,
+    half_px: Annotated[
+        int, Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)
+    ] = 8,
     oversampling: Annotated[
-        int | None, Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64)
+        int | None,
+        Option(
+            help="Samples a tracker pixel along each axis; by default as diffraction needs.",
+            min=1,
+            max=64,
+        ),
     ] = None,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -106,9 +158,18 @@ def lens(
         tracker = read_bench_file(bench).config.tracker
         pitch_um, size = pitch_um or tracker.pixel_pitch_um, size or tracker.resolution_px
     if pitch_um is None or size is None:
-        raise InputError("a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and --resolution W,H")
-    focuses = parse_numbers(focuses_um, focuses_um.count(",") + 1, "--focuses-um", "--focuses-um in um, such as -20,0,20")
-    found = glass_of_prescription(prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance)
+        raise InputError(
+            "a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and --resolution W,H"
+        )
+    focuses = parse_numbers(
+        focuses_um,
+        focuses_um.count(",") + 1,
+        "--focuses-um",
+        "--focuses-um in um, such as -20,0,20",
+    )
+    found = glass_of_prescription(
+        prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance
+    )
     for note in found.notes:
         say(f"{prescription}: {note}")
     facts: dict[str, Any] = {"focal_length_mm": found.focal_length_mm, "f_number": found.f_number}

@@ -28,48 +28,83 @@ if TYPE_CHECKING:
     from hilstar.server.bench.config import BenchConfig
     from hilstar.server.record.ledger import SplitLimits
 
-BenchFile = Annotated[Path, Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
-Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
+BenchFile = Annotated[
+    Path, Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")
+]
+Json = Annotated[
+    bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")
+]
 Headless = Annotated[bool, Option("--headless", help="Draw without a window.")]
-RadecText = Annotated[str | None, Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
-QuaternionText = Annotated[str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file that could not be made again.")]
+RadecText = Annotated[
+    str | None,
+    Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS."),
+]
+QuaternionText = Annotated[
+    str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")
+]
+Overwrite = Annotated[
+    bool, Option("--overwrite", help="Replace an existing file that could not be made again.")
+]
 Explain = Annotated[
-    bool, Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
+    bool,
+    Option(
+        "--explain",
+        help="Explain on stderr what was chosen for this scene, with its error and its saving.",
+    ),
 ]
 AtSeconds = Annotated[
-    float | None, Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.")
+    float | None,
+    Option(
+        "--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default."
+    ),
 ]
 RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 ScenarioFile = Annotated[
-    Path | None, Option("--scenario", metavar="FILE.toml", help="Faults on request: what is wrong in the sky, and when.")
+    Path | None,
+    Option(
+        "--scenario",
+        metavar="FILE.toml",
+        help="Faults on request: what is wrong in the sky, and when.",
+    ),
 ]
 # What a user states of a log (see `LogStatements`).
 unsaid = partial(Option, rich_help_panel="What the log itself does not say")
-KernelFiles = Annotated[list[Path] | None, unsaid("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.")]
-TopicName = Annotated[str | None, unsaid("--topic", metavar="NAME", help="The topic, where a bag has several.")]
-BodyName = Annotated[str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")]
+KernelFiles = Annotated[
+    list[Path] | None, unsaid("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.")
+]
+TopicName = Annotated[
+    str | None, unsaid("--topic", metavar="NAME", help="The topic, where a bag has several.")
+]
+BodyName = Annotated[
+    str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")
+]
 REFERENCE_HELP = "The frame that attitudes refer to, or what its axes are: icrs, enu, ned."
 ReferenceName = Annotated[str | None, unsaid("--reference", metavar="FRAME", help=REFERENCE_HELP)]
-EpochUtc = Annotated[str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")]
+EpochUtc = Annotated[
+    str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")
+]
 PLACE_HELP = "Where the vehicle is: degrees and metres, WGS84."
 PlaceText = Annotated[str | None, unsaid("--place", metavar="LAT,LON,HEIGHT", help=PLACE_HELP)]
 MOUNTING_HELP = "q_body_to_cam, for a log of the body's attitude."
 MountingText = Annotated[str | None, unsaid("--mounting", metavar="W,X,Y,Z", help=MOUNTING_HELP)]
 CONVENTION_METAVAR = "scalar=last,direction=cam_to_icrs,frame=body"
-CONVENTION_HELP = "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude] convention."
-ConventionText = Annotated[str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)]
+CONVENTION_HELP = (
+    "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude] convention."
+)
+ConventionText = Annotated[
+    str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)
+]
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS or CIC AEM, STK .a, MCAP (a ledger), a SPICE CK or a ROS bag."
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MAX_SPIN_RAD_S = 1e6
-SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
+SPIN_FORM = (
+    "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
+)
 SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
 SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
 SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
-READING_FORM = (
-    "write --reading HIP,DN or HIP,DN,SIGMA: a star's Hipparcos number, the sum of its DN over the background, and its noise"
-)
+READING_FORM = "write --reading HIP,DN or HIP,DN,SIGMA: a star's Hipparcos number, the sum of its DN over the background, and its noise"
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
 MAX_AT_S = 1e10
@@ -125,13 +160,17 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
     from hilstar.server.bench.frame import checked_quaternion
 
     if (radec is None) == (quaternion is None):
-        raise InputError(f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z")
+        raise InputError(
+            f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z"
+        )
     if radec is not None:
         return from_radec_roll_deg(*parse_radec(radec))
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
 
 
-def parse_at(command: str, at_s: float | None, config: "BenchConfig", timed: bool = False) -> int | None:
+def parse_at(
+    command: str, at_s: float | None, config: "BenchConfig", timed: bool = False
+) -> int | None:
     """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where
     nothing changes with time.
     """
@@ -178,7 +217,9 @@ def parse_spin(text: str) -> "FloatArray":
     *axis, rate_text = [part.strip() for part in text.split(",")]
     try:
         rate = math.radians(float(rate_text))
-        vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
+        vector = np.array(
+            SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis]
+        )
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
     length = math.hypot(*vector)
@@ -191,9 +232,13 @@ def parse_place(text: str | None) -> tuple[float, float, float] | None:
     """Latitude and longitude in degrees, and height in metres. Raises InputError."""
     if text is None:
         return None
-    latitude_deg, longitude_deg, height_m = parse_numbers(text, 3, "--place", "LAT,LON,HEIGHT in degrees and metres")
+    latitude_deg, longitude_deg, height_m = parse_numbers(
+        text, 3, "--place", "LAT,LON,HEIGHT in degrees and metres"
+    )
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 360):
-        raise InputError(f"--place {text}: write a latitude from -90 to 90 and a longitude from -180 to 360")
+        raise InputError(
+            f"--place {text}: write a latitude from -90 to 90 and a longitude from -180 to 360"
+        )
     return latitude_deg, longitude_deg, height_m
 
 
@@ -204,7 +249,9 @@ def parse_mounting(text: str) -> "Mounting":
 
     w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
     if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
-        raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
+        raise InputError(
+            f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z"
+        )
     return Mounting((w, x, y, z), by_option=True)
 
 
@@ -221,9 +268,13 @@ def parse_convention(text: str) -> dict[str, str]:
     for part in text.split(","):
         key, equals, value = (word.strip() for word in part.partition("="))
         if key not in choices or not equals or key in named:
-            raise InputError(f"--convention {text}: write {CONVENTION_METAVAR}, each key once, or some of them")
+            raise InputError(
+                f"--convention {text}: write {CONVENTION_METAVAR}, each key once, or some of them"
+            )
         if value not in choices[key]:
-            raise InputError(f"--convention {text}: {key} is {' or '.join(choices[key])}; write {CONVENTION_METAVAR}")
+            raise InputError(
+                f"--convention {text}: {key} is {' or '.join(choices[key])}; write {CONVENTION_METAVAR}"
+            )
         named[key] = value
     return named
 
@@ -252,7 +303,9 @@ class LogStatements:
         from hilstar.server.bench.bench_file import stated_in
 
         by_file = Stated() if config is None else stated_in(config)
-        stated = replace(by_file, kernels=tuple(self.kernel or ()), topic=self.topic, body=self.body)
+        stated = replace(
+            by_file, kernels=tuple(self.kernel or ()), topic=self.topic, body=self.body
+        )
         stated = replace(stated, reference=self.reference, epoch_utc=self.epoch_utc)
         stated = replace(stated, place=parse_place(self.place))
         if self.mounting is not None:
@@ -295,12 +348,19 @@ def log_statements(command: Callable[..., None]) -> Callable[..., None]:
             parameters.append(parameter)
             continue
         parameters += [
-            inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kinds[field.name])
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=None,
+                annotation=kinds[field.name],
+            )
             for field in fields(LogStatements)
         ]
     parameters.sort(key=lambda parameter: parameter.kind)
     with_statements.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    with_statements.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {"return": None}
+    with_statements.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    } | {"return": None}
     return with_statements
 
 
@@ -310,7 +370,9 @@ def parse_diode(text: str) -> tuple[str, int]:
 
     port = serial_target(text)
     if port is None:
-        raise InputError(f"--diode {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
+        raise InputError(
+            f"--diode {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200"
+        )
     return port
 
 
@@ -376,7 +438,9 @@ def parse_counts(text: str, most: int) -> tuple[int, ...]:
     """Star counts, each once, from "100,1000". Raises InputError."""
     parts = text.split(",")
     if not all(re.fullmatch(r"[1-9]\d{0,8}", part) and int(part) <= most for part in parts):
-        raise InputError(f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such as 100,1000")
+        raise InputError(
+            f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such as 100,1000"
+        )
     return tuple(dict.fromkeys(map(int, parts)))
 
 

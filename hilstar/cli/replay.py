@@ -18,17 +18,34 @@ def replay(
     bench_file: options.BenchFile,
     log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
     speed: Annotated[
-        str, Option(metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time.")
+        str,
+        Option(
+            metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time."
+        ),
     ] = "realtime",
-    start: Annotated[float | None, Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
-    stop: Annotated[float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
-    step: Annotated[float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
+    start: Annotated[
+        float | None, Option(metavar="S", help="Start this many seconds after the first sample.")
+    ] = None,
+    stop: Annotated[
+        float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")
+    ] = None,
+    step: Annotated[
+        float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")
+    ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
     headless: options.Headless = False,
     output: Annotated[
-        Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
+        Path | None,
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Directory for a PNG of each frame, and frames.csv.",
+        ),
     ] = None,
-    frames: Annotated[str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
+    frames: Annotated[
+        str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")
+    ] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: options.ScenarioFile = None,
@@ -55,17 +72,27 @@ def replay(
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
     faults = running.optional_scenario(scenario)
-    options.check_files([log, scenario], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
+    options.check_files(
+        [log, scenario],
+        [None if output is None else output / "frames.csv"],
+        file,
+        ledger,
+        overwrite,
+    )
     split = options.parse_split(ledger_split)
     notices = Notices()
     stated = statements.stated(file.config)
-    play = plan_play(log, Wanted(options.parse_speed(speed), start, stop, step), file.config, stated)
+    play = plan_play(
+        log, Wanted(options.parse_speed(speed), start, stop, step), file.config, stated
+    )
     file = with_codes_ms(dated(file, play.conventions.scale, play.first_ns), play.codes_ms)
     with (
         running.page_listener(console, control, token, console_name) as listener,
         running.optional_pulse(file, notices) as pulse,
         # The frames of an earlier run have the codes that it had.
-        running.shown_bench(file, headless, windowed, force, timed=play.paced and not play.moving) as (bench, screen),
+        running.shown_bench(
+            file, headless, windowed, force, timed=play.paced and not play.moving
+        ) as (bench, screen),
         FrameImages(output, bench) as record,
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
@@ -79,13 +106,19 @@ def replay(
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        told = RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen))
+        told = RunSource(
+            f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen)
+        )
         status = RunStatus(told, kept)
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
         parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
-            running.followed(listener, control, page, parts, status, record, watched) as (sink, follower, requests),
+            running.followed(listener, control, page, parts, status, record, watched) as (
+                sink,
+                follower,
+                requests,
+            ),
         ):
             outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)

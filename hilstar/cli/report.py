@@ -12,7 +12,10 @@ from hilstar.server.console.terminal import print_found
 
 def report(
     ledger: RunFile,
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json.")],
+    output: Annotated[
+        Path,
+        Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json."),
+    ],
     as_json: Json = False,
 ) -> None:
     """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events

@@ -46,7 +46,9 @@ Strict = Annotated[
         help="Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was shown for any time.",
     ),
 ]
-Windowed = Annotated[bool, Option("--windowed", help="A window on the desktop instead of the full display.")]
+Windowed = Annotated[
+    bool, Option("--windowed", help="A window on the desktop instead of the full display.")
+]
 Force = Annotated[
     bool,
     Option(
@@ -65,7 +67,12 @@ LedgerFile = Annotated[
 ]
 
 LedgerSplit = Annotated[
-    str | None, Option("--ledger-split", metavar="1GB|1h", help="Continue in RUN.0001.mcap and so on after this size or time.")
+    str | None,
+    Option(
+        "--ledger-split",
+        metavar="1GB|1h",
+        help="Continue in RUN.0001.mcap and so on after this size or time.",
+    ),
 ]
 Console = Annotated[
     str | None,
@@ -97,7 +104,11 @@ Token = Annotated[
 ]
 ConsoleName = Annotated[
     list[str] | None,
-    Option("--console-name", metavar="NAME", help="A further name of the page, as a proxy shows it; may be given often."),
+    Option(
+        "--console-name",
+        metavar="NAME",
+        help="A further name of the page, as a proxy shows it; may be given often.",
+    ),
 ]
 FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar tracker)"
 
@@ -140,7 +151,9 @@ def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:
 
 
 @contextmanager
-def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, *, timed: bool) -> Iterator[tuple[Any, Any]]:
+def shown_bench(
+    file: "BenchFile", headless: bool, windowed: bool, force: bool, *, timed: bool
+) -> Iterator[tuple[Any, Any]]:
     """The bench and its screen; None when headless. `timed` as in `open_bench`."""
     if headless:
         from hilstar.display.render.context import create_context
@@ -152,7 +165,9 @@ def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, 
         return
     from hilstar.server.screen.gate import open_screen
 
-    with open_screen(file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed) as screen:
+    with open_screen(
+        file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed
+    ) as screen:
         yield screen.bench, screen
 
 
@@ -217,7 +232,11 @@ def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """
     from hilstar.server.sync import beat_line, beat_of
 
-    measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
+    measured_hz = (
+        NS_PER_S / screen.clock.period_ns
+        if screen is not None and screen.clock.paced_by_screen
+        else None
+    )
     found = beat_of(bench.config, measured_hz, () if screen is None else screen.window.modes_hz)
     line = beat_line(found)
     if line is not None:
@@ -241,7 +260,9 @@ def optional_pulse(file: "BenchFile", notices: Notices) -> "Iterator[FramePulse 
 
 
 @contextmanager
-def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", screen: Any) -> "Iterator[LiveAnswers | None]":
+def optional_answers(
+    bench: Any, notices: Notices, ledger: "LedgerSwitch", screen: Any
+) -> "Iterator[LiveAnswers | None]":
     """The tracker's answers while this is open; None where the bench file names none. Raises
     InputError.
     """
@@ -253,7 +274,9 @@ def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", scree
     from hilstar.server.live_answers import LiveAnswers
 
     with open_answers(bench.config, bench.file.folder, notices) as source:
-        answers = LiveAnswers(bench, AnswerRules.of(bench.config), source, notices, ledger, screen=screen)
+        answers = LiveAnswers(
+            bench, AnswerRules.of(bench.config), source, notices, ledger, screen=screen
+        )
         with answers.running():
             say(f"answers: {source.endpoint}")
             yield answers
@@ -270,7 +293,9 @@ def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> "Iterator[
     from hilstar.attitude.wire.shown_frames import FrameSender
     from hilstar.server.frame_feed import FrameFeed
 
-    with FrameFeed(FrameSender(endpoint), bench, lambda: 0 if screen is None else screen.swap_to_light_ns) as feed:
+    with FrameFeed(
+        FrameSender(endpoint), bench, lambda: 0 if screen is None else screen.swap_to_light_ns
+    ) as feed:
         say(f"frames: {feed.endpoint}")
         yield feed
 
@@ -283,7 +308,9 @@ def dated_ledger(path: Path | None) -> Path | None:
 
 
 @contextmanager
-def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> "Iterator[LedgerSwitch]":
+def optional_ledger(
+    path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any
+) -> "Iterator[LedgerSwitch]":
     """The run's ledger, which also keeps its events; without a path it starts switched off."""
     from hilstar.server.bench.measured_on import SHOWN_ANYWAY
     from hilstar.server.record.ledger import Ledger, LedgerSwitch
@@ -307,7 +334,11 @@ def optional_scenario(path: Path | None) -> "Scenario | None":
 
 @contextmanager
 def run_with_faults(
-    bench: Any, scenario: "Scenario | None", notices: Notices, ledger: "LedgerSwitch", recording: "Recording | None" = None
+    bench: Any,
+    scenario: "Scenario | None",
+    notices: Notices,
+    ledger: "LedgerSwitch",
+    recording: "Recording | None" = None,
 ) -> "Iterator[AnyFaults | None]":
     """The faults of a run, from its scenario and stream or from the run that is replayed; None
     for none.
@@ -317,7 +348,9 @@ def run_with_faults(
 
     if recording is not None and recording.faults:
         if scenario is not None:
-            raise InputError(f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave it out")
+            raise InputError(
+                f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave it out"
+            )
         yield ReplayedFaults(bench, recording, ledger)
         return
     if scenario is None and bench.config.faults.endpoint is None:
@@ -396,12 +429,20 @@ def scpi_listener(
 
     if scpi is None:
         if file.config.attitude.source == "scpi":
-            raise InputError(f'{file.path}: [attitude] source = "scpi" needs SCPI; add --scpi, or name another source')
+            raise InputError(
+                f'{file.path}: [attitude] source = "scpi" needs SCPI; add --scpi, or name another source'
+            )
         yield None
         return
     token = token if page is None else page.token or None
     with PageListener(parse_address(scpi, "--scpi"), token, option="--scpi") as listener:
-        secret = f', SYST:AUTH "{listener.token}" first' if listener.made else ", SYST:AUTH first" if listener.token else ""
+        secret = (
+            f', SYST:AUTH "{listener.token}" first'
+            if listener.made
+            else ", SYST:AUTH first"
+            if listener.token
+            else ""
+        )
         say(f"SCPI is at {listener.host}:{listener.port}{secret}")
         yield listener
 
@@ -420,11 +461,21 @@ def page_parts(
     from hilstar.server.record.ledger import Ledger
 
     schedule = getattr(faults, "schedule", None)  # nobody starts a fault in a run that is replayed
-    return PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices, **split), screen, schedule, answers)
+    return PageParts(
+        bench,
+        notices,
+        ledger,
+        lambda path: Ledger(path, bench, notices, **split),
+        screen,
+        schedule,
+        answers,
+    )
 
 
 @contextmanager
-def optional_pointing(description: "RunDescription", parts: "PageParts", sinks: "list[FrameSink]") -> Iterator[None]:
+def optional_pointing(
+    description: "RunDescription", parts: "PageParts", sinks: "list[FrameSink]"
+) -> Iterator[None]:
     """Say where the first attitude points, while this is open; the demo knows where it does."""
     if description.command not in POINTED:
         yield
@@ -453,14 +504,20 @@ def followed(
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
         sinks.append(frames.see)
-    with Service(status.begun, status.alive, status.line), optional_pointing(description, parts, sinks):
+    with (
+        Service(status.begun, status.alive, status.line),
+        optional_pointing(description, parts, sinks),
+    ):
         if listener is None and scpi is None:
             yield _all_of(sinks), status.follow, None
             return
         from hilstar.server.console.page_process import Listeners
         from hilstar.server.console.publisher import opened_page
 
-        with opened_page(Listeners(listener, scpi), control, description, parts) as (feed, requests):
+        with opened_page(Listeners(listener, scpi), control, description, parts) as (
+            feed,
+            requests,
+        ):
 
             def follow(running: "Running") -> None:
                 status.follow(running)

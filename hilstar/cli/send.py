@@ -18,30 +18,48 @@ from hilstar.cli import options
 from hilstar.server.console.terminal import print_json, progress, say
 
 LISTEN_SLICE_S = 0.1  # between checks for a signal
-Share = Annotated[str, Option(metavar="[SHARE]", help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.")]
+Share = Annotated[
+    str,
+    Option(
+        metavar="[SHARE]",
+        help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.",
+    ),
+]
 KeyFile = Annotated[Path | None, Option(metavar="FILE", help="From `hilstar keys`.")]
 
 
 @options.log_statements
 def send(
     log: Annotated[Path | None, Argument(metavar="[LOG]", help=options.LOG_HELP)] = None,
-    spin: Annotated[str | None, Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
+    spin: Annotated[
+        str | None, Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")
+    ] = None,
     to: Annotated[
-        str, Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
+        str,
+        Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD."),
     ] = "tcp://127.0.0.1:5560",
-    rate: Annotated[float | None, Option(metavar="HZ", help="Packets per second; by default at the log's own times.")] = None,
+    rate: Annotated[
+        float | None,
+        Option(metavar="HZ", help="Packets per second; by default at the log's own times."),
+    ] = None,
     connect: Annotated[
-        bool, Option("--connect", help="Connect instead of binding, for a bench file with bind = true.")
+        bool,
+        Option("--connect", help="Connect instead of binding, for a bench file with bind = true."),
     ] = False,
     radec: options.RadecText = None,
     count: Annotated[int | None, Option(help="Stop after this many packets.", min=1)] = None,
-    duration: Annotated[float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)] = None,
+    duration: Annotated[
+        float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)
+    ] = None,
     wait: Annotated[float, Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
     lose: Share = "0",
     corrupt: Share = "0",
     reorder: Share = "0",
     jitter: Annotated[
-        float, Option(metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6)
+        float,
+        Option(
+            metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6
+        ),
     ] = 0.0,
     seed: Annotated[int, Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
     secret_key: KeyFile = None,
@@ -65,14 +83,18 @@ def send(
     named = (("--lose", lose), ("--corrupt", corrupt), ("--reorder", reorder))
     lost, corrupted, reordered = (options.parse_share(text, option) for option, text in named)
     if lost + corrupted + reordered > 1:
-        raise InputError("send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions")
+        raise InputError(
+            "send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions"
+        )
     samples, total = wanted_samples(log, spin, rate, radec, statements)
     if duration is not None:
         samples = takewhile(lambda sample: sample.t_ns < duration * NS_PER_S, samples)
     stop = threading.Event()
     keys = CurveKeys(secret_key, server_key, allowed_clients)
     with open_sender(to, connect=connect, keys=keys) as link, stop_on_signal(stop):
-        cable = BadCable(Faults(lost, corrupted, reordered, jitter / 1000), np.random.default_rng(seed), link.put)
+        cable = BadCable(
+            Faults(lost, corrupted, reordered, jitter / 1000), np.random.default_rng(seed), link.put
+        )
         say(f"waiting for a listener on {link.endpoint}")
         if not heard(link, wait, stop):
             say("no listener yet; sending anyway")
@@ -97,7 +119,11 @@ def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
 
 
 def wanted_samples(
-    log: Path | None, spin: str | None, rate: float | None, radec: str | None, statements: options.LogStatements
+    log: Path | None,
+    spin: str | None,
+    rate: float | None,
+    radec: str | None,
+    statements: options.LogStatements,
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
     from hilstar.attitude.logs.log_file import open_log
@@ -109,7 +135,9 @@ def wanted_samples(
         raise InputError(f"--rate {rate:g}: write packets per second, 0.001 to 10000")
     if spin is not None:
         statements.refuse("it is for a LOG, and --spin sends none; leave it out")
-        return spin_samples(options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")), math.inf
+        return spin_samples(
+            options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")
+        ), math.inf
     read = open_log(log or Path(), statements.stated())
     recorded = read.samples
     for _, line in [*read.told, *read.joins().told]:
@@ -121,12 +149,20 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
     """Print what was sent and what was lost."""
     told = {"packets": tally.total, "sent": tally.total - tally.lost}
     told |= {name: getattr(tally, name) for name in ("lost", "corrupted", "reordered")}
-    told |= {name: getattr(link, name) for name in ("requests", "statuses", "unsent") if hasattr(link, name)}
+    told |= {
+        name: getattr(link, name)
+        for name in ("requests", "statuses", "unsent")
+        if hasattr(link, name)
+    }
     told["link"] = {"endpoint": link.endpoint} | link.link_counts.summary()
     if as_json:
         print_json(told)
         return
-    faults = ", ".join(f"{told[name]} {name}" for name in ("lost", "corrupted", "reordered", "unsent") if told.get(name))
+    faults = ", ".join(
+        f"{told[name]} {name}"
+        for name in ("lost", "corrupted", "reordered", "unsent")
+        if told.get(name)
+    )
     say(f"{told['sent']} packets sent" + (f" ({faults})" if faults else ""))
     if told.get("statuses"):
         say(f"{told['statuses']} statuses heard, {told['requests']} time requests answered")

@@ -12,11 +12,15 @@ from hilstar.server.console.terminal import print_found
 if TYPE_CHECKING:
     from hilstar.instruments.calibrate.sensor import SensorFile
 
-Output = Annotated[Path, Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")]
+Output = Annotated[
+    Path, Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")
+]
 
 
 def import_(
-    data: Annotated[Path, Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")],
+    data: Annotated[
+        Path, Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")
+    ],
     output: Output,
     as_json: Json = False,
 ) -> None:
@@ -31,9 +35,17 @@ def import_(
 
 
 def measure(
-    flats: Annotated[list[Path], Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other.")],
+    flats: Annotated[
+        list[Path],
+        Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other."),
+    ],
     darks: Annotated[
-        list[Path], Option("--darks", metavar="DARKS...", help="Frames without light, two of each exposure (EXPTIME).")
+        list[Path],
+        Option(
+            "--darks",
+            metavar="DARKS...",
+            help="Frames without light, two of each exposure (EXPTIME).",
+        ),
     ],
     output: Output,
     as_json: Json = False,
@@ -45,7 +57,12 @@ def measure(
 
     _check(output)
     check_files([*flats, *darks], [output])
-    _tell(output, measure_sensor(flats, darks), "By hilstar sensor measure; errors are one sigma", as_json)
+    _tell(
+        output,
+        measure_sensor(flats, darks),
+        "By hilstar sensor measure; errors are one sigma",
+        as_json,
+    )
 
 
 def _check(output: Path) -> None:

@@ -18,7 +18,16 @@ from hilstar.basics.files import MCAP, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import end_with_parent
 from hilstar.cli import running
-from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files, parse_split
+from hilstar.cli.options import (
+    BenchFile,
+    Explain,
+    Headless,
+    Json,
+    Overwrite,
+    ScenarioFile,
+    check_files,
+    parse_split,
+)
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.server.console.terminal import print_found, say, without_attitude
 
@@ -50,7 +59,9 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
     if asked.ledger is not None and not overwrite:
         taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
         if taken:
-            raise InputError(f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite")
+            raise InputError(
+                f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite"
+            )
     notices = Notices()
     asked = replace(asked, consoles=_consoles(console, asked.token, len(heads.names)))
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
@@ -83,8 +94,12 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
         return ()
     first = parse_address(console)
     if first.port and first.port + count - 1 > MAX_PORT:
-        raise InputError(f"--console {console}: {count} pages need as many ports from there; choose a lower one")
-    addresses = [ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)]
+        raise InputError(
+            f"--console {console}: {count} pages need as many ports from there; choose a lower one"
+        )
+    addresses = [
+        ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)
+    ]
     with ExitStack() as doors:
         for address in addresses:
             doors.enter_context(PageListener(address, token))
@@ -102,21 +117,28 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))
-    sent = SentAttitudes(file.config.attitude.convention, Mounting(file.config.tracker.q_body_to_cam))
+    sent = SentAttitudes(
+        file.config.attitude.convention, Mounting(file.config.tracker.q_body_to_cam)
+    )
     decoder = FedDecoder(sent)
     # Only packets have the key of a convention; the other sources have one of their own, and refuse
     # it.
     of_packets = file.config.attitude.source in PACKET_SOURCES
-    decoder.conventions = replace(decoder.conventions, source="the source of several heads", of_packets=of_packets)
+    decoder.conventions = replace(
+        decoder.conventions, source="the source of several heads", of_packets=of_packets
+    )
     return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
 
 
 def serve(
     bench_file: BenchFile,
     headless: Headless = False,
-    duration: Annotated[float | None, Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
+    duration: Annotated[
+        float | None, Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)
+    ] = None,
     frames: Annotated[
-        list[str] | None, Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}.")
+        list[str] | None,
+        Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}."),
     ] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
@@ -146,11 +168,23 @@ def serve(
         from hilstar.server.heads import HeadsRun
 
         if scpi is not None:
-            raise InputError(f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head")
+            raise InputError(
+                f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head"
+            )
         valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
-        switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
+        switches = {
+            "--headless": headless,
+            "--windowed": windowed,
+            "--force": force,
+            "--control": control,
+        }
         switches |= {"--overwrite": overwrite, "--explain": explain, "--strict": strict}
-        words = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
+        words = [
+            word
+            for name, value in valued.items()
+            if value is not None
+            for word in (name, str(value))
+        ]
         words += [name for name, on in switches.items() if on]
         asked = HeadsRun(file, tuple(words), duration, running.dated_ledger(ledger), token=token)
         serve_heads(asked, console, overwrite, as_json)
@@ -173,29 +207,59 @@ def serve(
         running.optional_pulse(file, notices) as pulse,
         # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are
         # those of any other machine.
-        running.shown_bench(file, headless, windowed, force, timed=not file.config.attitude.lockstep) as (bench, screen),
+        running.shown_bench(
+            file, headless, windowed, force, timed=not file.config.attitude.lockstep
+        ) as (bench, screen),
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept) as wrong,
         running.optional_answers(bench, notices, kept, screen) as answers,
         running.optional_frames(watch, bench, screen) as watched,
     ):
         if explain:
-            running.explain_bench(bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam)))
+            running.explain_bench(
+                bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam))
+            )
         refresh_hz = bench.config.monitor.refresh_hz
-        limit = Limit(math.inf if duration is None else round(duration * refresh_hz), math.inf if count is None else count)
+        limit = Limit(
+            math.inf if duration is None else round(duration * refresh_hz),
+            math.inf if count is None else count,
+        )
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         optics = running.say_seen(bench)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest, running.forced_on(screen))
+        told = RunSource(
+            link.endpoint,
+            bench.renderer.gl_renderer,
+            refresh_hz,
+            limit.shortest,
+            running.forced_on(screen),
+        )
         status = RunStatus(told, kept)
         parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
-            running.followed(listener, control, _described(file, link), parts, status, frames=watched, scpi=instrument) as fed,
+            running.followed(
+                listener,
+                control,
+                _described(file, link),
+                parts,
+                status,
+                frames=watched,
+                scpi=instrument,
+            ) as fed,
         ):
-            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), *fed[1:], wrong, pulse, answers)
+            outlet = Outlet(
+                screen,
+                kept,
+                notices,
+                tracker_pictures(link, bench, wrong),
+                *fed[1:],
+                wrong,
+                pulse,
+                answers,
+            )
             summary = serve_stream(bench, link, limit, fed[0], outlet)
         optics |= running.effort_of_run(bench, explain, as_json)
     whole_summary = replaced(summary, beat=beat, **optics)
@@ -207,7 +271,9 @@ def serve(
 
 def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str | None]:
     """What --frames asks for: how many frames, and where they are sent to. Raises InputError."""
-    form = "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
+    form = (
+        "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
+    )
     counts = [text for text in asked or () if "://" not in text]
     endpoints = [text for text in asked or () if "://" in text]
     for kind in (counts, endpoints):
@@ -216,7 +282,9 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
     if counts and not (counts[0].isdecimal() and int(counts[0]) > 0):
         raise InputError(f"--frames {counts[0]}: {form}")
     if endpoints and heads:
-        raise InputError(f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or leave it out")
+        raise InputError(
+            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or leave it out"
+        )
     return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
 
 
@@ -228,7 +296,9 @@ def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
 
     source = file.config.attitude
     steer_port = int(link.endpoint.rpartition(":")[2]) if source.source == "scpi" else 0
-    return RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock", steer_port)
+    return RunDescription(
+        "serve", source.source, link.endpoint, "asked" if source.lockstep else "clock", steer_port
+    )
 
 
 def _source(file: "ReadFile", fed_by: str | None, notices: Notices) -> "AnyLink":

@@ -71,7 +71,9 @@ PrivateUsers=yes
 CapabilityBoundingSet=
 """
 # @resources stays: it is needed for real-time priority and for pinning threads to cores.
-DENIED_CALLS = "~@clock @cpu-emulation @debug @module @mount @obsolete @privileged @raw-io @reboot @swap"
+DENIED_CALLS = (
+    "~@clock @cpu-emulation @debug @module @mount @obsolete @privileged @raw-io @reboot @swap"
+)
 CLONE_NEWUSER, PR_CAPBSET_DROP = 0x10000000, 24
 SYSTEMD_S = 30.0  # more than TimeoutStopSec, in which a run ends
 
@@ -79,10 +81,18 @@ SYSTEMD_S = 30.0  # more than TimeoutStopSec, in which a run ends
 def install(
     bench_file: BenchFile,
     options: Annotated[
-        list[str] | None, Argument(metavar="[-- OPTIONS]", help="Options of `hilstar serve`, such as `-- --console --control`.")
+        list[str] | None,
+        Argument(
+            metavar="[-- OPTIONS]",
+            help="Options of `hilstar serve`, such as `-- --console --control`.",
+        ),
     ] = None,
-    name: Annotated[str | None, Option(metavar="NAME", help="The service's name; by default the bench file's.")] = None,
-    to_stdout: Annotated[bool, Option("--print", help="Print the unit, and write nothing.")] = False,
+    name: Annotated[
+        str | None, Option(metavar="NAME", help="The service's name; by default the bench file's.")
+    ] = None,
+    to_stdout: Annotated[
+        bool, Option("--print", help="Print the unit, and write nothing.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds
@@ -97,7 +107,9 @@ def install(
     confined = can_confine()
     text = unit_text(path, bench_file.resolve(), words, confined)
     if not confined:
-        say("this system gives users no namespace of their own: the unit keeps the capabilities that systemd gives it")
+        say(
+            "this system gives users no namespace of their own: the unit keeps the capabilities that systemd gives it"
+        )
     if to_stdout:
         typer.echo(text, nl=False)
         return
@@ -109,27 +121,39 @@ def install(
         if console is not None and not console.is_loopback and not tokens.exists():
             import secrets  # hashes and random numbers, which no other command needs
 
-            with os.fdopen(os.open(tokens, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            with os.fdopen(
+                os.open(tokens, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w"
+            ) as file:
                 file.write(f"HILSTAR_TOKEN={secrets.token_urlsafe(TOKEN_BYTES)}\n")
             say(f"the token of the operator's page is in {tokens}")
     except OSError as error:
         raise cannot_write(path, error) from error
     typer.echo(str(path))
-    say(f"start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user enable --now {service}")
+    say(
+        f"start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user enable --now {service}"
+    )
     say(f"at boot as well, with nobody logged in: loginctl enable-linger {getpass.getuser()}")
-    say(f"to be rid of it: hilstar service uninstall {service.removeprefix('hilstar-').removesuffix('.service')}")
+    say(
+        f"to be rid of it: hilstar service uninstall {service.removeprefix('hilstar-').removesuffix('.service')}"
+    )
 
 
 def uninstall(
     name: Annotated[
-        str, Argument(metavar="NAME", help="The service's name, as install printed it; by default the bench file's.")
+        str,
+        Argument(
+            metavar="NAME",
+            help="The service's name, as install printed it; by default the bench file's.",
+        ),
     ],
 ) -> None:
     """Stop a service, and delete its unit and its token."""
     bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
     path = units_folder() / unit_name(bare)
     if not os.path.lexists(path):
-        found = sorted(each.stem.removeprefix("hilstar-") for each in path.parent.glob("hilstar-*.service"))
+        found = sorted(
+            each.stem.removeprefix("hilstar-") for each in path.parent.glob("hilstar-*.service")
+        )
         there = f"there is {', '.join(found)}" if found else "there is none"
         raise InputError(f"{path}: no such service; {there}")
     stopped = _systemctl("disable", "--now", path.name)
@@ -141,12 +165,16 @@ def uninstall(
     _systemctl("daemon-reload")
     typer.echo(str(path))
     if not stopped:
-        say(f"no systemd of this user was reached: if it still runs, systemctl --user stop {path.name}")
+        say(
+            f"no systemd of this user was reached: if it still runs, systemctl --user stop {path.name}"
+        )
 
 
 def _systemctl(*words: str) -> bool:
     try:
-        done = subprocess.run(["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False)
+        done = subprocess.run(
+            ["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False
+        )
     except (OSError, subprocess.TimeoutExpired):
         return False
     return done.returncode == 0
@@ -159,16 +187,22 @@ def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAd
     alone = typer.Typer()
     alone.command()(serve)
     try:
-        given = typer.main.get_command(alone).make_context("serve", [str(bench_file), *words]).params
+        given = (
+            typer.main.get_command(alone).make_context("serve", [str(bench_file), *words]).params
+        )
     except Exception as error:  # typer's usage errors have no public base class in all its versions
         message = getattr(error, "format_message", None)
         if message is None:
             raise
         raise InputError(f"the options after --: {message()} (see hilstar serve --help)") from error
     if given["token"] is not None and "HILSTAR_TOKEN" not in os.environ:
-        raise InputError("--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside the unit")
+        raise InputError(
+            "--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside the unit"
+        )
     if given["ledger"] is not None and UTC_MARK not in str(given["ledger"]):
-        raise InputError(f"--ledger {given['ledger']}: each start needs a ledger of its own; write run-{UTC_MARK}.mcap")
+        raise InputError(
+            f"--ledger {given['ledger']}: each start needs a ledger of its own; write run-{UTC_MARK}.mcap"
+        )
     return words, None if given["console"] is None else parse_address(given["console"])
 
 
@@ -181,7 +215,9 @@ def can_confine() -> bool:
     libc = ctypes.CDLL(None)
     child = os.fork()
     if child == 0:
-        may = (os.geteuid() == 0 or libc.unshare(CLONE_NEWUSER) == 0) and libc.prctl(PR_CAPBSET_DROP, 0, 0, 0, 0) == 0
+        may = (os.geteuid() == 0 or libc.unshare(CLONE_NEWUSER) == 0) and libc.prctl(
+            PR_CAPBSET_DROP, 0, 0, 0, 0
+        ) == 0
         os._exit(0 if may else 1)
     return os.waitpid(child, 0)[1] == 0
 
@@ -189,7 +225,9 @@ def can_confine() -> bool:
 def unit_name(name: str) -> str:
     """The unit of a service of that name. Raises InputError."""
     if NAME.fullmatch(name) is None:
-        raise InputError(f"--name {shortened(name)}: write letters, digits, - . or _, such as bench-2")
+        raise InputError(
+            f"--name {shortened(name)}: write letters, digits, - . or _, such as bench-2"
+        )
     return f"hilstar-{name}.service"
 
 
@@ -200,7 +238,11 @@ def units_folder(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def unit_text(
-    path: Path, bench: Path, options: list[str], confined: bool = True, environment: Mapping[str, str] = os.environ
+    path: Path,
+    bench: Path,
+    options: list[str],
+    confined: bool = True,
+    environment: Mapping[str, str] = os.environ,
 ) -> str:
     """The unit at `path` that serves a bench file with these options of `hilstar serve`, from this
     folder.
@@ -208,7 +250,12 @@ def unit_text(
     A `confined` one drops its capabilities, if `can_confine`.
     """
     script = shutil.which("hilstar", path=str(Path(sys.executable).parent))
-    command = [*([script] if script else [sys.executable, "-m", "hilstar"]), "serve", str(bench), *options]
+    command = [
+        *([script] if script else [sys.executable, "-m", "hilstar"]),
+        "serve",
+        str(bench),
+        *options,
+    ]
     folder = Path.cwd()
     found = {name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)}
     return UNIT.format(
@@ -216,7 +263,9 @@ def unit_text(
         bench=_literal(bench.name),
         command=" ".join(_quoted(word) for word in command),
         folder=_literal(str(folder)),
-        display="".join(f"Environment={_quoted(f'{name}={value}')}\n" for name, value in found.items()),
+        display="".join(
+            f"Environment={_quoted(f'{name}={value}')}\n" for name, value in found.items()
+        ),
         tokens=_literal(str(path.with_suffix(".env"))),
         confined=CONFINED if confined else "",
         calls=DENIED_CALLS,

@@ -22,21 +22,36 @@ def simulate(
     bench_file: options.BenchFile,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
-    rate: Annotated[str | None, Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")] = None,
+    rate: Annotated[
+        str | None,
+        Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s."),
+    ] = None,
     at: options.AtSeconds = None,
     scenario: options.ScenarioFile = None,
     log: Annotated[
-        Path | None, Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
+        Path | None,
+        Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o."),
     ] = None,
     frames: Annotated[
-        int | None, Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
+        int | None,
+        Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1),
     ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
-    seed: Annotated[int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)] = 0,
-    noise: Annotated[Literal["full", "none"], Option(help="The detector's full noise, or none.")] = "full",
-    output: Annotated[Path | None, Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
-    png: Annotated[Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
-    dn_png: Annotated[Path | None, Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")] = None,
+    seed: Annotated[
+        int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)
+    ] = 0,
+    noise: Annotated[
+        Literal["full", "none"], Option(help="The detector's full noise, or none.")
+    ] = "full",
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")
+    ] = None,
+    png: Annotated[
+        Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")
+    ] = None,
+    dn_png: Annotated[
+        Path | None, Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Simulate the virtual tracker's image of the sky, with noise."""
@@ -50,7 +65,9 @@ def simulate(
 
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png or at is not None:
-            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png")
+            raise InputError(
+                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png"
+            )
         check_directory("-o", output)
         simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario, statements)
         return
@@ -58,7 +75,9 @@ def simulate(
     file = read_bench_file(bench_file)
     targets = [path for path in (output, png, dn_png) if path is not None]
     if not targets:
-        raise InputError("simulate: no output was asked for; add -o OUT.fits, --png OUT.png or --dn-png OUT.png")
+        raise InputError(
+            "simulate: no output was asked for; add -o OUT.fits, --png OUT.png or --dn-png OUT.png"
+        )
     check_ending("-o", output, FITS)
     check_ending("--png", png, PNG)
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
@@ -67,7 +86,11 @@ def simulate(
     q = options.parse_attitude("simulate", radec, quaternion)
     t_ns = options.parse_at("simulate", at, file.config, wrong is not None)
     file = at_moment(file, t_ns)
-    rate_rad_s = np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s")) if rate else np.zeros(3)
+    rate_rad_s = (
+        np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s"))
+        if rate
+        else np.zeros(3)
+    )
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)
@@ -83,7 +106,11 @@ def simulate(
             "stars": len(exposure.truth),
             "clipped": clipped_in(exposure.truth),
             "capped": exposure.capped,
-            "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
+            "dn": {
+                "min": int(exposure.dn.min()),
+                "mean": float(exposure.dn.mean()),
+                "max": int(exposure.dn.max()),
+            },
             "faults": list(exposure.faults),
             "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,

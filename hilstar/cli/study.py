@@ -38,26 +38,48 @@ ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
 OF_A_BENCH = {"chain", "models", "outputs"}
 OF_A_FIELD = {"models", "outputs"}
 # The studies that draw times: on a busy machine they name no winner, and `right` is null.
-TIMED = {"quantisation", "timing", "tradeoff", "economy", "prediction", "bodies", "faults", "colour"}
+TIMED = {
+    "quantisation",
+    "timing",
+    "tradeoff",
+    "economy",
+    "prediction",
+    "bodies",
+    "faults",
+    "colour",
+}
 CHAIN_SCENES = 5
 
 
 def study(
     what: Annotated[Study, Argument(help="The study.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")
+    ],
     bench: Annotated[
         Path | None,
         Argument(
-            metavar="[BENCH.toml]", help="The bench file of `chain`; of `models` and `outputs` one's own.", show_default=False
+            metavar="[BENCH.toml]",
+            help="The bench file of `chain`; of `models` and `outputs` one's own.",
+            show_default=False,
         ),
     ] = None,
     radec: Annotated[
         str | None,
-        Option(metavar="RA,DEC,ROLL", help="Of `models` and `outputs` of a bench: a field of one's own, beside the three."),
+        Option(
+            metavar="RA,DEC,ROLL",
+            help="Of `models` and `outputs` of a bench: a field of one's own, beside the three.",
+        ),
     ] = None,
-    quick: Annotated[bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
+    quick: Annotated[
+        bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")
+    ] = False,
     images: Annotated[
-        Path | None, Option(metavar="DIR", help="Photographs for `confront`: a folder for each camera, with its guess.toml.")
+        Path | None,
+        Option(
+            metavar="DIR",
+            help="Photographs for `confront`: a folder for each camera, with its guess.toml.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -82,7 +104,13 @@ def study(
             lines, right, answers = chain.lines, chain.right, chain.answers
         else:
             lines, right = thesis_lines(what, bench, output, place), True
-    told = {"study": what, "right": right, "findings": lines, "answers": answers, "directory": str(output)}
+    told = {
+        "study": what,
+        "right": right,
+        "findings": lines,
+        "answers": answers,
+        "directory": str(output),
+    }
     print_found(as_json, told, [*lines, f"figures and tables in {output}", *answers])
 
 
@@ -103,7 +131,9 @@ def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path
         raise InputError(f"study {what}: has no photographs; leave out --images")
 
 
-def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> "ChainStudy":
+def chain_study(
+    bench: Path, output: Path, quick: bool, advance: Callable[[int], object]
+) -> "ChainStudy":
     """Run the study of a bench's whole chain."""
     from hilstar.instruments.study.chain.run import OUTPUTS, run
     from hilstar.server.bench.bench_file import read_bench_file
@@ -113,7 +143,9 @@ def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int],
     return run(file, output, quick, advance)
 
 
-def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float, float] | None) -> list[str]:
+def thesis_lines(
+    what: str, bench: Path, output: Path, place: tuple[float, float, float] | None
+) -> list[str]:
     """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a
     place; what it found.
     """
@@ -126,7 +158,9 @@ def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float
     check_files([bench], [output / name for name in names], file)
     make_directory(output)
     if what == "models":
-        return [f"{finding.figure}: {finding.text}" for finding in rapp.bench_rapp(output, file, place)]
+        return [
+            f"{finding.figure}: {finding.text}" for finding in rapp.bench_rapp(output, file, place)
+        ]
     return outputs.run(output, file, place)
 
 
@@ -144,7 +178,8 @@ def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str]
     if what == "stability":
         cases = study_of.run(output)
         lines = [
-            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}: {c.fails}" for c in cases
+            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}: {c.fails}"
+            for c in cases
         ]
         return lines, all(case.right for case in cases)
     return study_of.run(output) if what == "outputs" else study_of.run(output, quick), True

@@ -31,12 +31,23 @@ planted = partial(Option, rich_help_panel="Errors to plant")
 
 def tracker(
     bench_file: options.BenchFile,
-    watch: Annotated[str, Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from.")],
+    watch: Annotated[
+        str,
+        Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from."),
+    ],
     answer: Annotated[
-        str, Option(metavar="TARGET", help="tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
+        str,
+        Option(
+            metavar="TARGET",
+            help="tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD.",
+        ),
     ],
     rate: Annotated[
-        float | None, Option(metavar="HZ", help="Answers per second; by default 10, or one an exposure where that is less.")
+        float | None,
+        Option(
+            metavar="HZ",
+            help="Answers per second; by default 10, or one an exposure where that is less.",
+        ),
     ] = None,
     solver: Annotated[
         str | None,
@@ -46,9 +57,15 @@ def tracker(
             ' installed), a command such as "solve {image}", python:MODULE:FUNCTION, or the true one each time.',
         ),
     ] = None,
-    form: Annotated[str, Option("--format", metavar="packet|json", help="The format of the answers.")] = "packet",
+    form: Annotated[
+        str, Option("--format", metavar="packet|json", help="The format of the answers.")
+    ] = "packet",
     connect: Annotated[
-        bool, Option("--connect", help="Connect the ZeroMQ answers instead of binding: [answers] bind = true.")
+        bool,
+        Option(
+            "--connect",
+            help="Connect the ZeroMQ answers instead of binding: [answers] bind = true.",
+        ),
     ] = False,
     bias: Annotated[str, planted(metavar="X,Y,Z", help="Arcsec about cam x, y and z.")] = "0,0,0",
     fov_error: Annotated[
@@ -61,22 +78,42 @@ def tracker(
         ),
     ] = 0.0,
     pixel_error: Annotated[
-        float, planted(metavar="ARCSEC", min=0, max=MAX_ARCSEC, help="The same, of waves of one pixel.")
+        float,
+        planted(metavar="ARCSEC", min=0, max=MAX_ARCSEC, help="The same, of waves of one pixel."),
     ] = 0.0,
-    wrong: Annotated[str, planted(metavar="SHARE", help="Of the answers that are any attitude, such as 1%.")] = "0",
+    wrong: Annotated[
+        str, planted(metavar="SHARE", help="Of the answers that are any attitude, such as 1%.")
+    ] = "0",
     silent: Annotated[
-        str | None, planted(metavar="S[@T]", help="Say nothing for S seconds, from T (5) after the first exposure.")
+        str | None,
+        planted(
+            metavar="S[@T]", help="Say nothing for S seconds, from T (5) after the first exposure."
+        ),
     ] = None,
     babble: Annotated[bool, planted("--babble", help="Send garbage between answers.")] = False,
-    latency: Annotated[float, planted(metavar="S", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S)] = 0.0,
-    clock_drift: Annotated[float, planted(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM)] = 0.0,
-    clock_offset: Annotated[float, planted(metavar="S", help="Of its own clock.", min=-MAX_S, max=MAX_S)] = 0.0,
+    latency: Annotated[
+        float,
+        planted(metavar="S", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S),
+    ] = 0.0,
+    clock_drift: Annotated[
+        float, planted(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM)
+    ] = 0.0,
+    clock_offset: Annotated[
+        float, planted(metavar="S", help="Of its own clock.", min=-MAX_S, max=MAX_S)
+    ] = 0.0,
     seed: Annotated[int, Option(help="Seed of noise and errors.", min=0, max=options.MAX_SEED)] = 0,
     duration: Annotated[
-        float | None, Option(metavar="S", help="Seconds from the first frame; by default until Ctrl-C.", min=0, max=1e8)
+        float | None,
+        Option(
+            metavar="S",
+            help="Seconds from the first frame; by default until Ctrl-C.",
+            min=0,
+            max=1e8,
+        ),
     ] = None,
     record: Annotated[
-        Path | None, Option(metavar="FILE.csv", help="Write its answers as telemetry, too, as assess reads it.")
+        Path | None,
+        Option(metavar="FILE.csv", help="Write its answers as telemetry, too, as assess reads it."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -102,7 +139,9 @@ def tracker(
         raise InputError(f"--bias {bias}: write at most {MAX_ARCSEC:g} arcsec")
     repeating, silence = (fov_error, pixel_error), parse_silent(silent)
     share = options.parse_share(wrong, "--wrong")
-    errors = Planted(tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset)
+    errors = Planted(
+        tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset
+    )
     rate_hz, stop = checked_rate(rate, file.config.tracker.exposure_s), threading.Event()
     noise, chance, garbage = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))
     with (
@@ -113,7 +152,9 @@ def tracker(
         stop_on_signal(stop),
     ):
         live.lost_in_space = solver_of(solver, live)
-        say(f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form}, to {link.endpoint}")
+        say(
+            f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form}, to {link.endpoint}"
+        )
         process = TrackerProcess(live, frames, errors, rate_hz, chance)
 
         def send(said: "Answer") -> None:
@@ -122,7 +163,11 @@ def tracker(
 
         process.run(send, stop, float("inf") if duration is None else duration)
         told = process.tally.summary() | {
-            "frames": {"received": live.frames.received, "missing": live.frames.missing, "refused": frames.refused},
+            "frames": {
+                "received": live.frames.received,
+                "missing": live.frames.missing,
+                "refused": frames.refused,
+            },
             "link": {"endpoint": link.endpoint, "sent": link.sent, "babbled": link.babbled},
         }
     tell(told, as_json)
@@ -145,10 +190,16 @@ def tell(told: dict[str, Any], as_json: bool) -> None:
         return
     cpu, latency = told["cpu_ms"], told["latency_ms"]
     modes = ", ".join(f"{count} {mode}" for mode, count in told["modes"].items()) or "none"
-    typer.echo(f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']} exposures passed over")
-    typer.echo(f"{'frames':20}{told['frames']['received']} received, {told['frames']['missing']} missing")
+    typer.echo(
+        f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']} exposures passed over"
+    )
+    typer.echo(
+        f"{'frames':20}{told['frames']['received']} received, {told['frames']['missing']} missing"
+    )
     if cpu.p50 is not None:
-        typer.echo(f"{'an answer':20}{cpu.p50:.0f} ms of one core, {latency.p50:.0f} ms after mid-exposure (median)")
+        typer.echo(
+            f"{'an answer':20}{cpu.p50:.0f} ms of one core, {latency.p50:.0f} ms after mid-exposure (median)"
+        )
     if told["own_bias_arcsec"] is not None:
         for name in ("bias", "sigma"):
             typer.echo(
@@ -164,14 +215,18 @@ def parse_silent(text: str | None) -> tuple[float, float]:
         return 0.0, SILENT_AFTER_S
     match = SILENT.fullmatch(text)
     if match is None:
-        raise InputError(f"--silent {text}: write seconds, and when they begin where that is not 5 s, such as 5s or 5s@20s")
+        raise InputError(
+            f"--silent {text}: write seconds, and when they begin where that is not 5 s, such as 5s or 5s@20s"
+        )
     return float(match[1]), SILENT_AFTER_S if match[2] is None else float(match[2])
 
 
 def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
     """The rate of answers. Raises InputError where exposures would overlap, or collect nothing."""
     if not exposure_s:
-        raise InputError("[tracker] exposure_s = 0: the tracker collects no light; write a longer exposure")
+        raise InputError(
+            "[tracker] exposure_s = 0: the tracker collects no light; write a longer exposure"
+        )
     fastest_hz = min(1 / exposure_s, MAX_RATE_HZ)
     if rate_hz is None:
         return min(USUAL_RATE_HZ, fastest_hz)
@@ -194,12 +249,16 @@ def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
         from importlib.util import find_spec
 
         if find_spec("tetra3rs") is None:
-            say("the extra hilstar[solve] is not installed: stars are identified by the true attitude, as by --solver truth")
+            say(
+                "the extra hilstar[solve] is not installed: stars are identified by the true attitude, as by --solver truth"
+            )
             return None
     if text in {None, "tetra3"}:
         camera, stars = live.camera, live.stars
         vectors = stars.directions(np.arange(len(stars.rates_e_per_s)))
-        database = LostInSpace(vectors, stars.v_mag[: len(vectors)], camera.focal_length_px, camera.resolution_px)
+        database = LostInSpace(
+            vectors, stars.v_mag[: len(vectors)], camera.focal_length_px, camera.resolution_px
+        )
         return lambda found, dn: database.solve(found.rays[:, :2] / found.rays[:, 2:], found.flux_e)
     return by_image(text or "", live)
 
@@ -214,13 +273,17 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
     from hilstar.optics.layers.view import View
 
     if text == CENTROIDS:
-        raise InputError("--solver centroids: is a campaign's; write truth, which identifies its stars by the true attitude")
+        raise InputError(
+            "--solver centroids: is a campaign's; write truth, which identifies its stars by the true attitude"
+        )
     solver = choose_solver(text, Centroiding(), live.file.folder, SOLVER_S)
     nowhere, told = View(np.array([1.0, 0.0, 0.0, 0.0])), set[str]()
 
     def solve(found: Any, dn: Any) -> Any:
         try:
-            return solver.solve(Exposure(nowhere, dn, np.zeros((0, 0)), np.zeros(0, dtype=EXPOSURE_DTYPE)), live).q_icrs_to_cam
+            return solver.solve(
+                Exposure(nowhere, dn, np.zeros((0, 0)), np.zeros(0, dtype=EXPOSURE_DTYPE)), live
+            ).q_icrs_to_cam
         except SolverFault as fault:
             if str(fault) not in told:
                 say(f"hilstar: {fault}")

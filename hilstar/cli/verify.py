@@ -22,13 +22,26 @@ if TYPE_CHECKING:
 def verify(
     bench_file: BenchFile,
     fields: Annotated[int, Option(help="Number of random attitudes.", min=1, max=100_000)] = 10,
-    seed: Annotated[int, Option(help="Seed of the attitudes and the noise.", min=0, max=MAX_SEED)] = 0,
-    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for charts and a table.")] = None,
-    strict: Annotated[bool, Option("--strict", help="Exit with code 1 if the bench does not pass.")] = False,
-    propose: Annotated[
-        bool, Option("--propose", help="Find the smallest change of the bench file with which a failing bench passes.")
+    seed: Annotated[
+        int, Option(help="Seed of the attitudes and the noise.", min=0, max=MAX_SEED)
+    ] = 0,
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="DIR", help="Directory for charts and a table."),
+    ] = None,
+    strict: Annotated[
+        bool, Option("--strict", help="Exit with code 1 if the bench does not pass.")
     ] = False,
-    write: Annotated[bool, Option("--write", help="Find it, and make it in the bench file.")] = False,
+    propose: Annotated[
+        bool,
+        Option(
+            "--propose",
+            help="Find the smallest change of the bench file with which a failing bench passes.",
+        ),
+    ] = False,
+    write: Annotated[
+        bool, Option("--write", help="Find it, and make it in the bench file.")
+    ] = False,
     scenario: ScenarioFile = None,
     as_json: Json = False,
 ) -> None:
@@ -43,9 +56,17 @@ def verify(
     check_directory("-o", output)
     file = read_bench_or_heads(bench_file)
     if isinstance(file, HeadsFile):
-        given = {"-o": output, "--strict": strict, "--propose": propose, "--write": write, "--scenario": scenario}
+        given = {
+            "-o": output,
+            "--strict": strict,
+            "--propose": propose,
+            "--write": write,
+            "--scenario": scenario,
+        }
         for option in [name for name, value in given.items() if value]:
-            raise InputError(f"verify {option}: is of one bench; leave it out, or give one of the heads' files of {bench_file}")
+            raise InputError(
+                f"verify {option}: is of one bench; leave it out, or give one of the heads' files of {bench_file}"
+            )
         _verify_heads(file, fields, seed, as_json)
         return
     if write:
@@ -73,7 +94,10 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
     from hilstar.instruments.simulate.heads import verify_heads
 
     with progress("verifying", fields) as advance:
-        pairs = [pair.summary() for pair in verify_heads(heads, fields, np.random.default_rng(seed), advance)]
+        pairs = [
+            pair.summary()
+            for pair in verify_heads(heads, fields, np.random.default_rng(seed), advance)
+        ]
     lines = []
     for pair in pairs:
         first, second = pair["heads"]
@@ -88,7 +112,9 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
     print_found(as_json, {"angles": pairs}, lines)
 
 
-def _proposed(file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool) -> dict[str, Any]:
+def _proposed(
+    file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool
+) -> dict[str, Any]:
     """The keys of --propose and --write in the JSON object; the lines are printed unless that is
     wanted.
     """

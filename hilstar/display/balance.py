@@ -75,10 +75,15 @@ class Balance:
     @property
     def window_px(self) -> tuple[float, float]:
         """The Gaussian's sigma along x and y."""
-        x, y = (math.sqrt(v + self.weights.window_blurs * self.seen.blur_px**2) for v in self.psf.variance_px2)
+        x, y = (
+            math.sqrt(v + self.weights.window_blurs * self.seen.blur_px**2)
+            for v in self.psf.variance_px2
+        )
         return x, y
 
-    def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
+    def in_box(
+        self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array
+    ) -> FloatArray:
         """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a
         star's nearest.
         """
@@ -87,7 +92,9 @@ class Balance:
         # monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)
         scale = 1 / (blur * math.sqrt(2))  # scipy.special would take 0.12 s to import
-        along_axis = np.array([(math.erf((at + half) * scale) - math.erf((at - half) * scale)) / 2 for at in ends])
+        along_axis = np.array(
+            [(math.erf((at + half) * scale) - math.erf((at - half) * scale)) / 2 for at in ends]
+        )
         x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
         return np.asarray(along_axis[x] * along_axis[y])
 
@@ -103,7 +110,9 @@ class Balance:
             slopes.append(2 * h * density / math.erf(h / math.sqrt(2)))
         return slopes[0], slopes[1]
 
-    def arms(self, offset_px: Float32Array, fraction_px: Float32Array, steps: Float32Array) -> Float32Array:
+    def arms(
+        self, offset_px: Float32Array, fraction_px: Float32Array, steps: Float32Array
+    ) -> Float32Array:
         """The factor of each pixel's error in each sum, (SUMS, pixels, n).
 
         `offset_px` (2, pixels, n) are whole pixels from the stars' own, `fraction_px` (2, n) the
@@ -115,11 +124,17 @@ class Balance:
         d = (offset_px - fraction).astype(np.float32)
         off = fraction - nearest
         # An eighth power stands for exp(-u), within 0.03, to save the shader's time.
-        u = 0.5 * (np.square(d[0] / np.float32(self.window_px[0])) + np.square(d[1] / np.float32(self.window_px[1])))
+        u = 0.5 * (
+            np.square(d[0] / np.float32(self.window_px[0]))
+            + np.square(d[1] / np.float32(self.window_px[1]))
+        )
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)
         weights = self.weights
-        arms[0], arms[1:3] = weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)), weights.moments * d
+        arms[0], arms[1:3] = (
+            weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)),
+            weights.moments * d,
+        )
         arms[3], arms[4:6] = weights.window_light * window, weights.window_moments * window * d
         for first, side, weight in ((6, 3, weights.box_3), (8, 5, weights.box_5)):
             follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]

@@ -19,7 +19,14 @@ from msgspec import Meta
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import write_whole
-from hilstar.basics.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes, read_text
+from hilstar.basics.reading import (
+    MAX_TOML_BYTES,
+    as_text,
+    exists,
+    parse_toml,
+    read_bytes,
+    read_text,
+)
 from hilstar.basics.text_tables import Chosen, TextTable, finite_numbers, needed, table_of
 from hilstar.basics.toml_tables import Kind, Table, explained, toml_text
 from hilstar.display import response as responses
@@ -116,9 +123,15 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     name = str(source)
     if name in FORMULAS:
         grey = _formula(name, bits)
-        response = responses.bit_stealing_response((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
+        response = (
+            responses.bit_stealing_response((grey, grey, grey), REC709_WEIGHTS)
+            if bit_stealing
+            else grey
+        )
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
-        return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
+        return Calibration(
+            name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula"
+        )
     path = _path_of(source)
     meant = did_you_mean(name, BUILT_IN)
     if not exists(path) and (meant or not path.suffix):
@@ -130,7 +143,9 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     file = read_toml(path, read)
     head = file.calibration
     if head.bits != bits:
-        raise InputError(f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits")
+        raise InputError(
+            f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits"
+        )
     columns = read_response(beside(path, head.response, "[calibration] response"), bits, read)
     uniformity = None
     if file.uniformity is not None:
@@ -177,7 +192,9 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
         light = np.stack([above[name] for name in ("r", "g", "b")])
         return np.asarray(light / light[:, -1].sum())
     if file.weights is None:
-        raise InputError(f"{path}: the primaries as the tracker sees them are not known; add [weights] r, g, b")
+        raise InputError(
+            f"{path}: the primaries as the tracker sees them are not known; add [weights] r, g, b"
+        )
     shares = np.array([file.weights.r, file.weights.g, file.weights.b])
     names = ("r", "g", "b") if "r" in above else ("w", "w", "w")
     light = np.stack([above[name] / above[name][-1] for name in names])
@@ -193,9 +210,12 @@ def primary_responses(source: str | Path, bits: int) -> tuple[responses.Response
     if str(source) in FORMULAS:
         return (_formula(str(source), bits),) * 3
     path = _path_of(source)
-    columns = read_response(beside(path, read_toml(path).calibration.response, "[calibration] response"), bits)
+    columns = read_response(
+        beside(path, read_toml(path).calibration.response, "[calibration] response"), bits
+    )
     tables = {
-        name: responses.table_response(bits, (light - light[0]) / (light[-1] - light[0])) for name, light in columns.items()
+        name: responses.table_response(bits, (light - light[0]) / (light[-1] - light[0]))
+        for name, light in columns.items()
     }
     return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
 
@@ -218,37 +238,56 @@ def with_uniformity(
     """
     response, weights, noise, notes, errors = f"{path.stem}.csv", None, 0.0, NotesTable(), None
     if str(source) in FORMULAS:
-        head = CalibrationHead("photometric", "", when, f"none: the formula {source}", "relative", bits, response)
+        head = CalibrationHead(
+            "photometric", "", when, f"none: the formula {source}", "relative", bits, response
+        )
         columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
     else:
         origin = _path_of(source)
         file = read_toml(origin)
-        columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits)
+        columns = read_response(
+            beside(origin, file.calibration.response, "[calibration] response"), bits
+        )
         head = msgspec.structs.replace(file.calibration, response=response)
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
         identity, errors = identity or file.monitor_identity, file.errors
-    table = write_calibration(path, head, columns, noise, notes, weights, identity=identity, errors=errors)
+    table = write_calibration(
+        path, head, columns, noise, notes, weights, identity=identity, errors=errors
+    )
     return (path, table) if grid is None else (path, table, add_uniformity(path, grid, relative))
 
 
 def _response(
-    path: Path, bits: int, columns: dict[str, FloatArray], weights: responses.Weights | None, bit_stealing: bool
+    path: Path,
+    bits: int,
+    columns: dict[str, FloatArray],
+    weights: responses.Weights | None,
+    bit_stealing: bool,
 ) -> tuple[responses.Response, responses.Weights | None]:
     whites = {name: float(light[-1] - light[0]) for name, light in columns.items()}
     if weights is None and "r" in columns:
         weights = whites["r"], whites["g"], whites["b"]
     if weights is not None:
         if not sum(weights) > 0:
-            raise InputError(f"{path}: [weights] r, g and b are all 0; write the primaries' shares of white")
+            raise InputError(
+                f"{path}: [weights] r, g and b are all 0; write the primaries' shares of white"
+            )
         weights = weights[0] / sum(weights), weights[1] / sum(weights), weights[2] / sum(weights)
     elif bit_stealing:
-        raise InputError(f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b")
+        raise InputError(
+            f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b"
+        )
     black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
-    tables = {name: responses.table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
+    tables = {
+        name: responses.table_response(bits, (light - light[0]) / whites[name])
+        for name, light in columns.items()
+    }
     if weights is None or ("w" in tables and not bit_stealing):
         return responses.table_response(bits, tables["w"].light, black), weights
     r, g, b = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
-    return (responses.bit_stealing_response if bit_stealing else responses.mixed_response)((r, g, b), weights, black), weights
+    return (responses.bit_stealing_response if bit_stealing else responses.mixed_response)(
+        (r, g, b), weights, black
+    ), weights
 
 
 class CalibrationHead(Table, frozen=True):
@@ -340,7 +379,9 @@ def beside(path: Path, name: str, key: str) -> Path:
     """
     other = path.parent / name
     if not exists(other):
-        raise InputError(f"{path}: {key} = {shortened(json.dumps(name))}; there is no such file beside it")
+        raise InputError(
+            f"{path}: {key} = {shortened(json.dumps(name))}; there is no such file beside it"
+        )
     return other
 
 
@@ -371,12 +412,16 @@ def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
     none, or is negative.
     """
     rows = []
-    names = [table.columns[column.place].header or f"column {column.place + 1}" for column in columns]
+    names = [
+        table.columns[column.place].header or f"column {column.place + 1}" for column in columns
+    ]
     for line, cells in table.rows():
         texts = [table.cell(cells, column) for column in columns]
         row = finite_numbers(table.path, line, names, texts, "write numbers that are not negative")
         if not 0 <= min(row) <= max(row) < 1e30:
-            raise InputError(f"{table.path}:{line}: {','.join(texts)[:40]!r}; write finite numbers that are not negative")
+            raise InputError(
+                f"{table.path}:{line}: {','.join(texts)[:40]!r}; write finite numbers that are not negative"
+            )
         rows.append(row)
     if not rows:
         raise InputError(f"{table.path}: no row of numbers in it")
@@ -393,16 +438,23 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
     table = _table(path, read)
     header = tuple(column.name for column in table.columns)
     if header not in (("code", *GREY), ("code", *PRIMARIES)):
-        raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b")
+        raise InputError(
+            f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b"
+        )
     rows = _numbers(table, [needed(table, name) for name in header])
     code, white = rows[:, 0], 2**bits - 1
     if np.any(code != np.rint(code)) or np.any(np.diff(code) <= 0):
-        raise InputError(f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code")
+        raise InputError(
+            f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code"
+        )
     if len(code) < 2 or code[0] != 0 or code[-1] != white:
         raise InputError(
             f"{path}: its codes are {code[0]:g} to {code[-1]:g}; write 0 (black) to {white} (white of {bits} bits)"
         )
-    columns = {name: _every_code(path, name, code, rows[:, place + 1], white) for place, name in enumerate(header[1:])}
+    columns = {
+        name: _every_code(path, name, code, rows[:, place + 1], white)
+        for place, name in enumerate(header[1:])
+    }
     blacks = rows[0, 1:]
     if np.ptp(blacks) > BLACKS_AGREE * blacks.mean():
         raise InputError(
@@ -411,7 +463,9 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
     return columns
 
 
-def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, white: int) -> FloatArray:
+def _every_code(
+    path: Path, name: str, code: FloatArray, light: FloatArray, white: int
+) -> FloatArray:
     """Light at codes 0 to `white`: between rows, PCHIP of log light above black over log code;
     below the first, a power law.
     """
@@ -433,7 +487,11 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
     wanted = np.log(np.arange(1, white + 1))
     slope = (log_light[1] - log_light[0]) / (log_code[1] - log_code[0])
     below = log_light[0] + slope * (wanted - log_code[0])
-    return np.append(light[0], light[0] + np.exp(np.where(wanted < log_code[0], below, curve(np.maximum(wanted, log_code[0])))))
+    return np.append(
+        light[0],
+        light[0]
+        + np.exp(np.where(wanted < log_code[0], below, curve(np.maximum(wanted, log_code[0])))),
+    )
 
 
 def read_grid(path: Path, read: list[bytes]) -> FloatArray:
@@ -442,10 +500,14 @@ def read_grid(path: Path, read: list[bytes]) -> FloatArray:
     """
     table = _table(path, read)
     if table.header:
-        raise InputError(f"{path}:{table.header_line}: {shortened(table.names)!r} is no row of numbers")
+        raise InputError(
+            f"{path}:{table.header_line}: {shortened(table.names)!r} is no row of numbers"
+        )
     grid = _numbers(table, [Chosen(place) for place in range(len(table.columns))])
     if not grid.min() > 0:
-        raise InputError(f"{path}: a field of the screen has no light; every value must be more than 0")
+        raise InputError(
+            f"{path}: a field of the screen has no light; every value must be more than 0"
+        )
     return grid
 
 
@@ -465,11 +527,25 @@ def write_calibration(
     """
     table = path.parent / head.response
     codes = np.arange(len(next(iter(columns.values()))))
-    rows = "".join(",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n" for code in codes)
+    rows = "".join(
+        ",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n"
+        for code in codes
+    )
     comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n"
-    tables: dict[str, Any] = {"calibration": head, "weights": weights, "noise": {"relative": float(f"{noise:.6g}")}}
-    tables |= {"notes": notes, "errors": errors, TABLE: None if identity is None else identity.known()}
-    write_whole(table, comment.encode("ascii", "replace").decode() + ",".join(["code", *columns]) + "\n" + rows)
+    tables: dict[str, Any] = {
+        "calibration": head,
+        "weights": weights,
+        "noise": {"relative": float(f"{noise:.6g}")},
+    }
+    tables |= {
+        "notes": notes,
+        "errors": errors,
+        TABLE: None if identity is None else identity.known(),
+    }
+    write_whole(
+        table,
+        comment.encode("ascii", "replace").decode() + ",".join(["code", *columns]) + "\n" + rows,
+    )
     write_whole(path, toml_text(msgspec.to_builtins(tables)))
     return table
 
@@ -481,7 +557,9 @@ def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) 
     `relative` is the standard error of a field. Raises InputError where it cannot be written.
     """
     table = path.with_name(f"{path.stem}-uniformity.csv")
-    write_whole(table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist()))
+    write_whole(
+        table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist())
+    )
     text = read_text(path, ADVICE, MAX_TOML_BYTES)
     known = "" if relative is None else f"relative = {relative:.4g}\n"
     write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n{known}")

@@ -104,7 +104,9 @@ class ExactQuantiser(quantise.Quantiser):
     kept = KEPT
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
-    def __init__(self, panel: quantise.Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+    def __init__(
+        self, panel: quantise.Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL
+    ) -> None:
         super().__init__(panel, resolution_px, psf, seen)
         self._map = FootprintMap(resolution_px, psf)
         self._balance = Balance(psf, seen, self.weights)
@@ -125,7 +127,10 @@ class ExactQuantiser(quantise.Quantiser):
         """The levels of the next frame: its stars are added to its dithered extended light."""
         if light.sprites is None or not light.sprites.extended:
             return self.levels(light.sprites)
-        return self.levels(light.sprites, quantise.dither_levels(light.extended(), self._panel, self.floor_turn(light.number)))
+        return self.levels(
+            light.sprites,
+            quantise.dither_levels(light.extended(), self._panel, self.floor_turn(light.number)),
+        )
 
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
@@ -147,7 +152,9 @@ class ExactQuantiser(quantise.Quantiser):
         has_compute = gl_version >= COMPUTE_VERSION
         by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
         why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
-        return quantise.LevelCost(EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why)
+        return quantise.LevelCost(
+            EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why
+        )
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
@@ -184,7 +191,9 @@ class ExactQuantiser(quantise.Quantiser):
             left = np.empty_like(carried.error)
             reach = self._reach(found.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32))
             for some in _turns(sprites):
-                levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some), reach[some])
+                levels[:, some], left[:, some] = self._choose(
+                    _part(found, some), carried.of(some), reach[some]
+                )
                 _hand_on(carried.error, left, some, sprites)
             self._keep(sprites, left)
             self._lit = found.place.ravel()
@@ -195,7 +204,9 @@ class ExactQuantiser(quantise.Quantiser):
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
         """How many pixels of stars of so much light (n,) are chosen, (n,)."""
         order = self._map.order
-        return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
+        return np.maximum(
+            order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order)
+        )
 
     def _carried(self, sprites: Sprites) -> Carried:
         """The errors that each sprite begins with: what its light in other primaries left, or
@@ -217,7 +228,9 @@ class ExactQuantiser(quantise.Quantiser):
         """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
         self.over = left
 
-    def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
+    def _choose(
+        self, found: Footprints, carried: Carried, reach: IntArray
+    ) -> tuple[IntArray, Float32Array]:
         """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried`
         leave, (SUMS, n).
 
@@ -226,12 +239,18 @@ class ExactQuantiser(quantise.Quantiser):
         near = self._map.order.near
         lower, upper, short, step = self._levels_about(found)
         chosen = np.arange(near)[:, None] < reach
-        far, short, step = short.copy(), np.where(chosen, short[:near], np.float32(0)), np.where(chosen, step, np.float32(0))
+        far, short, step = (
+            short.copy(),
+            np.where(chosen, short[:near], np.float32(0)),
+            np.where(chosen, step, np.float32(0)),
+        )
         far[:near][chosen] = 0.0
         d = found.offset_px - found.fraction_px[:, None]
         weights = self._balance.weights
         arm = self._balance.arms(
-            found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
+            found.offset_px[:, :near],
+            found.fraction_px,
+            found.rate_e_per_s / np.float32(self._step_e_per_s),
         )
         error = self._bounded(carried.error, step).copy()
         error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
@@ -251,7 +270,9 @@ class ExactQuantiser(quantise.Quantiser):
         left[0] += hidden
         return np.concatenate([lower + up, upper]), left
 
-    def _levels_about(self, found: Footprints) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
+    def _levels_about(
+        self, found: Footprints
+    ) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
         """The lower levels of the near pixels and the nearest ones of the others, what these are
         off the wanted light (pixels, n), and what the next level adds to the near ones' (near, n),
         in steps from black.
@@ -330,7 +351,12 @@ def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites:
 
 
 def _decide(
-    short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float, choices: int
+    short: Float32Array,
+    step: Float32Array,
+    arm: Float32Array,
+    error: Float32Array,
+    last_light: float,
+    choices: int,
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
     """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves,
     (SUMS, n).
@@ -368,7 +394,11 @@ def _decide(
 
 
 def _turn_one_more(
-    step: Float32Array, arm: Float32Array, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array
+    step: Float32Array,
+    arm: Float32Array,
+    up: npt.NDArray[np.bool_],
+    error: Float32Array,
+    grid: Float32Array,
 ) -> None:
     """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other
     sums the least harm.

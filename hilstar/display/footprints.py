@@ -50,12 +50,16 @@ class PixelOrder:
         phase, steps = self._middles, np.arange(self.size) + self.first
         x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
         # The footprint's pixels from a star of each phase, in sigmas
-        distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2)
+        distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(
+            self.size**2, PHASES**2
+        )
         self._least_spread_px = float(spread_px.min())
         reach_sigmas = max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px)
         self.near = int((distance <= reach_sigmas).sum(axis=0).max())
         order = np.argsort(distance, axis=0, kind="stable")
-        self._farthest_sigmas = float(np.take_along_axis(distance, order[self.near - 1 : self.near], axis=0).max())
+        self._farthest_sigmas = float(
+            np.take_along_axis(distance, order[self.near - 1 : self.near], axis=0).max()
+        )
         self.area_px2 = 2 * np.pi * float(spread_px.prod())
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
 
@@ -126,11 +130,15 @@ class FootprintMap:
         """The footprints of `sprites`. Raises InputError for sprites of another PSF's footprint."""
         order = self.order
         if sprites.footprint_px != order.size:
-            raise InputError(f"sprites of {sprites.footprint_px} px where the PSF needs {order.size} px")
+            raise InputError(
+                f"sprites of {sprites.footprint_px} px where the PSF needs {order.size} px"
+            )
         data, count = sprites.data, len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
         cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
-        row, column = (table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column))
+        row, column = (
+            table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column)
+        )
         if isinstance(self._psf, GlassPsf) and sprites.spectra is not None:
             x_px, y_px = data["pixel"].T + fraction
             stamps = self._psf.of_stars(x_px, y_px, sprites.spectra, data["electrons_per_s"])
@@ -153,7 +161,9 @@ class FootprintMap:
         place = row * width + column
         place += y * width + x
         reach = self.order.size
-        cut = np.flatnonzero((x < reach) | (x >= width - reach) | (y < reach) | (y >= height - reach))
+        cut = np.flatnonzero(
+            (x < reach) | (x >= width - reach) | (y < reach) | (y >= height - reach)
+        )
         if len(cut):
             at_x, at_y = x[cut] + column[:, cut], y[cut] + row[:, cut]
             inside = (at_x >= 0) & (at_x < width) & (at_y >= 0) & (at_y < height)
@@ -183,7 +193,9 @@ class FootprintMap:
         flat_light[winner], flat_place[winner] = total, flat_place_of_winner
 
 
-def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Levels) -> FloatArray:
+def star_losses_mag(
+    sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Levels
+) -> FloatArray:
     """How many magnitudes fainter than wanted each of n sprites is in `levels` (height, width),
     (n,).
 
@@ -197,9 +209,15 @@ def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, le
     shown = _shown(found.place, panel, levels).sum(axis=0)
     hidden = np.flatnonzero(wanted == 0)
     if len(hidden):
-        whole = np.bincount(found.place.ravel(), found.light.ravel(), minlength=footprints.pixels + 1)
+        whole = np.bincount(
+            found.place.ravel(), found.light.ravel(), minlength=footprints.pixels + 1
+        )
     for k in hidden.tolist():
-        spectra = sprites.spectra if sprites.spectra is None or sprites.spectra.ndim == 1 else sprites.spectra[k : k + 1]
+        spectra = (
+            sprites.spectra
+            if sprites.spectra is None or sprites.spectra.ndim == 1
+            else sprites.spectra[k : k + 1]
+        )
         alone = footprints.find(replace(sprites, data=sprites.data[k : k + 1], spectra=spectra))
         place, light = alone.place[:, 0], alone.light[:, 0].astype(np.float64)
         lit = light > 0
@@ -211,7 +229,9 @@ def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, le
 
 def _shown(place: PlaceArray, panel: Panel, levels: Levels) -> FloatArray:
     if levels.ndim == 3:
-        return np.asarray(sum(_shown(place, one, Levels(levels[..., k])) for k, one in enumerate(panel.primaries)))
+        return np.asarray(
+            sum(_shown(place, one, Levels(levels[..., k])) for k, one in enumerate(panel.primaries))
+        )
     level = np.append(levels.ravel(), levels.dtype.type(0))[place]
     share = np.asarray(panel.response.light[level], dtype=np.float64)
     if panel.uniformity is not None:

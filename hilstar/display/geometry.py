@@ -73,7 +73,9 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
         rows, modes, turn = self.map_arcsec, self.modes_arcsec, self.alignment_covariance_arcsec2
         if rows is not None and (not rows or len({len(row) for row in rows}) != 1):
             raise ValueError("map_arcsec has rows of different lengths")
-        if modes is not None and (rows is None or {len(mode) for mode in modes} != {2 * len(rows) * len(rows[0])}):
+        if modes is not None and (
+            rows is None or {len(mode) for mode in modes} != {2 * len(rows) * len(rows[0])}
+        ):
             raise ValueError("modes_arcsec are not x and y of each place of map_arcsec")
         if turn is not None and [len(row) for row in turn] != [3, 3, 3]:
             raise ValueError("alignment_covariance_arcsec2 is not 3 by 3")
@@ -121,7 +123,9 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     focal_length_px: Annotated[float, Meta(gt=0, le=1e9)]
     principal_point_px: tuple[Finite, Finite]
     q_cam_to_mon: tuple[Finite, Finite, Finite, Finite]
-    tilt_deg: tuple[Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]] = (0.0, 0.0)
+    tilt_deg: tuple[
+        Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]
+    ] = (0.0, 0.0)
     max_field_deg: Annotated[float, Meta(gt=0, lt=90)] | None = None
     field: FieldTable | None = None
     sigma: dict[str, float] = {}
@@ -137,9 +141,13 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     """The camera of a geometry file for a monitor of `resolution_px`. Raises InputError."""
     found: GeometryFile = _read(path, GeometryFile, ADVICE)
     if found.kind != KIND:
-        raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
+        raise InputError(
+            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+        )
     if found.resolution_px != resolution_px:
-        sizes = "{} x {} px and the bench file's monitor has {} x {}".format(*found.resolution_px, *resolution_px)
+        sizes = "{} x {} px and the bench file's monitor has {} x {}".format(
+            *found.resolution_px, *resolution_px
+        )
         raise InputError(f"{path}: is of a monitor of {sizes}; calibrate this monitor")
     q = np.array(found.q_cam_to_mon)
     if not abs(float(np.linalg.norm(q)) - 1.0) <= NORM_TOLERANCE:
@@ -148,7 +156,9 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     if field is not None:
         sides = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
         if len(sides) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
-            raise InputError(f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}")
+            raise InputError(
+                f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}"
+            )
         residual = ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
     a, b = found.tilt_deg
     lens = Lens(
@@ -158,13 +168,21 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
         residual,
         math.inf if found.max_field_deg is None else math.tan(math.radians(found.max_field_deg)),
     )
-    return Camera(resolution_px, found.focal_length_px, found.principal_point_px, to_matrix(normalise(q)), lens)
+    return Camera(
+        resolution_px,
+        found.focal_length_px,
+        found.principal_point_px,
+        to_matrix(normalise(q)),
+        lens,
+    )
 
 
 def load_notes(path: Path) -> Notes:
     """The notes of a geometry file. Raises InputError."""
     found: GeometryFile = _read(path, GeometryFile, ADVICE)
-    return Notes(found.sigma, found.error or ErrorTable(), found.made or MadeTable(), found.monitor_identity)
+    return Notes(
+        found.sigma, found.error or ErrorTable(), found.made or MadeTable(), found.monitor_identity
+    )
 
 
 def _read(path: Path, form: type[LensTable], advice: str) -> Any:
@@ -197,7 +215,9 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     if lens.field is not None:
         field = FieldTable(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
     w, x, y, z = q_cam_to_mon.tolist()
-    coefficients: dict[str, Any] = dict(zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True))
+    coefficients: dict[str, Any] = dict(
+        zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True)
+    )
     found = GeometryFile(
         kind=KIND,
         resolution_px=camera.resolution_px,
@@ -206,13 +226,17 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         q_cam_to_mon=(w, x, y, z),
         tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
         **coefficients,
-        max_field_deg=math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None,
+        max_field_deg=math.degrees(math.atan(lens.max_tangent))
+        if math.isfinite(lens.max_tangent)
+        else None,
         field=field,
         sigma=notes.sigma,
         error=notes.error,
         made=notes.made,
     )
-    table = msgspec.to_builtins(found) | {TABLE: None if notes.identity is None else notes.identity.known()}
+    table = msgspec.to_builtins(found) | {
+        TABLE: None if notes.identity is None else notes.identity.known()
+    }
     write_whole(path, toml_text(table))
 
 

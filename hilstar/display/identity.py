@@ -26,7 +26,19 @@ MIN_IN_A_ROW = 4  # characters: fewer are a count
 SERIAL_BYTES = 4  # of the number in an EDID's head
 NO_SERIAL_WORDS = frozenset(
     {
-        *("na", "none", "null", "nil", "no", "unknown", "undefined", "default", "empty", "blank", "tbd"),
+        *(
+            "na",
+            "none",
+            "null",
+            "nil",
+            "no",
+            "unknown",
+            "undefined",
+            "default",
+            "empty",
+            "blank",
+            "tbd",
+        ),
         *("system", "string", "default", "value"),
         *("serial", "serialno", "serialnumber", "sn", "number", "monitor", "display"),
         *("demo", "demoset", "sample", "test", "dummy", "tobefilledbyoem"),
@@ -65,7 +77,10 @@ class MonitorIdentity(Table, frozen=True):
 
     def name(self) -> str:
         """The monitor and its connection for a person."""
-        own = " ".join(part for part in (self.maker, self.model) if part) or "a monitor that does not say what it is"
+        own = (
+            " ".join(part for part in (self.maker, self.model) if part)
+            or "a monitor that does not say what it is"
+        )
         own += f", serial {self.serial}" if self.serial else ""
         return f"{own}, on {self.connector or 'a connector not known'} at {self.mode or 'a mode not known'}"
 
@@ -81,7 +96,11 @@ class MonitorIdentity(Table, frozen=True):
 
     def known(self) -> dict[str, Any]:
         """What is known, by its keys."""
-        return {key: value for key, value in msgspec.to_builtins(self).items() if value not in ("", None, ())}
+        return {
+            key: value
+            for key, value in msgspec.to_builtins(self).items()
+            if value not in ("", None, ())
+        }
 
 
 def edid_identity(edid: bytes) -> MonitorIdentity:
@@ -173,9 +192,25 @@ def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
     and says nothing now, differs.
     """
     if was.edid_sha256 != now.edid_sha256:
-        same = was.serial and (was.maker, was.model, was.serial) == (now.maker, now.model, now.serial)
-        yield "the same monitor with another EDID (another input, or a setting of its menu)" if same else "another monitor"
-    for key in ("connector", "mode", "bits", "gamma_ramp", "brightness", "contrast", "colour_preset"):
+        same = was.serial and (was.maker, was.model, was.serial) == (
+            now.maker,
+            now.model,
+            now.serial,
+        )
+        yield (
+            "the same monitor with another EDID (another input, or a setting of its menu)"
+            if same
+            else "another monitor"
+        )
+    for key in (
+        "connector",
+        "mode",
+        "bits",
+        "gamma_ramp",
+        "brightness",
+        "contrast",
+        "colour_preset",
+    ):
         before, after = getattr(was, key), getattr(now, key)
         if before not in ("", None) and after not in ("", None) and before != after:
             yield f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now {str(after)[:SHOWN_DIGITS]}"

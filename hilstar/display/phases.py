@@ -38,7 +38,9 @@ class Errors:
     centroid_max_px: float
 
 
-def phase_grid(count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MIDDLES) -> tuple[Sprites, int]:
+def phase_grid(
+    count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MIDDLES
+) -> tuple[Sprites, int]:
     """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel;
     and the tile's side, px.
 
@@ -104,7 +106,12 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 
 def shown_by(
-    method: Quantisation, exposure_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, balance: Balance
+    method: Quantisation,
+    exposure_frames: int,
+    panel: Panel,
+    linear: Float32Array,
+    sprites: Sprites,
+    balance: Balance,
 ) -> FloatArray:
     """The light (h, w) that a method shows for a linear image, with `temporal` the mean of
     `exposure_frames` frames.
@@ -113,6 +120,9 @@ def shown_by(
     """
     quantiser = QUANTISERS[method](panel, linear.shape[::-1], balance.psf, balance.seen)
     exposed = quantiser.exposure(FRAMES_BEFORE, exposure_frames)
-    levels = (quantiser.draw(FrameLight(sprites, lambda: linear, lambda: linear, number)) for number in range(exposed.stop))
+    levels = (
+        quantiser.draw(FrameLight(sprites, lambda: linear, lambda: linear, number))
+        for number in range(exposed.stop)
+    )
     shown = (shown_light(each, panel) for each in islice(levels, exposed.start, None))
     return np.asarray(sum(shown) / len(exposed))

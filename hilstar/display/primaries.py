@@ -18,7 +18,13 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.reading import read_text
 from hilstar.basics.text_tables import finite_numbers, read_rows
 from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import MAX_CURVE_BYTES, RANGE_NM, Curve, integration_nodes, refuse_other_units
+from hilstar.sky.spectrum import (
+    MAX_CURVE_BYTES,
+    RANGE_NM,
+    Curve,
+    integration_nodes,
+    refuse_other_units,
+)
 
 PRIMARIES = ("r", "g", "b")
 COLUMNS = ("wavelength_nm", *PRIMARIES)
@@ -38,7 +44,11 @@ XY_NM = np.arange(380.0, 781.0, 1.0)
 # CIE 1931 2 degrees, as sums of Gaussians with two sides (Wyman, Sloan and Shirley 2013, JCGT 2,
 # 1): times, middle, 1 / sigma.
 MATCHING = (
-    ((0.362, 442.0, 0.0624, 0.0374), (1.056, 599.8, 0.0264, 0.0323), (-0.065, 501.1, 0.0490, 0.0382)),
+    (
+        (0.362, 442.0, 0.0624, 0.0374),
+        (1.056, 599.8, 0.0264, 0.0323),
+        (-0.065, 501.1, 0.0490, 0.0382),
+    ),
     ((0.821, 568.8, 0.0213, 0.0247), (0.286, 530.9, 0.0613, 0.0322)),
     ((1.217, 437.0, 0.0845, 0.0278), (0.681, 459.0, 0.0385, 0.0725)),
 )
@@ -70,9 +80,13 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
     for line, cells in read_rows(path, COLUMNS, ADVICE, MAX_CURVE_BYTES):
         rows.append(finite_numbers(path, line, COLUMNS, cells[: len(COLUMNS)], ADVICE))
         if min(rows[-1][1:]) < 0 or not RANGE_NM[0] < rows[-1][0] < RANGE_NM[1]:
-            raise InputError(f"{path}:{line}: power below 0, or a wavelength that is not in nm; {ADVICE}")
+            raise InputError(
+                f"{path}:{line}: power below 0, or a wavelength that is not in nm; {ADVICE}"
+            )
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
-            raise InputError(f"{path}:{line}: wavelengths do not rise from row to row; sort them, each once")
+            raise InputError(
+                f"{path}:{line}: wavelengths do not rise from row to row; sort them, each once"
+            )
     table = np.array(rows).reshape(-1, len(COLUMNS)).T
     if len(rows) > 1:
         refuse_other_units(path, rows[0][0], rows[-1][0])
@@ -100,7 +114,9 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
     power = samples.sum(axis=1)
     lit = np.flatnonzero(power > DARK_SHARE * power.max())
     if len(lit) < 3:
-        raise InputError(f"{path}: {len(lit)} samples with light, where three primaries are wanted; {CCSS_ADVICE}")
+        raise InputError(
+            f"{path}: {len(lit)} samples with light, where three primaries are wanted; {CCSS_ADVICE}"
+        )
     shape = samples[lit] / np.linalg.norm(samples[lit], axis=1, keepdims=True)
     together = shape @ shape.T
     found = []
@@ -108,17 +124,29 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
         gram = together[np.ix_(three, three)]
         if np.linalg.det(gram) > MIXED_WITHIN**4:
             by = nearest_mixtures(gram, together[:, three])
-            off = 1 - 2 * (by * together[:, three]).sum(axis=1) + np.einsum("ni,ij,nj->n", by, gram, by)
-            found.append((float(np.sqrt(max(off.max(), 0.0))), -float(power[lit[three]].sum()), three))
+            off = (
+                1
+                - 2 * (by * together[:, three]).sum(axis=1)
+                + np.einsum("ni,ij,nj->n", by, gram, by)
+            )
+            found.append(
+                (float(np.sqrt(max(off.max(), 0.0))), -float(power[lit[three]].sum()), three)
+            )
     worst = min(found, default=(1.0, 0.0, []))[0]
     if worst > MIXED_WITHIN:
         raise InputError(
             f"{path}: no three of its {len(lit)} samples are primaries of which the others are mixtures (the nearest leave"
             f" {100 * worst:.0f} % of one): a white subpixel, or samples of several displays; {CCSS_ADVICE}"
         )
-    _, _, three = min((one for one in found if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1])
+    _, _, three = min(
+        (one for one in found if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1]
+    )
     size = np.linalg.norm(samples[lit], axis=1)
-    drive = nearest_mixtures(together[np.ix_(three, three)], together[:, three]) * size[:, None] / size[three]
+    drive = (
+        nearest_mixtures(together[np.ix_(three, three)], together[:, three])
+        * size[:, None]
+        / size[three]
+    )
     if drive.max() > 1 + MAX_EXCESS:
         raise InputError(
             f"{path}: a sample has {drive.max():.2f} times the light of its primaries: a white subpixel, as of a panel that is"
@@ -136,14 +164,24 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
     try:
         head, _, rest = text.partition("BEGIN_DATA_FORMAT")
         names, _, rest = rest.partition("END_DATA_FORMAT")
-        keys = dict(words for line in head.splitlines() if len(words := shlex.split(line, comments=True)) == 2)
+        keys = dict(
+            words
+            for line in head.splitlines()
+            if len(words := shlex.split(line, comments=True)) == 2
+        )
         first, last = float(keys["SPECTRAL_START_NM"]), float(keys["SPECTRAL_END_NM"])
         nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))
         fields = names.split()
         spectral = [k for k, name in enumerate(fields) if name.startswith("SPEC_")]
-        cells = np.array(rest.partition("BEGIN_DATA")[2].partition("END_DATA")[0].split()).reshape(-1, len(fields))
+        cells = np.array(rest.partition("BEGIN_DATA")[2].partition("END_DATA")[0].split()).reshape(
+            -1, len(fields)
+        )
         samples = cells[:, spectral].astype(np.float64)
-        good = len(spectral) == len(nm) > 1 and RANGE_NM[0] < first < last < RANGE_NM[1] and np.isfinite(samples).all()
+        good = (
+            len(spectral) == len(nm) > 1
+            and RANGE_NM[0] < first < last < RANGE_NM[1]
+            and np.isfinite(samples).all()
+        )
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: {error} is wrong or missing; {CCSS_ADVICE}") from error
     if not good or not 0 < len(samples) <= MAX_SAMPLES:
@@ -173,9 +211,13 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
                 " another width_nm, or measured spectra as file"
             )
     white = np.array([D65_XY[0], D65_XY[1], 1 - sum(D65_XY)]) / D65_XY[1]
-    amounts = np.linalg.solve(seen[chosen].T, white) if len(set(chosen)) == len(chosen) else np.zeros(3)
+    amounts = (
+        np.linalg.solve(seen[chosen].T, white) if len(set(chosen)) == len(chosen) else np.zeros(3)
+    )
     if not (amounts > 0).all():
-        raise InputError("[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those of r, g and b")
+        raise InputError(
+            "[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those of r, g and b"
+        )
     return _curves(XY_NM, spectra[chosen] * amounts[:, None])
 
 
@@ -186,11 +228,15 @@ def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
 
 def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
     """The longest wavelength at which a primary has `least` of its largest power."""
-    lit = [curve.wavelength_nm[curve.value > least * curve.value.max()].max() for curve in primaries]
+    lit = [
+        curve.wavelength_nm[curve.value > least * curve.value.max()].max() for curve in primaries
+    ]
     return float(max(lit))
 
 
-def channel_matrix(primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float) -> ChannelMatrix:
+def channel_matrix(
+    primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float
+) -> ChannelMatrix:
     """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels
     together.
 
@@ -198,9 +244,13 @@ def channel_matrix(primaries: Sequence[Curve], channels: Mapping[str, Optics], w
     wavelength: photons are counted. Raises InputError where the tracker detects no light of the
     primaries.
     """
-    matrix = np.array([[_electrons(primary, optics) for primary in primaries] for optics in channels.values()])
+    matrix = np.array(
+        [[_electrons(primary, optics) for primary in primaries] for optics in channels.values()]
+    )
     if not matrix.any():
-        raise InputError("[monitor.primaries] file: the tracker detects none of this light; check that both are in nm")
+        raise InputError(
+            "[monitor.primaries] file: the tracker detects none of this light; check that both are in nm"
+        )
     parted = np.linalg.matrix_rank(matrix) == min(matrix.shape)
     condition = float(np.linalg.cond(matrix)) if parted else None
     return ChannelMatrix(tuple(channels), matrix * (white_e_per_s / matrix.sum()), condition)
@@ -227,7 +277,9 @@ def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = Fals
         for parts in map(list, itertools.combinations(range(len(gram)), size)):
             system, right = gram[np.ix_(parts, parts)], wanted[:, parts]
             if whole:
-                system = np.block([[system, np.ones((size, 1))], [np.ones((1, size)), np.zeros((1, 1))]])
+                system = np.block(
+                    [[system, np.ones((size, 1))], [np.ones((1, size)), np.zeros((1, 1))]]
+                )
                 right = np.column_stack([right, np.ones(len(right))])
             found = np.zeros_like(wanted)
             found[:, parts] = (right @ np.linalg.pinv(system, rcond=SINGULAR).T)[:, :size]

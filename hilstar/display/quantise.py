@@ -57,7 +57,9 @@ class Panel:
     primaries: "tuple[Panel, ...]" = ()
 
     def __post_init__(self) -> None:
-        if self.uniformity is not None and not (np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()):
+        if self.uniformity is not None and not (
+            np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()
+        ):
             raise InputError(
                 "the uniformity map has pixels that are not positive; give each pixel its light relative to the mean"
             )
@@ -116,7 +118,9 @@ class Quantiser(ABC):
     shader: ClassVar[str] = ""
     other_codes: ClassVar[float] = 1e-4
 
-    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+    def __init__(
+        self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL
+    ) -> None:
         """For images of `resolution_px`, sprites of `psf`, and a tracker that sees the monitor
         as `seen`.
         """
@@ -358,7 +362,9 @@ def lit_light(levels: Levels, panel: Panel) -> LitLight:
     """
     place = np.flatnonzero(levels)
     light = panel.response.light[levels.ravel()[place]] * panel.flux_at_white_e_per_s
-    return LitLight(place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place])
+    return LitLight(
+        place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
+    )
 
 
 def primary_levels(levels: Levels, panel: Panel) -> list[tuple[Levels, Panel]]:
@@ -396,7 +402,10 @@ class CodeTable:
         there is an empty one, for all light below it. None where a bin has several thresholds.
         """
         bits, none = self.threshold.view(np.uint32), np.uint32(1 << self.bin_shift)
-        place, lower = (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin, bits & (none - 1)
+        place, lower = (
+            (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin,
+            bits & (none - 1),
+        )
         # the first code of a later bin counts a threshold at its very edge
         asked = (lower > 0) | (place == 0)
         place, lower = place[asked], lower[asked]
@@ -415,9 +424,15 @@ def code_table(thresholds: Float32Array) -> CodeTable:
     one threshold; up to MAX_FINER times as many where then none does.
     """
     bits = min(12, len(thresholds).bit_length())
-    tables = (_table(thresholds, MANTISSA_BITS - bits - finer) for finer in range(MAX_FINER.bit_length()))
+    tables = (
+        _table(thresholds, MANTISSA_BITS - bits - finer) for finer in range(MAX_FINER.bit_length())
+    )
     first = next(tables)
-    return first if first.steps() is not None else next((table for table in tables if table.steps() is not None), first)
+    return (
+        first
+        if first.steps() is not None
+        else next((table for table in tables if table.steps() is not None), first)
+    )
 
 
 def _table(thresholds: Float32Array, shift: int) -> CodeTable:
@@ -443,7 +458,9 @@ class ThresholdCounter:
 
     def count(self, light: Float32Array) -> IntArray:
         """How many thresholds are at or below each light, which is finite; same shape."""
-        place = np.clip((light.view(np.int32) >> self._shift) - self._first_bin, 0, len(self._first) - 1)
+        place = np.clip(
+            (light.view(np.int32) >> self._shift) - self._first_bin, 0, len(self._first) - 1
+        )
         count: IntArray = self._first[place]
         while (more := light >= self._threshold[count]).any():
             count += more

@@ -87,14 +87,18 @@ def table_response(bits: int, light: FloatArray, black: float = 0.0) -> Response
     return Response(bits, light, _midway(light), black)
 
 
-def mixed_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
+def mixed_response(
+    channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0
+) -> Response:
     """The grey response of three channels, each weighted as the tracker sees its primary."""
     share = np.asarray(weights) / np.sum(weights)
     light = share @ np.stack([channel.light for channel in channels])
     return table_response(channels[0].bits, light / light[-1], black)
 
 
-def bit_stealing_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
+def bit_stealing_response(
+    channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0
+) -> Response:
     """Levels between the greys: the six triples of codes k and k + 1 between grey k and grey k + 1,
     by rising light.
 
@@ -104,13 +108,20 @@ def bit_stealing_response(channels: tuple[Response, Response, Response], weights
     """
     bits = channels[0].bits
     if (2**bits - 1) * TRIPLES + 1 > MAX_LEVELS:
-        raise InputError(f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most 13 bits")
+        raise InputError(
+            f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most 13 bits"
+        )
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     # (0, 0, 0) first; (1, 1, 1) is the next grey
     steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]
     rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)
     rgb = np.concatenate([rgb, np.full((1, 3), 2**bits - 1)])
-    light = np.stack([channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1) @ share
+    light = (
+        np.stack(
+            [channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1
+        )
+        @ share
+    )
     order = np.argsort(light, kind="stable")
     rgb, light = rgb[order], light[order]
     grey, kept = (rgb == rgb[:, :1]).all(axis=1), [0]
@@ -132,7 +143,9 @@ def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
     return np.uint8 if bits <= 8 else np.uint16
 
 
-def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Levels:
+def encode(
+    linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float
+) -> Levels:
     """Nearest levels of a linear image, same shape, uint8 up to 256 levels; light over white
     becomes white.
     """

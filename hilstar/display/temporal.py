@@ -114,5 +114,7 @@ def first_phases(star: IntArray, before: IntArray) -> Float32Array:
     """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were
     there before.
     """
-    turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(np.float64) / 2**32 - 0.5
+    turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(
+        np.float64
+    ) / 2**32 - 0.5
     return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)

@@ -53,7 +53,9 @@ class ResidualField:
     resolution_px: tuple[int, int]
 
     @classmethod
-    def of_terms(cls, x: FloatArray, y: FloatArray, degree: int, resolution_px: tuple[int, int]) -> "ResidualField":
+    def of_terms(
+        cls, x: FloatArray, y: FloatArray, degree: int, resolution_px: tuple[int, int]
+    ) -> "ResidualField":
         """The field of coefficients (terms,) in the order of `field_terms`."""
         squares = np.zeros((2, degree + 1, degree + 1))
         i, j = _exponents(degree)
@@ -63,10 +65,14 @@ class ResidualField:
     def at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The shift at pixels (k,), px."""
         columns, rows = _polynomials(x_px, y_px, self.resolution_px, len(self.x) - 1)
-        return np.einsum("ik,ik->k", self.x.T @ columns, rows), np.einsum("ik,ik->k", self.y.T @ columns, rows)
+        return np.einsum("ik,ik->k", self.x.T @ columns, rows), np.einsum(
+            "ik,ik->k", self.y.T @ columns, rows
+        )
 
 
-def field_terms(x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int) -> FloatArray:
+def field_terms(
+    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int
+) -> FloatArray:
     """The polynomials T_i T_j of total degree up to `degree` at pixels (k,): (k, terms)."""
     columns, rows = _polynomials(x_px, y_px, resolution_px, degree)
     i, j = _exponents(degree)
@@ -161,11 +167,15 @@ def ray_shifts(camera: "Camera") -> Float32Array:
     The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's
     likewise. Where the lens has no direction the shift is 0.
     """
-    places = [np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1) for size in camera.resolution_px]
+    places = [
+        np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1) for size in camera.resolution_px
+    ]
     x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
     seen = camera.tangents(x_px, y_px)
     plain = replace(camera, lens=None).tangents(x_px, y_px)
-    shifts = np.stack([a - b for a, b in zip(seen, plain, strict=True)], axis=-1).reshape(len(places[1]), len(places[0]), 2)
+    shifts = np.stack([a - b for a, b in zip(seen, plain, strict=True)], axis=-1).reshape(
+        len(places[1]), len(places[0]), 2
+    )
     return np.nan_to_num(shifts).astype(np.float32)
 
 
@@ -227,7 +237,10 @@ class Camera:
         u[beyond] /= times
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)
-        for place, centre in ((x_px, self.principal_point_px[0]), (y_px, self.principal_point_px[1])):
+        for place, centre in (
+            (x_px, self.principal_point_px[0]),
+            (y_px, self.principal_point_px[1]),
+        ):
             place[beyond] = centre + (place[beyond] - centre) * times
         return x_px, y_px
 
@@ -325,17 +338,26 @@ class Camera:
         xx, yy = wide * (a * a + b * b + along_x**2), wide * (c * c + d * d + along_y**2)
         xy = wide * (a * c + b * d + along_x * along_y)
         middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-        return float(np.sqrt(np.nanmin(middle - spread))), float(np.sqrt(np.nanmax(middle + spread)))
+        return float(np.sqrt(np.nanmin(middle - spread))), float(
+            np.sqrt(np.nanmax(middle + spread))
+        )
 
     def grid_px(self, count: int | tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Places over the whole image, its edges among them: `count` to a row and a column, or
         (columns, rows).
         """
         counts = (count, count) if isinstance(count, int) else count
-        x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(self.resolution_px, counts, strict=True)))
+        x, y = np.meshgrid(
+            *(
+                np.linspace(-0.5, size - 0.5, n)
+                for size, n in zip(self.resolution_px, counts, strict=True)
+            )
+        )
         return x.ravel(), y.ravel()
 
-    def pixels_from(self, other: "Camera", x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def pixels_from(
+        self, other: "Camera", x_px: FloatArray, y_px: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """This camera's pixels at pixels (n,) of another; NaN behind this camera, and beyond a
         lens.
         """
@@ -347,7 +369,10 @@ class Camera:
         """Whether places in pixels are on the image; not so at NaN."""
         width, height = self.resolution_px
         with np.errstate(invalid="ignore"):
-            return np.asarray((np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2))
+            return np.asarray(
+                (np.abs(x_px - (width - 1) / 2) <= width / 2)
+                & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+            )
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
         """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the
@@ -376,7 +401,11 @@ class Camera:
             return self.lens.box
         pairs = zip(self.principal_point_px, self.resolution_px, strict=True)
         x, y = (
-            ((-0.5 - margin_px - c) / self.focal_length_px, (n - 0.5 + margin_px - c) / self.focal_length_px) for c, n in pairs
+            (
+                (-0.5 - margin_px - c) / self.focal_length_px,
+                (n - 0.5 + margin_px - c) / self.focal_length_px,
+            )
+            for c, n in pairs
         )
         return x, y
 
@@ -387,7 +416,9 @@ class Camera:
         With a lens they are those of the box around its directions.
         """
         (left, right), (top, bottom) = self._box(margin_px)
-        normals = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        normals = np.array(
+            [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+        )
         return np.asarray(normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)))
 
     def field(self, margin_px: float) -> tuple[float, FloatArray]:
@@ -442,21 +473,31 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     if lens is None:
         return camera
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
-    (left, right), (top, bottom) = ((-0.5 - margin_px, size - 0.5 + margin_px) for size in camera.resolution_px)
+    (left, right), (top, bottom) = (
+        (-0.5 - margin_px, size - 0.5 + margin_px) for size in camera.resolution_px
+    )
     across, down = np.linspace(left, right, BORDER_PLACES), np.linspace(top, bottom, BORDER_PLACES)
-    border_x = np.concatenate([across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)])
-    border_y = np.concatenate([np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down])
+    border_x = np.concatenate(
+        [across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)]
+    )
+    border_y = np.concatenate(
+        [np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down]
+    )
     u, v = free.tangents(border_x, border_y)
     reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
     box = (_wide(u), _wide(v))
     folds = True
     if np.isfinite(reach):
-        side_u, side_v = (part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, FOLD_PLACES)] * 2))
+        side_u, side_v = (
+            part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, FOLD_PLACES)] * 2)
+        )
         inside = np.hypot(side_u, side_v) <= reach
         a, b, c, d = free.slopes(side_u[inside], side_v[inside])
         folds = not (a * d - b * c > 0).all()
     if folds:
-        raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
+        raise InputError(
+            "its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms"
+        )
     return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER, box=box))
 
 
@@ -465,4 +506,6 @@ def _wide(tangents: FloatArray) -> tuple[float, float]:
     all, where one is unknown.
     """
     low, high = float(tangents.min()), float(tangents.max())
-    return (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT
+    return (
+        (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT
+    )

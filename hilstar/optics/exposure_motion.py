@@ -74,7 +74,9 @@ class Motion:
         return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
 
 
-def own_row_s(paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan) -> tuple[FloatArray, FloatArray]:
+def own_row_s(
+    paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan
+) -> tuple[FloatArray, FloatArray]:
     """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt /
     ds: how much longer that is.
 
@@ -93,7 +95,9 @@ def own_row_s(paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: S
     return found, 1 / (1 - np.clip(share, -MAX_ROWS_A_ROW, MAX_ROWS_A_ROW))
 
 
-def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan: Scan = AT_ONCE) -> Sprites:
+def smeared_sprites(
+    stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan: Scan = AT_ONCE
+) -> Sprites:
     """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
 
     `scan` says over how long rows begin, and in which direction. `capped` stars are drawn coarser
@@ -101,7 +105,9 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan
     long to be drawn at all.
     """
     if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
-        return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px)
+        return make_sprites(
+            stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px
+        )
     degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
     turn = f"an exposure in which the camera turns by {degrees:.4g} deg"
     fastest_px_s = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s)
@@ -126,16 +132,24 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan
         smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness, scan)
         chain: list[Sprites] = []
         total = 0
-        for begin, end in itertools.pairwise(np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s):
+        for begin, end in itertools.pairwise(
+            np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s
+        ):
             chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
             total += len(chain[-1])
             if total > MAX_SPRITES:
                 break
         else:
             sprites = join_sprites(chain, psf.footprint_px)
-            return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
+            return (
+                sprites
+                if fineness == 1.0
+                else replace(sprites, capped=len(np.unique(sprites.star)))
+            )
         fineness *= COARSER
-    raise InputError(f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars")
+    raise InputError(
+        f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,23 +165,33 @@ class _Smear:
     def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> Sprites:
         """The sprites of a piece of an exposure that is `part` of it."""
         camera, stars = self.camera, self.stars
-        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (end_s - begin_s + self.scan.scanout_s)
+        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (
+            end_s - begin_s + self.scan.scanout_s
+        )
         middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
         radius_rad, edges = camera.field(self.psf.footprint_px / 2 + 1)
         near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
-        paths = Paths(stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
+        paths = Paths(
+            stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera
+        )
         half_s = (end_s - begin_s) / 2
         thrice_s = np.array([[-half_s], [0.0], [half_s]])
         if self.scan.scanout_s:
             every = np.tile(np.arange(len(paths)), 3)
-            thrice_s = own_row_s(paths, every, np.repeat(thrice_s, len(paths)), self.scan)[0].reshape(3, -1)
+            thrice_s = own_row_s(paths, every, np.repeat(thrice_s, len(paths)), self.scan)[
+                0
+            ].reshape(3, -1)
         x_px, y_px = paths.all_places_px(thrice_s)
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
-        length = sum(Chords(x_px[k : k + 2], y_px[k : k + 2]).length_sigma(self.psf.width_px) for k in (0, 1))
+        length = sum(
+            Chords(x_px[k : k + 2], y_px[k : k + 2]).length_sigma(self.psf.width_px) for k in (0, 1)
+        )
         whole = Chords(x_px[::2], y_px[::2])
         bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
         begin, end = whole.on_image(camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
-        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
+        counts = node_counts(
+            length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA
+        )
         counts[end <= begin] = 0  # the path misses the image
         nodes = nodes_of(np.minimum(counts, MAX_NODES))
         share = begin[nodes.path] + (end - begin)[nodes.path] * (nodes.place + 1) / 2

@@ -136,13 +136,28 @@ class DiscLight:
             return (0, 0, *resolution_px)
         sheared_px = 0.0  # how far the first and the last pixels' light is moved at most, about
         if self.shear is not None:
-            late_s = sum(abs(s) * size for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)) / 2
+            late_s = (
+                sum(
+                    abs(s) * size
+                    for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)
+                )
+                / 2
+            )
             turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
-            sheared_px = 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
+            sheared_px = (
+                2
+                * turn
+                * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
+            )
         edges = []
         for k, place in enumerate((x_px, y_px)):
             low, high = float(place.min()), float(place.max())
-            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k])) + 1 + sheared_px
+            half = (
+                (high - low) / 2 * BOW
+                + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k]))
+                + 1
+                + sheared_px
+            )
             edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
         return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
 
@@ -165,21 +180,32 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
         from scipy.ndimage import shift
 
         image, cover = (
-            None if one is None else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
+            None
+            if one is None
+            else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
             for one, most in ((light.image, np.inf), (light.cover, 1.0))
         )
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1
-        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
+        return (
+            light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
+        )
     x_px, y_px = light.camera.principal_point_px
-    return replace(light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px)))
+    return replace(
+        light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px))
+    )
 
 
-def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
+def clipped(
+    edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]
+) -> Rectangle | None:
     """The pixels of an image within left, top, right and bottom (the last two excluded); None
     where there is none.
     """
     (left, right), (top, bottom) = (
-        np.clip((np.floor(edges_px[k]), np.ceil(edges_px[k + 2])), 0, resolution_px[k]).astype(int).tolist() for k in (0, 1)
+        np.clip((np.floor(edges_px[k]), np.ceil(edges_px[k + 2])), 0, resolution_px[k])
+        .astype(int)
+        .tolist()
+        for k in (0, 1)
     )
     return (left, top, right - left, bottom - top) if right > left and bottom > top else None
 
@@ -212,7 +238,11 @@ def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]
     """
     if len(view.poses) == 1:
         pose = view.poses[0]
-        return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, covers, view.shear))
+        return _at_pose(
+            DiscLight(
+                disc, pose.icrs_to_image, view.camera, view.psf, pose.share, covers, view.shear
+            )
+        )
     lights: list[ExtendedLight] = []
     if covers:
         # Poses hide together what one in the middle hides: each after the other would hide the
@@ -220,7 +250,11 @@ def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]
         middle = view.poses[len(view.poses) // 2].icrs_to_image
         lights += _at_pose(DiscLight(disc, middle, view.camera, view.psf, 0.0, True, view.shear))
     for pose in view.poses:
-        lights += _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, False, view.shear))
+        lights += _at_pose(
+            DiscLight(
+                disc, pose.icrs_to_image, view.camera, view.psf, pose.share, False, view.shear
+            )
+        )
     return lights
 
 
@@ -266,7 +300,9 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         px_per_sr = float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)
         share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * px_per_sr, region)
         cover = np.where(share > WHOLE, np.float32(1), share)
-    image = light.psf.spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region)
+    image = light.psf.spread(
+        lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region
+    )
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
 
 
@@ -285,4 +321,8 @@ def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
     directions, law_sr = disc.points(nodes)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
-    return FacePlaces(x_px, y_px, law_sr) if known.all() else FacePlaces(x_px[known], y_px[known], law_sr[known])
+    return (
+        FacePlaces(x_px, y_px, law_sr)
+        if known.all()
+        else FacePlaces(x_px[known], y_px[known], law_sr[known])
+    )

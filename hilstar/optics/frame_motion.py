@@ -14,7 +14,16 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
-from hilstar.optics.paths import Chords, Paths, ShortPaths, bend_px, node_counts, nodes_of, points_within, within_budget
+from hilstar.optics.paths import (
+    Chords,
+    Paths,
+    ShortPaths,
+    bend_px,
+    node_counts,
+    nodes_of,
+    points_within,
+    within_budget,
+)
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
@@ -46,7 +55,9 @@ class Orientation:
 
     def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
         """The screen that an image of `resolution_px` fills."""
-        return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+        return (
+            resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+        )
 
     @property
     def down(self) -> tuple[int, int]:
@@ -88,7 +99,9 @@ class Scan:
         """
         return self.scanout_s / 2 + self.hold_s
 
-    def late_s(self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
+    def late_s(
+        self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]
+    ) -> FloatArray:
         """How long after the middle row the row of a pixel lights up; off the image as at its
         edge.
         """
@@ -121,7 +134,9 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
     makes them.
     """
     turn, is_slower = slowed(turn, scan, camera)
-    middle = CameraTurn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
+    middle = CameraTurn(
+        propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s
+    )
     icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
     footprint_px = psf.footprint_px
     margin_px = footprint_px / 2 + 1
@@ -150,11 +165,15 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
     span_s = np.zeros(len(late_s))
     if scan.hold_s:
         share = (scan.late_s(*ends[1], camera.resolution_px) - late_s) / scan.hold_s
-        span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
+        span_s = scan.hold_s / (
+            1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD)
+        )
         chords = chords.to(span_s / scan.hold_s)
     # the part of each path, 0 to 1
     first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)
-    wanted = node_counts(chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    wanted = node_counts(
+        chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA
+    )
     wanted[last <= first] = 0  # the path misses the image
     chosen, wanting = wanted, np.flatnonzero(wanted)
     kept = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
@@ -186,14 +205,19 @@ def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Pa
     if points is None:
         return exact
     x_px, y_px = exact.through(replace(camera, lens=None)).all_places_px(np.zeros((1, 1)))
-    return ShortPaths(exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points)
+    return ShortPaths(
+        exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points
+    )
 
 
 def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
     """The turn itself, or one about the same axis that takes no star farther than
     MAX_TURN_FIELD; and whether it is slower.
     """
-    angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
+    angle_rad, most_rad = (
+        turn.speed_rad_s * scan.whole_s,
+        MAX_TURN_FIELD * camera.field_radius_rad(0.0),
+    )
     if angle_rad <= most_rad:
         return turn, False
     return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True

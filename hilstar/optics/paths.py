@@ -44,7 +44,13 @@ MAX_HALF_TURN_RAD = 0.04
 NARROWER = 2**-0.25
 TRIES = 40
 TRIED_PLACES, TRIED_MOMENTS = 13, 9  # along each side of the image, and within a turn
-TRIED_AXES = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (0.0, 1.0) if (x, y, z) != (0.0, 0.0, 0.0)]
+TRIED_AXES = [
+    (x, y, z)
+    for x in (-1.0, 0.0, 1.0)
+    for y in (-1.0, 0.0, 1.0)
+    for z in (0.0, 1.0)
+    if (x, y, z) != (0.0, 0.0, 0.0)
+]
 # A path may begin or end beyond what its lens is known for. Straight lines from there would put a
 # kink into it.
 BEYOND_LENS = 1.05
@@ -64,7 +70,11 @@ class NodeTable(NamedTuple):
 def _node_table() -> NodeTable:
     rules = [np.polynomial.legendre.leggauss(count) for count in range(1, MAX_NODES + 1)]
     first = np.cumsum([0, 0, *range(1, MAX_NODES)])
-    return NodeTable(first, np.concatenate([nodes for nodes, _ in rules]), np.concatenate([weights for _, weights in rules]))
+    return NodeTable(
+        first,
+        np.concatenate([nodes for nodes, _ in rules]),
+        np.concatenate([weights for _, weights in rules]),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,21 +137,29 @@ class Paths:
         paths.camera = camera
         return paths
 
-    def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def places_px(
+        self, star: IntArray | slice, seconds: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,);
         NaN behind the camera.
         """
-        return self._places_px(self._seen[:, star], self._cross[:, star], self._along[:, star], seconds)
+        return self._places_px(
+            self._seen[:, star], self._cross[:, star], self._along[:, star], seconds
+        )
 
     def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN
         behind the camera.
         """
         shape = len(seconds), len(self)
-        x_px, y_px = self._places_px(self._seen[:, None], self._cross[:, None], self._along[:, None], seconds)
+        x_px, y_px = self._places_px(
+            self._seen[:, None], self._cross[:, None], self._along[:, None], seconds
+        )
         return x_px.reshape(shape), y_px.reshape(shape)
 
-    def tangents_at(self, seconds: FloatArray, unit_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def tangents_at(
+        self, seconds: FloatArray, unit_s: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of
         the change of that.
         """
@@ -181,7 +199,10 @@ class Chords:
 
     def to(self, longer: FloatArray) -> "Chords":
         """The same ways from their begins, so many times (n,) as long."""
-        x_px, y_px = (np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer]) for ends in (self.x_px, self.y_px))
+        x_px, y_px = (
+            np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer])
+            for ends in (self.x_px, self.y_px)
+        )
         return Chords(x_px, y_px)
 
     def length_sigma(self, width_px: tuple[float, float]) -> FloatArray:
@@ -189,10 +210,17 @@ class Chords:
         the camera.
         """
         return np.asarray(
-            np.hypot(*(np.diff(ends, axis=0)[0] / s for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)))
+            np.hypot(
+                *(
+                    np.diff(ends, axis=0)[0] / s
+                    for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)
+                )
+            )
         )
 
-    def on_image(self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def on_image(
+        self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
         """Begin and end (n,) of the part of each, 0 to 1, that is within `margin_px` of the image;
         1 and 0 for none.
 
@@ -207,23 +235,31 @@ class Chords:
             step = np.where(still, 1.0, step)
             a, b = (low - ends[0]) / step, (high - ends[0]) / step
             outside = still & ((ends[0] < low) | (ends[0] > high))
-            begin = np.maximum(begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b)))
+            begin = np.maximum(
+                begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b))
+            )
             end = np.minimum(end, np.where(still, np.where(outside, 0.0, 1.0), np.maximum(a, b)))
         seen = end > begin
         finite, (width, height) = np.isfinite(self.x_px), resolution_px
-        there = (np.abs(self.x_px - width / 2) <= width) & (np.abs(self.y_px - height / 2) <= height)
+        there = (np.abs(self.x_px - width / 2) <= width) & (
+            np.abs(self.y_px - height / 2) <= height
+        )
         half_seen = (finite.sum(axis=0) == 1) & there.any(axis=0)
         begin, end = np.where(seen, begin, 1.0), np.where(seen, end, 0.0)
         begin[half_seen], end[half_seen] = 0.0, 1.0
         return begin, end
 
 
-def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shortest_sigma: float) -> IntArray:
+def node_counts(
+    length_sigma: FloatArray, per_sigma: float, at_rest: int, shortest_sigma: float
+) -> IntArray:
     """ceil(per_sigma length + at_rest) nodes for each length in sigmas, 1 under `shortest_sigma`.
 
     A length that is not finite gets MAX_NODES.
     """
-    length = np.where(np.isfinite(length_sigma), np.minimum(length_sigma, 1e9), MAX_NODES / per_sigma)
+    length = np.where(
+        np.isfinite(length_sigma), np.minimum(length_sigma, 1e9), MAX_NODES / per_sigma
+    )
     counts = np.ceil(per_sigma * length + at_rest)
     return np.asarray(np.where(length < shortest_sigma, 1, counts), dtype=np.intp)
 
@@ -243,20 +279,29 @@ class ShortPaths:
         self._count = len(exact)
         self._middle_s, self._half_s = middle_s, half_s
         if points == 1:
-            self._terms = _lens_table(*_mapping(exact.camera)).along(*exact.tangents_at(middle_s, half_s))
+            self._terms = _lens_table(*_mapping(exact.camera)).along(
+                *exact.tangents_at(middle_s, half_s)
+            )
             return
         at = np.cos((np.arange(points) + 0.5) * (np.pi / points))
-        places = np.stack(exact.through(_beyond(exact.camera)).all_places_px(middle_s + half_s * at[:, None]), axis=1)
+        places = np.stack(
+            exact.through(_beyond(exact.camera)).all_places_px(middle_s + half_s * at[:, None]),
+            axis=1,
+        )
         powers = np.linalg.inv(np.vander(at, increasing=True))
         self._terms = (powers @ places.reshape(points, -1)).reshape(places.shape)
 
     def __len__(self) -> int:
         return self._count
 
-    def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def places_px(
+        self, star: IntArray | slice, seconds: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,)."""
         at = (seconds - self._middle_s[star]) / self._half_s
-        terms = self._terms[:, :, star] if isinstance(star, slice) else self._terms.take(star, axis=2)
+        terms = (
+            self._terms[:, :, star] if isinstance(star, slice) else self._terms.take(star, axis=2)
+        )
         places = terms[-1] * at
         for term in terms[-2:0:-1]:
             places += term
@@ -289,7 +334,9 @@ class LensTable:
         for of_side, size in zip(node, self.shape, strict=True):
             of_side.clip(0, size - 1, out=of_side)
         off -= node
-        place, by_u, by_v, uu, uv, vv = self.terms.take((node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2)
+        place, by_u, by_v, uu, uv, vv = self.terms.take(
+            (node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2
+        )
         (u, v), (first_u, first_v), (bend_u, bend_v) = off, by * self.steps, bend * self.steps
         steep_u, steep_v = uu * u, vv * v
         place += u * (by_u + steep_u)
@@ -298,7 +345,12 @@ class LensTable:
         by_u += uv * v + 2 * steep_u
         by_v += cross + 2 * steep_v
         first = by_u * first_u + by_v * first_v
-        second = by_u * bend_u + by_v * bend_v + (uu * first_u + uv * first_v) * first_u + vv * (first_v * first_v)
+        second = (
+            by_u * bend_u
+            + by_v * bend_v
+            + (uu * first_u + uv * first_v) * first_u
+            + vv * (first_v * first_v)
+        )
         return np.stack([place, first, second])
 
 
@@ -308,7 +360,9 @@ def _mapping(camera: Camera) -> tuple[tuple[int, int], float, tuple[float, float
 
 
 @lru_cache(maxsize=4)
-def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens) -> LensTable:
+def _lens_table(
+    size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens
+) -> LensTable:
     """The table of a bounded lens: its places at the grid's nodes, their slopes and bends by
     differences.
     """
@@ -327,8 +381,13 @@ def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[f
     terms = np.stack([middle, (right - left) / 2, (below - above) / 2, *bends]).reshape(6, 2, -1)
     table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
     between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
-    found, exact = table.along(between, *np.zeros((2, 2, 1)))[0], np.stack(camera.places_outward_px(*between))
-    return replace(table, off_px=float(np.hypot(*(found - exact))[camera.contains_px(*exact)].max(initial=0.0)))
+    found, exact = (
+        table.along(between, *np.zeros((2, 2, 1)))[0],
+        np.stack(camera.places_outward_px(*between)),
+    )
+    return replace(
+        table, off_px=float(np.hypot(*(found - exact))[camera.contains_px(*exact)].max(initial=0.0))
+    )
 
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
@@ -362,8 +421,15 @@ def _longest_half_turns_rad(
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
     few = POINTS
     if lens is not None and lens.max_tangent < WIDEST_TABLE:
-        few = LENS_POINTS if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX else POINTS
-    firsts = [bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0) for points in few]
+        few = (
+            LENS_POINTS
+            if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX
+            else POINTS
+        )
+    firsts = [
+        bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0)
+        for points in few
+    ]
     return tuple((points, [*turns, 0.0][first]) for points, first in zip(few, firsts, strict=True))
 
 
@@ -393,4 +459,8 @@ def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
 
 def _beyond(camera: Camera) -> Camera:
     lens = camera.lens
-    return camera if lens is None else replace(camera, lens=replace(lens, max_tangent=lens.max_tangent * BEYOND_LENS))
+    return (
+        camera
+        if lens is None
+        else replace(camera, lens=replace(lens, max_tangent=lens.max_tangent * BEYOND_LENS))
+    )

@@ -128,7 +128,9 @@ class Psf(ABC):
         """
 
     @abstractmethod
-    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+    def stamps(
+        self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
+    ) -> Float32Array:
         """The light of n stars in squares of pixels (side, side, n): rows, columns, stars.
 
         `fraction_px` (2, n) is each star's x and y from the middle of its pixel, which is the
@@ -137,7 +139,11 @@ class Psf(ABC):
 
     @abstractmethod
     def spread(
-        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        electrons_per_s: FloatArray,
+        region: tuple[int, int, int, int],
     ) -> Float32Array:
         """The light of n points in all pixels of a region: left, top, width, height."""
 
@@ -188,7 +194,9 @@ class GaussianPsf(Psf):
         sizes = range(1, MAX_GAUSSIAN_PX + 1)
         place = bisect_left(sizes, -MAX_CUT, key=lambda size: -self.cut_share(size))
         if place == len(sizes):
-            raise InputError(f"sprite sigma {self.sigma_px} px: too large for any footprint; write a few pixels")
+            raise InputError(
+                f"sprite sigma {self.sigma_px} px: too large for any footprint; write a few pixels"
+            )
         return sizes[place]
 
     @cached_property
@@ -202,7 +210,10 @@ class GaussianPsf(Psf):
         scale = [2 * (sigma**2 + 1 / 12) for sigma in self.sigma_px]
         places = np.linspace(0.0, self.footprint_px / 2 + 0.5, BOUND_PLACES)
         shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in self.sigma_px]
-        more = [float((np.log(share) + places**2 / along).max()) for share, along in zip(shares, scale, strict=True)]
+        more = [
+            float((np.log(share) + places**2 / along).max())
+            for share, along in zip(shares, scale, strict=True)
+        ]
         return Reach((scale[0], scale[1]), math.exp(sum(more)))
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -213,38 +224,56 @@ class GaussianPsf(Psf):
             return np.asarray(both[0] * both[1])
         return pixel_shares(x_px, sigma_x) * pixel_shares(y_px, sigma_y)
 
-    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+    def stamps(
+        self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
+    ) -> Float32Array:
         """Row by row the product of what each column and each row has."""
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
         edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
-        across, down = (np.diff(ndtr((edges - at) / s), axis=0) for at, s in zip(fraction_px, self.sigma_px, strict=True))
+        across, down = (
+            np.diff(ndtr((edges - at) / s), axis=0)
+            for at, s in zip(fraction_px, self.sigma_px, strict=True)
+        )
         down *= electrons_per_s
         return np.asarray(across.astype(np.float32)[None] * down.astype(np.float32)[:, None])
 
     def spread(
-        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        electrons_per_s: FloatArray,
+        region: tuple[int, int, int, int],
     ) -> Float32Array:
         """One product of all rows and all columns."""
         from scipy.special import ndtr  # as in `stamps`
 
         left, top, width, height = region
-        across = np.diff(ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / self.sigma_px[0]), axis=1)
-        down = np.diff(ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / self.sigma_px[1]), axis=1)
+        across = np.diff(
+            ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / self.sigma_px[0]), axis=1
+        )
+        down = np.diff(
+            ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / self.sigma_px[1]), axis=1
+        )
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
         """Axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
-            inside_axis = 1.0 - 0.5 * sum(math.erfc((size_px / 2 + side) / (sigma * SQRT2)) for side in (-0.5, 0.5))
+            inside_axis = 1.0 - 0.5 * sum(
+                math.erfc((size_px / 2 + side) / (sigma * SQRT2)) for side in (-0.5, 0.5)
+            )
             inside *= inside_axis
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
         """The share of a pixel beside the middle of an edge."""
         (x, y), beyond = self.sigma_px, size_px / 2
-        return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
+        return max(
+            pixel_share(beyond, x) * pixel_share(0.0, y),
+            pixel_share(beyond, y) * pixel_share(0.0, x),
+        )
 
     def shader(self, side_px: int) -> ShareShader:
         """A polynomial for each axis where one is exact enough (`share_polynomial`), else error
@@ -287,15 +316,22 @@ class SampledPsf(Psf):
         samples = self.samples
         if samples.ndim != 2 or not all(side % 2 for side in samples.shape):
             found = " x ".join(map(str, samples.shape[::-1]))
-            raise InputError(f"a PSF of {found} samples has no middle; write an image of odd width and height")
+            raise InputError(
+                f"a PSF of {found} samples has no middle; write an image of odd width and height"
+            )
         if self.per_px < 1:
             raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")
         if not np.isfinite(samples).all() or samples.sum() <= 0:
-            raise InputError("a PSF has samples that are not finite, or no light; write finite ones with a positive sum")
+            raise InputError(
+                "a PSF has samples that are not finite, or no light; write finite ones with a positive sum"
+            )
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
         # largest of those below zero
         phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-        least, negative = min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
+        least, negative = (
+            min(float(part.sum()) for part in phases),
+            max(float(-part.clip(max=0).sum()) for part in phases),
+        )
         if negative > self.max_negative:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample it more finely than "
@@ -307,7 +343,9 @@ class SampledPsf(Psf):
                 "pixel-integrated; write PIXINT = F"
             )
         if self.cut_share(MAX_FOOTPRINT_PX) > MAX_SAMPLED_CUT:
-            raise InputError(f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies further out")
+            raise InputError(
+                f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies further out"
+            )
 
     def _before_cut(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Shares of pixels at these columns and rows, (len(y_px), len(x_px)), of all the light
@@ -321,12 +359,17 @@ class SampledPsf(Psf):
             black = [(BLACK_SAMPLES, BLACK_SAMPLES) if k == axis else (0, 0) for k in (0, 1)]
             found = np.pad(found, black)
             place_px = (np.arange(found.shape[axis]) - found.shape[axis] // 2) / self.per_px
-            spline, last_px = make_interp_spline(place_px, found, SPLINE_DEGREE, axis=axis), place_px[-1]
+            spline, last_px = (
+                make_interp_spline(place_px, found, SPLINE_DEGREE, axis=axis),
+                place_px[-1],
+            )
             if self.pixel_integrated:
                 found = spline(np.clip(at_px, -last_px, last_px))
             else:
                 light = spline.antiderivative()
-                low, high = (light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5))
+                low, high = (
+                    light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5)
+                )
                 found = high - low
         return np.asarray(found)
 
@@ -345,10 +388,15 @@ class SampledPsf(Psf):
         # a Gaussian weight as wide as the PSF halves its variance and its distance
         for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
-            across, down = (powers * np.exp(-((at_px - m) ** 2) / (2 * v)) for m, v in zip(middle, variance, strict=True))
+            across, down = (
+                powers * np.exp(-((at_px - m) ** 2) / (2 * v))
+                for m, v in zip(middle, variance, strict=True)
+            )
             sums = down @ self._table @ across.T  # powers of y, powers of x
             mean = np.array([sums[0, 1], sums[1, 0]]) / sums[0, 0]
-            variance = np.maximum(2 * (np.array([sums[0, 2], sums[2, 0]]) / sums[0, 0] - mean**2), PIXEL_VARIANCE)
+            variance = np.maximum(
+                2 * (np.array([sums[0, 2], sums[2, 0]]) / sums[0, 0] - mean**2), PIXEL_VARIANCE
+            )
             middle = 2 * mean - middle
         x, y = np.sqrt(np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)).tolist()
         return x, y
@@ -398,7 +446,9 @@ class SampledPsf(Psf):
             x, y = (float(scale) * variance for variance in self.variance_px2)
             # the table is interpolated
             log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
-            found.append((scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y)))
+            found.append(
+                (scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y))
+            )
         _, log_factor, axes_px2 = min(found)
         return Reach(axes_px2, math.exp(log_factor))
 
@@ -409,25 +459,38 @@ class SampledPsf(Psf):
         column, row = (np.minimum(at.astype(np.intp), last - 1) for at in (at_x, at_y))
         x, y, first = at_x - column, at_y - row, row * (last + 1) + column
         table = self._table.ravel()
-        above, below = ((1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1))
+        above, below = (
+            (1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1)
+        )
         return np.asarray((1 - y) * above + y * below)
 
-    def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
+    def stamps(
+        self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
+    ) -> Float32Array:
         """See `Psf.stamps`: all offsets at once."""
         pixel = np.arange(side_px) - (side_px - 1) // 2
         x, y = (pixel[:, None] - at for at in fraction_px)
         return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)
 
     def spread(
-        self, x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, region: tuple[int, int, int, int]
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        electrons_per_s: FloatArray,
+        region: tuple[int, int, int, int],
     ) -> Float32Array:
         """Point after point: each has its own pixels."""
         left, top, width, height = region
         image = np.zeros((height, width))
         columns, rows = np.arange(left, left + width), np.arange(top, top + height)
         for x, y, light in zip(x_px, y_px, electrons_per_s, strict=True):
-            near_x, near_y = (np.abs(at - middle) < self.footprint_px / 2 for at, middle in ((columns, x), (rows, y)))
-            image[np.ix_(near_y, near_x)] += light * self.shares(columns[near_x] - x, rows[near_y, None] - y)
+            near_x, near_y = (
+                np.abs(at - middle) < self.footprint_px / 2
+                for at, middle in ((columns, x), (rows, y))
+            )
+            image[np.ix_(near_y, near_x)] += light * self.shares(
+                columns[near_x] - x, rows[near_y, None] - y
+            )
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
@@ -444,14 +507,24 @@ class SampledPsf(Psf):
 
     def outside_share(self, size_px: int) -> float:
         """The largest of the table beyond half of that side."""
-        far = np.abs(np.arange(len(self._table)) - len(self._table) // 2) >= size_px * self._steps / 2
-        return max(float(self._table[far].max(initial=1e-30)), float(self._table[:, far].max(initial=1e-30)))
+        far = (
+            np.abs(np.arange(len(self._table)) - len(self._table) // 2) >= size_px * self._steps / 2
+        )
+        return max(
+            float(self._table[far].max(initial=1e-30)),
+            float(self._table[:, far].max(initial=1e-30)),
+        )
 
     def shader(self, side_px: int) -> ShareShader:
         """The same table: in each cell between four places what its bilinear interpolation is
         made of.
         """
-        near, right, down, both = self._table[:-1, :-1], self._table[:-1, 1:], self._table[1:, :-1], self._table[1:, 1:]
+        near, right, down, both = (
+            self._table[:-1, :-1],
+            self._table[:-1, 1:],
+            self._table[1:, :-1],
+            self._table[1:, 1:],
+        )
         cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
         return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
 
@@ -491,9 +564,13 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
     if not image.ndim:
         raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}")
     if image.ndim == 3 and len(image) > 1:
-        raise InputError(f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one of them")
+        raise InputError(
+            f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one of them"
+        )
     if type(per_px) is not int or type(integrated) is not bool:
-        raise InputError(f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F")
+        raise InputError(
+            f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F"
+        )
     try:
         return SampledPsf(image.astype(np.float64), per_px, integrated)
     except InputError as error:
@@ -530,7 +607,9 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
 def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
     """As `pixel_share`, of an array of offsets; same shape."""
     if np.size(offset_px) <= BOUND_PLACES:  # as a bench that opens asks for
-        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(np.shape(offset_px))
+        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(
+            np.shape(offset_px)
+        )
     from scipy.special import erfc  # as in `stamps`
 
     near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5
@@ -557,7 +636,9 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
             found = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
             error = np.abs(np.exp2(np.minimum(terms @ found, 0.0)) - shares)
             if error.max() <= MAX_SHARE_ERROR:
-                power = np.polynomial.Chebyshev(found, domain=[0.0, reach_px**2]).convert(kind=np.polynomial.Polynomial)
+                power = np.polynomial.Chebyshev(found, domain=[0.0, reach_px**2]).convert(
+                    kind=np.polynomial.Polynomial
+                )
                 return tuple(power.coef.tolist())
             # Lawson (1961): towards the smallest maximum
             weight = weight * np.sqrt(error / error.max() + 1e-3)

@@ -27,7 +27,9 @@ KEPT_TURN_RAD = math.radians(1.0)
 ROUNDING_RAD = 1e-6
 # A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px
 # further out. results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
-SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
+SPRITE_DTYPE = np.dtype(
+    [("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")]
+)
 
 # The work and memory of a frame are bounded by the pixels that its sprites cover: 250 000 stars of
 # sigma 0.85 px. Of more stars only the brightest are drawn.
@@ -65,20 +67,31 @@ class Candidates:
         # was found
         self._kept: tuple[Stars, Camera, float, FloatArray, NearStars] | None = None
 
-    def near(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> NearStars:
+    def near(
+        self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float
+    ) -> NearStars:
         """The stars within `margin_px` of the image, and some more. The caller must not change
         the arrays.
         """
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
-            same = stars.vectors is last.vectors and stars.electrons_per_s is last.electrons_per_s and stars.grid is last.grid
+            same = (
+                stars.vectors is last.vectors
+                and stars.electrons_per_s is last.electrons_per_s
+                and stars.grid is last.grid
+            )
             difference = (icrs_to_image - last_icrs_to_image).ravel()
             # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
             # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
-            if same and camera is last_camera and margin_px == last_margin_px and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
+            if (
+                same
+                and camera is last_camera
+                and margin_px == last_margin_px
+                and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD
+            ):
                 return near
         star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
@@ -87,7 +100,13 @@ class Candidates:
         return near
 
 
-def stars_about(stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float, reach_rad: float = 0.0) -> IntArray:
+def stars_about(
+    stars: Stars,
+    icrs_to_image: FloatArray,
+    camera: Camera,
+    margin_px: float,
+    reach_rad: float = 0.0,
+) -> IntArray:
     """Every star that can come within `margin_px` of the image by a turn of `reach_rad`, and
     some more; rising.
     """
@@ -149,7 +168,11 @@ class Sprites:
 
 
 def make_sprites(
-    stars: Stars, icrs_to_image: FloatArray, camera: Camera, footprint_px: int, candidates: Candidates | None = None
+    stars: Stars,
+    icrs_to_image: FloatArray,
+    camera: Camera,
+    footprint_px: int,
+    candidates: Candidates | None = None,
 ) -> Sprites:
     """The sprites of every star whose footprint touches the image, centres off the edge included.
 
@@ -229,7 +252,13 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
     """All sprites of `parts`, which have one footprint."""
     if not parts:
         nothing = np.empty(0)
-        return Sprites(np.empty(0, dtype=SPRITE_DTYPE), footprint_px, np.empty(0, dtype=np.intp), nothing, nothing)
+        return Sprites(
+            np.empty(0, dtype=SPRITE_DTYPE),
+            footprint_px,
+            np.empty(0, dtype=np.intp),
+            nothing,
+            nothing,
+        )
     return Sprites(
         np.concatenate([part.data for part in parts]),
         footprint_px,
@@ -258,7 +287,11 @@ def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
 
     `stars` are those among which `sprites.star` has its places.
     """
-    return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours, stars.colours_by_bv)
+    return (
+        [sprites]
+        if stars.colours is None
+        else by_share(sprites, stars, stars.colours, stars.colours_by_bv)
+    )
 
 
 def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
@@ -285,7 +318,9 @@ def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
     return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
 
 
-def shares_of_sprites(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None) -> FloatArray:
+def shares_of_sprites(
+    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None
+) -> FloatArray:
     """The shares (n, columns) of each sprite's light, by those of each star; see `by_share`."""
     found, added = shares_at(shares, stars, sprites.star), sprites.star < 0
     if by_bv is not None and added.any():
@@ -311,11 +346,19 @@ def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
         data["pixel"][:, column] += whole.astype(np.int32)
         data["fraction_px"][:, column] = part - whole
     right, down = places_px[k]
-    x_px, y_px, lights = sprites.x_px - right, sprites.y_px - down, sprites.lights[k] if sprites.lights else ()
-    return replace(sprites, data=data, x_px=x_px, y_px=y_px, extended=lights, primaries=None, lights=())
+    x_px, y_px, lights = (
+        sprites.x_px - right,
+        sprites.y_px - down,
+        sprites.lights[k] if sprites.lights else (),
+    )
+    return replace(
+        sprites, data=data, x_px=x_px, y_px=y_px, extended=lights, primaries=None, lights=()
+    )
 
 
-def by_share(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None) -> list[Sprites]:
+def by_share(
+    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
+) -> list[Sprites]:
     """The sprites once for each column of `shares` (stars, columns): every light times its star's
     or body's share.
 
@@ -324,7 +367,9 @@ def by_share(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArr
     """
     of_sprites = shares_of_sprites(sprites, stars, shares, by_bv).astype(np.float32)
     parts = []
-    for share, lights in zip(of_sprites.T, extended_by_share(sprites, stars, shares, by_bv), strict=True):
+    for share, lights in zip(
+        of_sprites.T, extended_by_share(sprites, stars, shares, by_bv), strict=True
+    ):
         data = sprites.data.copy()
         data["electrons_per_s"] *= share
         parts.append(replace(sprites, data=data, extended=lights))
@@ -336,12 +381,22 @@ def extended_by_share(
 ) -> list[tuple[ExtendedLight, ...]]:
     """The extended light of sprites once for each column of `shares`, as `by_share`."""
     bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
-    lights = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
+    lights = [
+        -1 if isinstance(light, GlowLight) else bodies.get(light.name, -1)
+        for light in sprites.extended
+    ]
     wide = shares_at(shares, stars, np.array(lights, dtype=np.intp))
     for place, (light, body) in enumerate(zip(sprites.extended, lights, strict=True)):
-        if by_bv is not None and body < 0 and (bv_mag := getattr(light, "bv_mag", None)) is not None:
+        if (
+            by_bv is not None
+            and body < 0
+            and (bv_mag := getattr(light, "bv_mag", None)) is not None
+        ):
             wide[place] = shares_by_bv(by_bv, bv_mag)
-    return [tuple(times(light, float(part)) for light, part in zip(sprites.extended, one, strict=True)) for one in wide.T]
+    return [
+        tuple(times(light, float(part)) for light, part in zip(sprites.extended, one, strict=True))
+        for one in wide.T
+    ]
 
 
 def clipped_sprites(
@@ -376,7 +431,9 @@ def clipped_sprites(
     limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
     if uniformity is not None:
         limit *= uniformity[y, x]
-    own = sprites.data["electrons_per_s"][bright] * psf.shares(x - sprites.x_px[bright], y - sprites.y_px[bright])
+    own = sprites.data["electrons_per_s"][bright] * psf.shares(
+        x - sprites.x_px[bright], y - sprites.y_px[bright]
+    )
     over = own > limit
     doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
@@ -390,9 +447,14 @@ def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArra
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
     pixel, reach = sprites.data["pixel"], sprites.footprint_px / 2
     # Sprites whose footprints can reach one of the columns and rows, and some more
-    close = np.flatnonzero(_reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px))
+    close = np.flatnonzero(
+        _reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px)
+    )
     if len(x) * len(close) <= FEW_PAIRS:
-        offset_x, offset_y = (wanted[:, None] - places[close] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
+        offset_x, offset_y = (
+            wanted[:, None] - places[close]
+            for places, wanted in ((sprites.x_px, x), (sprites.y_px, y))
+        )
         share = psf.shares(offset_x, offset_y)
         share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
         return np.asarray(share @ sprites.data["electrons_per_s"][close].astype(np.float64))
@@ -406,7 +468,10 @@ def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArra
     near = np.abs(offset_y) <= reach
     pixel, other, offset_y = pixel[near], other[near], offset_y[near]
     share = psf.shares(x[pixel] - sprites.x_px[other], offset_y)
-    return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)
+    return np.asarray(
+        np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)),
+        dtype=np.float64,
+    )
 
 
 def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:

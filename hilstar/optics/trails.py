@@ -55,7 +55,9 @@ class TrailView:
     rate_image_rad_s: FloatArray
     velocity_km_s: FloatArray | None = None
 
-    def places_px(self, seen: "Pass", which: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def places_px(
+        self, seen: "Pass", which: IntArray | slice, seconds: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of satellites `which` (k,) of a pass, each at its own of `seconds` (k,);
         NaN behind the camera.
         """
@@ -68,8 +70,12 @@ class TrailView:
         """Places of the satellites that can come within a margin of the image within that time
         of the moment, and some more.
         """
-        turned = seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
-        reach_rad = (float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))) * longest_s
+        turned = (
+            seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
+        )
+        reach_rad = (
+            float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))
+        ) * longest_s
         return self.camera.in_view(turned, margin_px, REACH * reach_rad)
 
 
@@ -114,7 +120,9 @@ class Trails:
     middle: FloatArray
 
 
-def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
+def trails(
+    seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0
+) -> Trails:
     """The satellites of a pass along their paths; one whose mean rate is fainter than
     `faintest_e_per_s` is left out.
     """
@@ -133,14 +141,20 @@ def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per
     shown = (rates > 0) & (rates >= faintest_e_per_s)
     kept = shown[path] & (light > 0)
     star, size_px = seen.index[path[kept]], view.camera.resolution_px
-    sprites = pack_sprites(x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px)
+    sprites = pack_sprites(
+        x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px
+    )
     found = np.flatnonzero(np.isin(seen.index, sprites.star))
     most = int(np.bincount(path[kept], minlength=1).max(initial=1))
     sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[found].sum()))
-    return Trails(sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found]))
+    return Trails(
+        sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found])
+    )
 
 
-def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+def sprite_counts(
+    seen: "Pass", view: TrailView, lit: Lit, brush: Brush
+) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many sprites each path should have (0: it misses the image), and its part on the
     image.
     """
@@ -151,8 +165,13 @@ def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tupl
     ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
     off_x, off_y = ((1 - at) * place[0] + at * place[-1] - place for place in (x_px, y_px))
     bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
-    begin, end = ends.on_image(view.camera.resolution_px, brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px))
-    step_x, step_y = (np.diff(place, axis=0) / s for place, s in zip((x_px, y_px), brush.psf.width_px, strict=True))
+    begin, end = ends.on_image(
+        view.camera.resolution_px, brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px)
+    )
+    step_x, step_y = (
+        np.diff(place, axis=0) / s
+        for place, s in zip((x_px, y_px), brush.psf.width_px, strict=True)
+    )
     length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
     length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
     wanted = 1 + np.floor(np.minimum(length / SPACING_SIGMA, brush.most)).astype(np.intp)
@@ -167,7 +186,9 @@ def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
     """
     own = found.sprites
     whole = with_sprites(sprites, [replace(own, star=own.star + first)])
-    return replace(whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped)
+    return replace(
+        whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,12 +231,18 @@ def disc_of(seen: "Pass", name: str, second: float, velocity_km_s: FloatArray | 
     )
 
 
-def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
+def disc_trail(
+    seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush
+) -> DiscTrail | None:
     """The only satellite of a pass along its path; None where it misses the image or has no
     light.
     """
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
-    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.psf.width_px)
+    radius_sigma = (
+        disc_of(seen, name, 0.0, None).radius_rad
+        * view.camera.focal_length_px
+        / min(brush.psf.width_px)
+    )
     coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
     count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
     if not count:
@@ -237,15 +264,29 @@ def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush)
     if not lights:
         return None
     middle = seen.directions(slice(None), lit.middle_s)[0]
-    maps = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
-    radiance = sum(light.times * light.disc.normal_e_per_s_sr for light in lights if isinstance(light, DiscLight))
+    maps = sum(
+        float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap)
+    )
+    radiance = sum(
+        light.times * light.disc.normal_e_per_s_sr
+        for light in lights
+        if isinstance(light, DiscLight)
+    )
     brightest = maps + radiance / view.camera.scales_px_rad()[0] ** 2
     return DiscTrail(
-        int(seen.index[0]), float(rates.sum()) * share, middle, along, np.full(count, share), tuple(lights), brightest
+        int(seen.index[0]),
+        float(rates.sum()) * share,
+        middle,
+        along,
+        np.full(count, share),
+        tuple(lights),
+        brightest,
     )
 
 
-def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool) -> list[ExtendedLight]:
+def _lights(
+    disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool
+) -> list[ExtendedLight]:
     turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
     return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
 

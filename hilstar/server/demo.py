@@ -79,12 +79,16 @@ def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
 
     def scan(t_s: float) -> FloatArray:
         turns = [size_deg * math.sin(2 * math.pi * t_s / period_s) for size_deg, period_s in SCAN]
-        return from_radec_roll_deg(*(middle + turn for middle, turn in zip(WAYPOINTS_DEG[0], turns, strict=True)))
+        return from_radec_roll_deg(
+            *(middle + turn for middle, turn in zip(WAYPOINTS_DEG[0], turns, strict=True))
+        )
 
     return _jittered(scan, duration_s, rng)
 
 
-def _jittered(path: Callable[[float], FloatArray], duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
+def _jittered(
+    path: Callable[[float], FloatArray], duration_s: float, rng: np.random.Generator
+) -> list[AttitudeSample]:
     count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
     # Jitter about cam axes: first-order Gauss-Markov noise.
@@ -128,7 +132,17 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
     with (
         load(shows.bench_file) as bench,
         ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
-        _DemoSender(["send", str(log_path), "--to", link.endpoint, "--connect", "--wait", f"{LISTENER_WITHIN_S:g}"]) as sender,
+        _DemoSender(
+            [
+                "send",
+                str(log_path),
+                "--to",
+                link.endpoint,
+                "--connect",
+                "--wait",
+                f"{LISTENER_WITHIN_S:g}",
+            ]
+        ) as sender,
         watching(bench, link.endpoint) as (watch, outlet),
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
@@ -144,7 +158,9 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
             watch(shown)
 
         link.await_ready()
-        summary = serve(bench, link, Limit(slots=frame_count, from_first_attitude=True), sink, outlet)
+        summary = serve(
+            bench, link, Limit(slots=frame_count, from_first_attitude=True), sink, outlet
+        )
     return Demo(summary, kept, bench.config.monitor.bits)
 
 
@@ -155,10 +171,14 @@ class _DemoSender(Closing):
 
     def tend(self) -> None:
         if self._process is None:
-            self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            self._process = subprocess.Popen(
+                self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
         elif self._process.poll() is not None:
             command = shlex.join(["hilstar", *self._command[3:]])
-            raise MachineError(f"the demo's sender ended before an attitude came; to see why, run: {command}")
+            raise MachineError(
+                f"the demo's sender ended before an attitude came; to see why, run: {command}"
+            )
 
     def close(self) -> None:
         if self._process is not None:
@@ -171,7 +191,9 @@ def write_pictures(directory: Path, demo: Demo, advance: Callable[[int], None]) 
     many are written.
     """
     for written, (number, codes) in enumerate(demo.kept.items()):
-        exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
+        exact, preview = (
+            directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview")
+        )
         write_codes_png(exact, codes, demo.bits)
         advance(2 * written + 1)
         write_preview_png(preview, codes)

@@ -40,7 +40,15 @@ from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.sky.catalog import load_catalog
 
 USUAL_BITS = 8
-COLUMNS = ("hilstar", "machine", "OpenGL", "display server", "monitors", "links", "what was measured, and what came out")
+COLUMNS = (
+    "hilstar",
+    "machine",
+    "OpenGL",
+    "display server",
+    "monitors",
+    "links",
+    "what was measured, and what came out",
+)
 TO_FILL = "(write it here)"
 NOT_THERE = "none"
 SYS, PROC = Path("/sys"), Path("/proc")
@@ -72,7 +80,10 @@ class OutputReport:
 
     def lines(self) -> list[str]:
         """For a person."""
-        return [f"{'check' if self.faults else 'ok':8}{'output':12}{self.line}", *(f"{'':20}{fault}" for fault in self.faults)]
+        return [
+            f"{'check' if self.faults else 'ok':8}{'output':12}{self.line}",
+            *(f"{'':20}{fault}" for fault in self.faults),
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +100,9 @@ class Examination:
 def examine() -> Examination:
     """Check everything that hilstar uses on this machine."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
-    shown = _check("display", lambda: "; ".join(display.line() for display in displays()) or NOT_THERE)
+    shown = _check(
+        "display", lambda: "; ".join(display.line() for display in displays()) or NOT_THERE
+    )
     ports = serial_ports()
     checks += [
         _gpus(),
@@ -97,7 +110,9 @@ def examine() -> Examination:
         Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False),
     ]
     outputs = [
-        OutputReport(state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields())
+        OutputReport(
+            state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields()
+        )
         for state in lit_outputs()
     ]
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
@@ -155,7 +170,11 @@ def _report_on(file: BenchFile, today: datetime.date) -> BenchReport:
     now = identity_here(file.config.monitor.display)
     check = MonitorCheck(None) if now is None else check_monitor(file, now, today)
     config, folder = file.config, file.folder
-    return BenchReport(fields_of_view(config, folder), star_size(config, folder, bench_camera(config, folder)), check)
+    return BenchReport(
+        fields_of_view(config, folder),
+        star_size(config, folder, bench_camera(config, folder)),
+        check,
+    )
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:
@@ -180,7 +199,10 @@ class _Unsaid(Notices):
 
 def _zeromq() -> str:
     """One message through a real loopback socket."""
-    with ZmqSender("tcp://127.0.0.1:*") as sender, ZmqReceiver(sender.endpoint, notices=_Unsaid()) as receiver:
+    with (
+        ZmqSender("tcp://127.0.0.1:*") as sender,
+        ZmqReceiver(sender.endpoint, notices=_Unsaid()) as receiver,
+    ):
         receiver.receive(0)  # a receiver connects when it is first read
         if not sender.wait_for_listener(2.0):
             raise MachineError("a loopback connection does not come up; allow TCP on 127.0.0.1")
@@ -216,7 +238,9 @@ LOOKS: dict[str, Callable[[], str]] = {
     "opengl": _gl,
     "zeromq": _zeromq,
     "catalogue": _catalogue,
-    "files": lambda: f"{resource_path('shaders', 'splat.frag')}, {resource_path('configs', 'demo.toml')}",
+    "files": lambda: (
+        f"{resource_path('shaders', 'splat.frag')}, {resource_path('configs', 'demo.toml')}"
+    ),
 }
 
 
@@ -224,9 +248,14 @@ def row() -> dict[str, str]:
     """This machine's cells by their columns; the last is for who measured."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("moderngl", "glfw"))
     own = f"{__version__}; Python {platform.python_version()}, ZeroMQ {zmq_version()}, {packages}"
-    links = "; ".join(["ZeroMQ and UDP over loopback", *(f"serial {words}" for words in adapters())])
+    links = "; ".join(
+        ["ZeroMQ and UDP over loopback", *(f"serial {words}" for words in adapters())]
+    )
     cells = (own, _machine(), _opengl(), _display_server(), _monitors(), links, TO_FILL)
-    return {name: " ".join(text.split()).replace("|", "/") for name, text in zip(COLUMNS, cells, strict=True)}
+    return {
+        name: " ".join(text.split()).replace("|", "/")
+        for name, text in zip(COLUMNS, cells, strict=True)
+    }
 
 
 def table(cells: dict[str, str]) -> str:
@@ -238,7 +267,9 @@ def table(cells: dict[str, str]) -> str:
 def _machine() -> str:
     model = _text(SYS / "firmware/devicetree/base/model")  # a Raspberry Pi or a Jetson
     if not model:
-        cpu = re.search(r"^(?:model name|Hardware)\s*:\s*(.+)$", _text(PROC / "cpuinfo"), re.MULTILINE)
+        cpu = re.search(
+            r"^(?:model name|Hardware)\s*:\s*(.+)$", _text(PROC / "cpuinfo"), re.MULTILINE
+        )
         model = cpu[1] if cpu else "processor not named"
     system = platform.system()
     with contextlib.suppress(OSError):
@@ -265,7 +296,9 @@ def _cards() -> Iterator[str]:
     for card in sorted((SYS / "class/drm").glob("card[0-9]")):
         with contextlib.suppress(OSError):
             driver = (card / "device/driver").resolve(strict=True).name
-            identity = ":".join(_text(card / "device" / part).removeprefix("0x") for part in ("vendor", "device"))
+            identity = ":".join(
+                _text(card / "device" / part).removeprefix("0x") for part in ("vendor", "device")
+            )
             yield f"{driver} ({identity})" if identity.strip(":") else driver
 
 
@@ -274,7 +307,9 @@ def _display_server() -> str:
     found = ""
     with contextlib.suppress(OSError):
         found = server_of()
-    wayland = "a Wayland session" if os.environ.get("WAYLAND_DISPLAY") or session == "wayland" else ""
+    wayland = (
+        "a Wayland session" if os.environ.get("WAYLAND_DISPLAY") or session == "wayland" else ""
+    )
     return ", ".join(part for part in (found, wayland) if part) or NOT_THERE
 
 
@@ -285,7 +320,9 @@ def _monitors() -> str:
     for path in sorted((SYS / "class/drm").glob("card*-*/edid")):
         with contextlib.suppress(OSError):
             if (found := edid_identity(edid := path.read_bytes())).maker:
-                shown.append(f"EDID {found.maker} {found.model} ({found.year}, {edid[21]} x {edid[22]} cm)")
+                shown.append(
+                    f"EDID {found.maker} {found.model} ({found.year}, {edid[21]} x {edid[22]} cm)"
+                )
     return "; ".join(shown) or NOT_THERE
 
 

@@ -68,7 +68,9 @@ class FaultStream:
     cannot be used.
     """
 
-    def __init__(self, schedule: FaultSchedule, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+    def __init__(
+        self, schedule: FaultSchedule, endpoint: str, **options: Unpack[SocketOptions]
+    ) -> None:
         self.messages = 0
         self.refused: Counter[str] = Counter()
         self._schedule, self._notices = schedule, options.get("notices") or Notices()
@@ -90,7 +92,10 @@ class FaultStream:
                 for each in self._link.taken(POLL_MS):
                     self._take(each.host_ns, each.parts[-1])
             except Exception as error:  # whatever it is: the run goes on, and so does this
-                self._notices.tell("fault-stream", f"the stream of faults failed ({type(error).__name__}: {error}); going on")
+                self._notices.tell(
+                    "fault-stream",
+                    f"the stream of faults failed ({type(error).__name__}: {error}); going on",
+                )
                 self._stop.wait(RETRY_S)
 
     def _take(self, host_ns: int, raw: bytes) -> None:
@@ -134,7 +139,9 @@ class Recording:
     @property
     def scenario(self) -> Scenario:
         """What a view of them has to know."""
-        return Scenario(self.folder, "", self.seed, tuple(dict.fromkeys(self.faults.values())), self.folder)
+        return Scenario(
+            self.folder, "", self.seed, tuple(dict.fromkeys(self.faults.values())), self.folder
+        )
 
 
 NO_RECORDING = Recording({}, 0, Path())
@@ -155,9 +162,13 @@ def read_recording(path: Path, records: Sequence[FaultRecord] | None = None) -> 
         try:
             faults[record.number] = fault = fault_of(msgspec.json.decode(record.table))
         except (*NOT_JSON, InputError) as error:
-            raise InputError(f"{path}: the fault {record.name!r} is not one of hilstar's ({error})") from error
+            raise InputError(
+                f"{path}: the fault {record.name!r} is not one of hilstar's ({error})"
+            ) from error
         if isinstance(fault, MeasuredMap) and map_sha256(folder / fault.file) != record.file_sha256:
-            raise InputError(f"{path}: {folder / fault.file} is not the map that the run had; put that one there")
+            raise InputError(
+                f"{path}: {folder / fault.file} is not the map that the run had; put that one there"
+            )
     return Recording(faults, seed, folder, records)
 
 
@@ -170,19 +181,27 @@ class RunFaults:
     one that cannot be drawn.
     """
 
-    def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None) -> None:
+    def __init__(
+        self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None
+    ) -> None:
         self._scenario, self._notices, self._ledger = scenario, notices, ledger
         self._started: Counter[str] = Counter()
         self._missed: Counter[str] = Counter()
         self._stream: FaultStream | None = None
         view = display_view(bench, scenario)
         self._sha256: dict[Fault, str] = {
-            fault: map_sha256(scenario.folder / fault.file) for fault in scenario.faults if isinstance(fault, MeasuredMap)
+            fault: map_sha256(scenario.folder / fault.file)
+            for fault in scenario.faults
+            if isinstance(fault, MeasuredMap)
         }
-        self.schedule = FaultSchedule(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear)
+        self.schedule = FaultSchedule(
+            scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear
+        )
         self.frames = FaultyFrames(self.schedule.at, view)
         if ledger is not None and scenario.faults:
-            ledger.fault(self._record("scenario", scenario.text, name=printable(str(scenario.path))))
+            ledger.fault(
+                self._record("scenario", scenario.text, name=printable(str(scenario.path)))
+            )
 
     def _hear(self, change: FaultChange) -> None:
         fault = change.fault
@@ -190,15 +209,23 @@ class RunFaults:
         if change.what != "end":
             tally[fault.name if len(tally) < MAX_NAMES or fault.name in tally else "others"] += 1
         person = "" if change.who in {FILE, STREAM} else change.who
-        self._notices.tell("fault", f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}", person)
+        self._notices.tell(
+            "fault",
+            f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}",
+            person,
+        )
         if self._ledger is not None:
             table = msgspec.json.encode(table_of(fault)).decode()
-            record = self._record(change.what, table, name=fault.name, kind=fault.KIND, who=change.who)
+            record = self._record(
+                change.what, table, name=fault.name, kind=fault.KIND, who=change.who
+            )
             record.number, record.t_ns = change.number, change.t_ns
             record.file_sha256 = self._sha256.get(fault, "")
             self._ledger.fault(record)
 
-    def _record(self, event: str, table: str, name: str, kind: str = "", who: str = "") -> FaultRecord:
+    def _record(
+        self, event: str, table: str, name: str, kind: str = "", who: str = ""
+    ) -> FaultRecord:
         folder = str(self._scenario.folder.resolve()) if self._scenario.faults else ""
         return FaultRecord(
             host_ns=time.monotonic_ns(),
@@ -230,7 +257,9 @@ class RunFaults:
             yield ""
             return
         keys = link_keys(settings, folder)
-        self._stream = FaultStream(self.schedule, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices)
+        self._stream = FaultStream(
+            self.schedule, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices
+        )
         try:
             yield self._stream.endpoint
         finally:
@@ -256,14 +285,18 @@ class ReplayedFaults:
     that cannot be drawn.
     """
 
-    def __init__(self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> None:
+    def __init__(
+        self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None
+    ) -> None:
         view = display_view(bench, recording.scenario)
         for fault in recording.faults.values():
             view.prepare(fault)
         self._faults = recording.faults
         self._frame_ns = round(NS_PER_S / bench.config.monitor.refresh_hz)
         self._now: tuple[Now, ...] = ()
-        self._started = Counter(record.name for record in recording.records if record.event == "start")
+        self._started = Counter(
+            record.name for record in recording.records if record.event == "start"
+        )
         self.frames = FaultyFrames(lambda t_ns: self._now, view)
         if ledger is not None:
             for record in recording.records:
@@ -276,7 +309,11 @@ class ReplayedFaults:
         dropped frame was never recorded.
         """
         recorded = zip(record.faults, record.fault_since_ns, strict=False)
-        known = ((number, self._faults[number], since_ns) for number, since_ns in recorded if number in self._faults)
+        known = (
+            (number, self._faults[number], since_ns)
+            for number, since_ns in recorded
+            if number in self._faults
+        )
         self._now = tuple(
             Now(number, fault, since_ns, share_on(fault, since_ns, self._frame_ns))
             for number, fault, since_ns in known

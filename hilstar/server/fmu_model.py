@@ -82,14 +82,22 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
 
     def _register(self) -> None:
         parameter = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
-        self.register_variable(String("address", description="HOST:PORT of hilstar's [attitude] bind", **parameter))
+        self.register_variable(
+            String("address", description="HOST:PORT of hilstar's [attitude] bind", **parameter)
+        )
         pace = "a step takes as long as it simulates; false: the tool itself is in real time"
         self.register_variable(Boolean("real_time", description=pace, **parameter))
-        self.register_variable(Boolean("use_rate", description="the rate inputs are connected", **parameter))
+        self.register_variable(
+            Boolean("use_rate", description="the rate inputs are connected", **parameter)
+        )
         for name in (*Q, *RATE, "t_s"):
             words = "s: time of the attitude, -1 for that of the communication point"
             if name != "t_s":
-                words = "q_icrs_to_cam, scalar first, Hamilton" if name in Q else "rad/s: rate of cam, its own components"
+                words = (
+                    "q_icrs_to_cam, scalar first, Hamilton"
+                    if name in Q
+                    else "rad/s: rate of cam, its own components"
+                )
             self.register_variable(Real(name, causality=Fmi2Causality.input, description=words))
         for name, words in (
             ("frame", "number of the newest frame that was shown, mod 2^31"),
@@ -98,12 +106,20 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             ("answers", "valid answers of the tracker so far"),
         ):
             discrete = Fmi2Variability.discrete
-            self.register_variable(Integer(name, causality=Fmi2Causality.output, variability=discrete, description=words))
+            self.register_variable(
+                Integer(
+                    name, causality=Fmi2Causality.output, variability=discrete, description=words
+                )
+            )
         for name in ANSWERED:
             words = "attitude of the tracker's newest valid answer, q_icrs_to_cam; zeros before one"
             self.register_variable(Real(name, causality=Fmi2Causality.output, description=words))
         self.register_variable(
-            Real("answered_t_s", causality=Fmi2Causality.output, description="s: when that answer's exposure had its middle")
+            Real(
+                "answered_t_s",
+                causality=Fmi2Causality.output,
+                description="s: when that answer's exposure had its middle",
+            )
         )
 
     def to_xml(self, *options: object) -> Element:
@@ -123,11 +139,16 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         self._socket = socket.socket(found[0][0], socket.SOCK_DGRAM)
         self._socket.connect(found[0][4])
         self._socket.settimeout(LISTEN_S)
-        threading.Thread(target=self._listen, args=(self._socket,), name="hilstar-fmu", daemon=True).start()
+        threading.Thread(
+            target=self._listen, args=(self._socket,), name="hilstar-fmu", daemon=True
+        ).start()
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Send the attitude of this communication point; in real time, wait for the next."""
-        q, rate = tuple(getattr(self, name) for name in Q), tuple(getattr(self, name) for name in RATE)
+        q, rate = (
+            tuple(getattr(self, name) for name in Q),
+            tuple(getattr(self, name) for name in RATE),
+        )
         if not abs(math.hypot(*q) - 1.0) <= NORM_TOLERANCE or not all(map(math.isfinite, rate)):
             line = f"q has the norm {math.hypot(*q):.6g}, rate is {rate}; connect a unit quaternion, w first"
             self.log(line, Fmi2Status.error)
@@ -176,11 +197,15 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         _, kind, flags, sequence, t_ns, *rest = numbers
         if kind == TIME_REQUEST and self._zero is not None:
             now_ns = self._now_ns()
-            reply = TIME_REPLY_BODY.pack(VERSION, TIME_REPLY, 0, sequence, t_ns, now_ns, self._now_ns())
+            reply = TIME_REPLY_BODY.pack(
+                VERSION, TIME_REPLY, 0, sequence, t_ns, now_ns, self._now_ns()
+            )
             with contextlib.suppress(OSError):
                 opened.send(packed(reply))
         elif kind == STATUS:
             self.health, self.frame, self.statuses = flags, sequence % 2**31, self.statuses + 1
         elif kind == ANSWER and flags & ANSWER_VALID:
-            self.answered_q_w, self.answered_q_x, self.answered_q_y, self.answered_q_z = map(float, rest[:4])
+            self.answered_q_w, self.answered_q_x, self.answered_q_y, self.answered_q_z = map(
+                float, rest[:4]
+            )
             self.answered_t_s, self.answers = t_ns / NS_PER_S, self.answers + 1

@@ -41,7 +41,9 @@ class FrameFeed(Closing):
     holds it, a frame stands for the half refresh period before its moment and the one after it.
     """
 
-    def __init__(self, sender: FrameSender, bench: Bench, swap_to_light_ns: Callable[[], int] = lambda: 0) -> None:
+    def __init__(
+        self, sender: FrameSender, bench: Bench, swap_to_light_ns: Callable[[], int] = lambda: 0
+    ) -> None:
         self.sent = self.skipped = 0
         self.endpoint = sender.endpoint
         self._sender, self._bench, self._swap_to_light_ns = sender, bench, swap_to_light_ns
@@ -71,7 +73,9 @@ class FrameFeed(Closing):
         on_screen = shown.predicted_swap_ns is not None
         copied.head = FrameHead(
             frame=shown.number,
-            lit_ns=shown.swap_ns + self._swap_to_light_ns() if on_screen else shown.draw_ns - self._half_period_ns,
+            lit_ns=shown.swap_ns + self._swap_to_light_ns()
+            if on_screen
+            else shown.draw_ns - self._half_period_ns,
             width=levels.shape[1],
             height=levels.shape[0],
             bits=monitor.bits,
@@ -85,7 +89,9 @@ class FrameFeed(Closing):
         if shown.attitude is None:
             return None
         q, rate = shown.attitude.q_icrs_to_cam, shown.drawn.rate_cam_rad_s
-        w, x, y, z = (q if rate is None else propagate(q, rate, self._bench.scan.hold_s / 2)).tolist()
+        w, x, y, z = (
+            q if rate is None else propagate(q, rate, self._bench.scan.hold_s / 2)
+        ).tolist()
         return w, x, y, z
 
     def _send(self) -> None:
@@ -126,5 +132,7 @@ def lit_pixels(levels: npt.NDArray[np.unsignedinteger[Any]]) -> npt.NDArray[np.i
     each = WORD_BYTES // flat.itemsize
     whole = len(flat) // each * each
     words = np.flatnonzero(flat[:whole].view(np.uint64))
-    near = np.concatenate([(words[:, None] * each + np.arange(each)).ravel(), np.arange(whole, len(flat))])
+    near = np.concatenate(
+        [(words[:, None] * each + np.arange(each)).ravel(), np.arange(whole, len(flat))]
+    )
     return np.asarray(near[flat[near] > 0])

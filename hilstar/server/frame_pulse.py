@@ -40,7 +40,11 @@ class FramePulse(Closing):
         self._pulse_ns = round(settings.pulse_ms * NS_PER_MS)
         self._every = settings.every_frames
         self._notices = notices
-        self._wanted, self._taken, self._idle = threading.Event(), threading.Event(), threading.Event()
+        self._wanted, self._taken, self._idle = (
+            threading.Event(),
+            threading.Event(),
+            threading.Event(),
+        )
         self._idle.set()
         self._frame_ns = 0
         self._ends = False
@@ -100,7 +104,10 @@ class FramePulse(Closing):
             self._count("lost")
             self._count("skipped")
             why = one_line(str(error))
-            self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
+            self._notices.tell(
+                "sync-lost",
+                f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse",
+            )
             self._line.close()
             self._retry.put_off(anew=True)
             return

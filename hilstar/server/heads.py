@@ -56,7 +56,14 @@ class HeadProcess:
     (0 where it never did). It sends its signs of life to the socket `life`.
     """
 
-    def __init__(self, name: str, command: Command, say: Say, life: Path, secrets: Mapping[str, str] = NOTHING) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: Command,
+        say: Say,
+        life: Path,
+        secrets: Mapping[str, str] = NOTHING,
+    ) -> None:
         self.name = name
         self.restarts = 0
         self.code: int | None = None  # None before its end
@@ -75,7 +82,11 @@ class HeadProcess:
 
     def _begin(self) -> None:
         environment = {name: value for name, value in os.environ.items() if name != "WATCHDOG_PID"}
-        environment |= {**self._secrets, "NOTIFY_SOCKET": self._address, "WATCHDOG_USEC": str(int(STALLED_S * US_PER_S))}
+        environment |= {
+            **self._secrets,
+            "NOTIFY_SOCKET": self._address,
+            "WATCHDOG_USEC": str(int(STALLED_S * US_PER_S)),
+        }
         self._drain()  # what the last one still said
         self._ready, self._begun_s = False, time.monotonic()
         self._heard_s = self._begun_s
@@ -139,7 +150,9 @@ class HeadProcess:
             self._heard_s = now_s
         limit_s = STALLED_S if self._ready else STARTS_S
         if now_s - self._heard_s > limit_s:
-            self._say(f"{self.name}: no frame for {now_s - self._heard_s:.1f} s; it is started again")
+            self._say(
+                f"{self.name}: no frame for {now_s - self._heard_s:.1f} s; it is started again"
+            )
             self._kill()
             self._wait_to_begin(now_s)
         return True
@@ -223,7 +236,9 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     with temporary_folder("heads") as folder, stop_on_signal(stop):
         endpoint = f"ipc://{folder}/{SOCKET}"
         with Feed(endpoint) as feed:
-            processes = [_head(asked, k, endpoint, folder, say) for k in range(len(asked.heads.names))]
+            processes = [
+                _head(asked, k, endpoint, folder, say) for k in range(len(asked.heads.names))
+            ]
             try:
                 _hand_on(link, feed, processes, stop)
                 for process in processes:
@@ -239,7 +254,13 @@ def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> Hea
 
     def command(number: int, drawn_s: float) -> list[str]:
         made = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
-        made += ["--head-of", str(asked.heads.path), "--fed-by", f"{endpoint},{os.getpid()}", *asked.options]
+        made += [
+            "--head-of",
+            str(asked.heads.path),
+            "--fed-by",
+            f"{endpoint},{os.getpid()}",
+            *asked.options,
+        ]
         if asked.duration_s is not None:
             made += ["--duration", f"{max(asked.duration_s - drawn_s, MIN_DURATION_S):.6g}"]
         if asked.ledger is not None:
@@ -252,7 +273,9 @@ def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> Hea
     return HeadProcess(name, command, say, folder / f"life-{k}", secrets)
 
 
-def _hand_on(link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: threading.Event) -> None:
+def _hand_on(
+    link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: threading.Event
+) -> None:
     """Give what arrives to the heads, and tend them, until all have ended or a signal comes."""
     back = BackChannel(link, Traffic())
     tended_ns = 0

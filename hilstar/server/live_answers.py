@@ -107,7 +107,9 @@ class LiveAnswers:
             self._untold = True
             self._stop.wait(REST_S)
         now_ns = self._clock.now_ns()
-        if self._frames.newest is None or now_ns - self._figures_ns < (PROMPT_NS if self._untold else FIGURES_NS):
+        if self._frames.newest is None or now_ns - self._figures_ns < (
+            PROMPT_NS if self._untold else FIGURES_NS
+        ):
             return
         self._figures_ns = now_ns
         refused = dict(self._source.refusals())
@@ -147,7 +149,10 @@ class LiveAnswers:
             return self._judge.pass_over(answer)
 
     def _failed(self, error: Exception) -> None:
-        self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
+        self._notices.tell(
+            "answers-failed",
+            one_line(f"an answer failed ({type(error).__name__}: {error}); going on"),
+        )
 
     def _take(self, judged: Judged) -> None:
         self.newest = judged
@@ -167,7 +172,10 @@ def wrong_line(judged: Judged) -> str:
     assert judged.residual is not None and judged.lit is not None
     off, lit = math.hypot(*judged.residual), judged.lit
     unit, scale, digits = ("arcsec", 1.0, 0) if off < 3600 else ("deg", 3600.0, 2)
-    parts = ", ".join(f"{axis} {part / scale:.{digits}f}" for axis, part in zip("xyz", judged.residual, strict=True))
+    parts = ", ".join(
+        f"{axis} {part / scale:.{digits}f}"
+        for axis, part in zip("xyz", judged.residual, strict=True)
+    )
     late_ms = (judged.answer.host_ns - judged.middle_ns) / NS_PER_MS
     frames = f"frames {lit.first} to {lit.last}"
     return f"the tracker's answer is off by {off / scale:.{digits}f} {unit} ({parts}) in {frames}, {late_ms:.0f} ms ago"

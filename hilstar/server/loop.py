@@ -89,17 +89,25 @@ class FaultyFrames:
         self.dropped += 1
         return True
 
-    def attitude(self, effects: FaultLayer | None, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+    def attitude(
+        self, effects: FaultLayer | None, t_ns: int, attitude: Attitude | None
+    ) -> Attitude | None:
         """The attitude that is shown in place of a frame's own."""
         if effects is None or attitude is None:
             return attitude
         if effects.frozen and self._held is not None:
             held = self._held.attitude
-            return None if held is None else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
+            return (
+                None
+                if held is None
+                else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
+            )
         if effects.blank:
             return None
         turned = effects.turned(View(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s))
-        return replace(attitude, q_icrs_to_cam=turned.q_icrs_to_cam, rate_cam_rad_s=turned.rate_cam_rad_s)
+        return replace(
+            attitude, q_icrs_to_cam=turned.q_icrs_to_cam, rate_cam_rad_s=turned.rate_cam_rad_s
+        )
 
     def frozen_frame(self, effects: FaultLayer | None, bench: Bench) -> Drawn | None:
         """What is on the display already, for a frame that is frozen."""
@@ -109,7 +117,12 @@ class FaultyFrames:
         return Drawn(bench.renderer, self._held.drawn.sprites, self._held.drawn.clipped_hip)
 
     def shown(
-        self, effects: FaultLayer | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
+        self,
+        effects: FaultLayer | None,
+        drawn: Drawn,
+        attitude: Attitude | None,
+        t_ns: int,
+        stays: bool,
     ) -> tuple[Now, ...]:
         """Remember a shown frame, and return its faults: of one that `stays` its first ones, and
         what freezes it now.
@@ -117,7 +130,9 @@ class FaultyFrames:
         now = () if effects is None else effects.now
         if stays and self._held is not None:
             return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
-        self._held = Held(drawn, attitude, t_ns, tuple(one for one in now if not isinstance(one.fault, Freeze)))
+        self._held = Held(
+            drawn, attitude, t_ns, tuple(one for one in now if not isinstance(one.fault, Freeze))
+        )
         return now
 
 
@@ -143,7 +158,11 @@ class FrameLoop:
         self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self._blank_when_stale = settings.on_stale == "blank"
         self.pacer = Pacer(self._period_ns) if pacer is None else pacer
-        self._moving = (motion == "on" or (motion == "auto" and self.pacer.moves_stars)) if moving is None else moving
+        self._moving = (
+            (motion == "on" or (motion == "auto" and self.pacer.moves_stars))
+            if moving is None
+            else moving
+        )
         self.on_frame: Callable[[int, int], None] = lambda number, frame_ns: None
         self.stop = self.pacer.stop
         self.tally = RunTally()
@@ -153,7 +172,9 @@ class FrameLoop:
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
         self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
 
-    def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
+    def draw(
+        self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE
+    ) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
 
         None for a frame that is given up because its moment passed while its sprites were computed,
@@ -172,7 +193,9 @@ class FrameLoop:
         finally:
             self.watch.end(timed=moment.due_ns is not None)
 
-    def _draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment) -> Shown | None:
+    def _draw(
+        self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment
+    ) -> Shown | None:
         begun_ns = self.pacer.clock.now_ns()
         stale, missing = self.gate.update(attitude), attitude is None
         self._presence.see(attitude, stale)
@@ -186,13 +209,20 @@ class FrameLoop:
             effects = faults.at(t_ns, attitude)
             if faults.drops(effects, number):
                 return None
-            attitude, stays = faults.attitude(effects, t_ns, attitude), faults.frozen_frame(effects, self._bench)
+            attitude, stays = (
+                faults.attitude(effects, t_ns, attitude),
+                faults.frozen_frame(effects, self._bench),
+            )
         light = None if stays is not None else self._light(attitude, t_ns, effects)
         if self._gives_up(number, moment):
             return None
         self.watch.enter("draw")
         drawn = self._bench.draw_sprites(light, number) if stays is None else stays
-        now = () if faults is None else faults.shown(effects, drawn, attitude, t_ns, stays is not None)
+        now = (
+            ()
+            if faults is None
+            else faults.shown(effects, drawn, attitude, t_ns, stays is not None)
+        )
         presented = self.pacer.show(number, drawn, moment, begun_ns, self.watch.enter)
         if moment.starts_ns is None:
             self.on_frame(number, presented.swap_ns)
@@ -217,11 +247,15 @@ class FrameLoop:
         self._sink(shown)
         return shown
 
-    def _light(self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None) -> Sprites | None:
+    def _light(
+        self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None
+    ) -> Sprites | None:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
-        view = self._bench.view(attitude.q_icrs_to_cam, rate, t_ns, attitude.velocity_km_s, attitude.place_km)
+        view = self._bench.view(
+            attitude.q_icrs_to_cam, rate, t_ns, attitude.velocity_km_s, attitude.place_km
+        )
         return self._bench.light(view, faults)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
@@ -244,14 +278,16 @@ class FrameLoop:
         self.tally.blank_frames += shown.missing
         if drawn.capped:
             if not self.tally.capped_frames:
-                line = (
-                    f"frame {shown.number}: the turn is too fast for full paths; {drawn.capped} stars are drawn coarser, with"
+                line = f"frame {shown.number}: the turn is too fast for full paths; {drawn.capped} stars are drawn coarser, with"
+                self.notices.tell(
+                    "capped", f"{line} all their light (further such frames are only counted)"
                 )
-                self.notices.tell("capped", f"{line} all their light (further such frames are only counted)")
             self.tally.capped_frames += 1
         if shown.predicted_swap_ns is not None:
             received_ns = None if attitude is None else attitude.received_ns
-            self.tally.swaps.add(shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns)
+            self.tally.swaps.add(
+                shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns
+            )
         self.pacer.operator.count(on_screen, shown.swap_ns)
 
     def idle(self) -> None:
@@ -278,7 +314,11 @@ class FrameLoop:
                 if last is not None:
                     missed = self._missed_between(last, moment.slot, gave_up, limit)
                     moment = replace(moment, missed_before=missed, may_be_given_up=not gave_up)
-                over = moment.slot >= limit.slots or self.tally.frames >= limit.frames or self.stop.is_set()
+                over = (
+                    moment.slot >= limit.slots
+                    or self.tally.frames >= limit.frames
+                    or self.stop.is_set()
+                )
                 if over or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
                     return
                 gave_up = draw_slot(moment) is None

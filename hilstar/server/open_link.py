@@ -12,7 +12,13 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeReply, Tim
 from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
 from hilstar.attitude.wire.source import Mounting, SentAttitudes
 from hilstar.attitude.wire.udp import UdpLink
-from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardLive, vizard_broadcast
+from hilstar.attitude.wire.vizard import (
+    DifferenceRates,
+    Follower,
+    StateUse,
+    VizardLive,
+    vizard_broadcast,
+)
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -31,7 +37,9 @@ def link_keys(settings: AttitudeSettings | FaultSettings, folder: Path) -> Curve
     return CurveKeys(*(None if name is None else folder / name for name in names))
 
 
-def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None, *, apart: bool = False) -> AnyLink:
+def open_link(
+    config: BenchConfig, folder: Path, notices: Notices | None = None, *, apart: bool = False
+) -> AnyLink:
     """The link that the bench file in `folder` names. Raises InputError if it cannot be opened.
 
     With `apart`, what the kernel does not stamp is read and stamped by a process of its own:
@@ -41,7 +49,9 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
     settings = config.attitude
     sent = SentAttitudes(settings.convention, Mounting(config.tracker.q_body_to_cam))
     if settings.source == "serial":
-        return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices, sent=sent)
+        return (SerialApart if apart else SerialLink)(
+            str(settings.port), settings.baud, notices, sent=sent
+        )
     if settings.source in {"udp", "scpi"}:
         link = UdpLink(*udp_road(settings), notices, sent=sent)
         # hilstar's own process sends the packets: nobody else has a convention
@@ -54,22 +64,34 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
         return _open_42(config, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
-        return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices, sent=sent)
+        return ZmqLockstep(
+            settings.address, bind=settings.bind is not False, keys=keys, notices=notices, sent=sent
+        )
     decoder = PacketDecoder(sent)
-    receiver = ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices, decoder=decoder)
+    receiver = ZmqReceiver(
+        settings.address, bind=settings.bind is True, keys=keys, notices=notices, decoder=decoder
+    )
     return ZmqApart(receiver, notices) if apart else receiver
 
 
 def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -> AnyLink:
     settings = config.attitude
-    rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
+    rates = DifferenceRates(
+        round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s)
+    )
     name = None if settings.spacecraft is None else str(settings.spacecraft)
     mounting = Mounting(config.tracker.q_body_to_cam)
-    taken: StateUse = "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
+    taken: StateUse = (
+        "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
+    )
     follower = Follower(name, mounting, rates, taken)
     if settings.lockstep:
-        return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
-    broadcast = vizard_broadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
+        return VizardLive(
+            settings.address, follower, bind=settings.bind is not False, notices=notices
+        )
+    broadcast = vizard_broadcast(
+        settings.address, follower, bind=settings.bind is True, notices=notices
+    )
     return ZmqApart(broadcast, notices) if apart else broadcast
 
 
@@ -78,7 +100,9 @@ def _open_42(config: BenchConfig, notices: Notices | None) -> AnyLink:
     spacecraft, allowed = nasa42_road(settings)
     reader = MessageReader(spacecraft, Mounting(config.tracker.q_body_to_cam))
     kind = Nasa42Lockstep if settings.lockstep else Nasa42Link
-    return kind(settings.address, reader, bind=settings.bind is True, allowed=allowed, notices=notices)
+    return kind(
+        settings.address, reader, bind=settings.bind is True, allowed=allowed, notices=notices
+    )
 
 
 def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:

@@ -66,7 +66,9 @@ class Aids:
         if name == "pause":
             self.paused = on
         elif name == "patch":
-            self._patch = min(range(len(PATCHES)), key=lambda k: abs(PATCHES[k] - share)) if on else -1
+            self._patch = (
+                min(range(len(PATCHES)), key=lambda k: abs(PATCHES[k] - share)) if on else -1
+            )
         else:
             self._overlay = self._overlay | _BITS[name] if on else self._overlay & ~_BITS[name]
 
@@ -152,7 +154,11 @@ class Operator:
                 self.aids.set(request.name, request.on, request.share)
                 shown = self.aids.text
                 self._told = replace(self._told, operator=shown)
-                self._notices.tell("operator", f"{request.text}, by {request.who}: {shown or SKY_AGAIN}", request.who)
+                self._notices.tell(
+                    "operator",
+                    f"{request.text}, by {request.who}: {shown or SKY_AGAIN}",
+                    request.who,
+                )
                 request.done = True
         now = OnScreen(self.aids.text, self._hidden(), self.aids.shows_sky)
         if now != self._told:
@@ -160,7 +166,9 @@ class Operator:
             if now.operator != before.operator:
                 self._notices.tell("operator", f"operator's keys: {now.operator or SKY_AGAIN}")
             if now.hidden and now.hidden != before.hidden:
-                self._notices.tell("hidden", f"the window is {now.hidden}: its frames are not fully visible")
+                self._notices.tell(
+                    "hidden", f"the window is {now.hidden}: its frames are not fully visible"
+                )
             elif before.hidden and not now.hidden:
                 self._notices.tell("visible", "the window is visible again")
         return now
@@ -175,12 +183,18 @@ class Operator:
             attitude = None
         else:
             held, held_t_ns = self._held
-            attitude = replace(held, rate_cam_rad_s=None, age_ns=max(0, held.age_ns + t_ns - held_t_ns))
+            attitude = replace(
+                held, rate_cam_rad_s=None, age_ns=max(0, held.age_ns + t_ns - held_t_ns)
+            )
         return attitude if self.aids.shows_sky else None
 
     def laid_over(self, levels: Levels) -> Levels:
         """The levels of a frame that no screen changes, with the aids over them."""
-        return levels if self._levels is None else self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)
+        return (
+            levels
+            if self._levels is None
+            else self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)
+        )
 
     def count(self, shown: OnScreen, swap_ns: int) -> None:
         """Count a frame by how it was shown."""
@@ -195,10 +209,15 @@ class Operator:
         """Frames changed by the operator and frames hidden by the window: count, and duration in
         s.
         """
-        return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}
+        return {
+            name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S}
+            for name in self._frames
+        }
 
 
 def aid_levels_of(bench: Bench) -> AidLevels:
     """The aids' levels on a bench."""
     x_px, y_px = bench.camera.boresight_px
-    return AidLevels(bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px)))
+    return AidLevels(
+        bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px))
+    )

@@ -107,7 +107,9 @@ class Pacer:
 
     moves_stars = False
 
-    def __init__(self, period_ns: float, clock: HostClock = HOST_CLOCK, operator: Operator | None = None) -> None:
+    def __init__(
+        self, period_ns: float, clock: HostClock = HOST_CLOCK, operator: Operator | None = None
+    ) -> None:
         self.clock = clock
         self.stop = threading.Event()
         self.operator = Operator(Aids(), Notices()) if operator is None else operator
@@ -133,7 +135,9 @@ class Pacer:
         """
         return nullcontext()
 
-    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
+    def show(
+        self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]
+    ) -> Presented:
         """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each
         stage.
         """

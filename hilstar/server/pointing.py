@@ -42,7 +42,9 @@ class Pointing:
     def _run(self) -> None:
         self._come.wait()
         if self._q_icrs_to_cam is not None and not self._closed:
-            self._notices.begin(POINTING, f"{pointing_text(self._bench, self._q_icrs_to_cam)}: {LINE_ENDS}")
+            self._notices.begin(
+                POINTING, f"{pointing_text(self._bench, self._q_icrs_to_cam)}: {LINE_ENDS}"
+            )
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -67,7 +69,9 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
         return f"{text}, in {constellation_of(matrix[2])}, where the catalogue has no star in view"
     stars = bench.stars
     designation, name = star_names().get(int(stars.hip[star]), ("", ""))
-    words = [part for part in (name, designation) if part] or [str(stars.designations(np.array([star]))[0])]
+    words = [part for part in (name, designation) if part] or [
+        str(stars.designations(np.array([star]))[0])
+    ]
     called = printable(", ".join(f"HIP {word}" if word.isdecimal() else word for word in words))
     where = constellation_of(np.asarray(stars.vectors[star]))
     return f"{text}; the brightest star in view is {called}, V {stars.v_mag[star]:.2f}, in {where}"
@@ -78,8 +82,16 @@ def _brightest_in_view(bench: Bench, matrix: FloatArray) -> int | None:
     is there.
     """
     tracker, stars = bench.config.tracker, bench.stars
-    width, height = (0.5 * pixels * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm for pixels in tracker.resolution_px)
+    width, height = (
+        0.5 * pixels * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
+        for pixels in tracker.resolution_px
+    )
     fixed = len(stars) - len(stars.bodies)
     x, y, z = matrix @ np.asarray(stars.vectors[:fixed]).T
-    inside = np.flatnonzero((z > 0) & (np.abs(x) <= width * z) & (np.abs(y) <= height * z) & np.isfinite(stars.v_mag[:fixed]))
+    inside = np.flatnonzero(
+        (z > 0)
+        & (np.abs(x) <= width * z)
+        & (np.abs(y) <= height * z)
+        & np.isfinite(stars.v_mag[:fixed])
+    )
     return int(inside[stars.v_mag[inside].argmin()]) if len(inside) else None

@@ -136,7 +136,11 @@ class Play:
 
 
 def played_again(
-    read: Callable[[], Iterator[FrameRecord]], count: int, packet_count: int, paced: bool, recording: Recording
+    read: Callable[[], Iterator[FrameRecord]],
+    count: int,
+    packet_count: int,
+    paced: bool,
+    recording: Recording,
 ) -> Play:
     """The play of an earlier run's `count` frames, each with the attitude and the motion that it
     had.
@@ -154,14 +158,23 @@ def played_again(
             past, at = found, at + 1
         if past.q is None:
             return PlayedFrame(past.frame, past.t_ns, None, past)
-        rate, velocity, place = (None if v is None else np.array(v) for v in (past.rate, past.velocity_km_s, past.place_km))
-        attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place)
+        rate, velocity, place = (
+            None if v is None else np.array(v)
+            for v in (past.rate, past.velocity_km_s, past.place_km)
+        )
+        attitude = Attitude(
+            np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place
+        )
         return PlayedFrame(past.frame, past.t_ns, attitude, past)
 
-    return Play(frame, count, packet_count, paced, first.t_ns, first.t_ns, moving=True, recording=recording)
+    return Play(
+        frame, count, packet_count, paced, first.t_ns, first.t_ns, moving=True, recording=recording
+    )
 
 
-def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
+def plan_play(
+    log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED
+) -> Play:
     """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a
     step is given.
 
@@ -187,11 +200,15 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
     if wanted.step_s is not None:
         if wanted.step_s <= 0 or factor not in {1.0, math.inf}:
-            raise InputError(f"--step {wanted.step_s:g}: write seconds above 0, with --speed realtime or max")
+            raise InputError(
+                f"--step {wanted.step_s:g}: write seconds above 0, with --speed realtime or max"
+            )
         step_s = wanted.step_s
     count = (stop_s - start_s) / step_s + 1e-6
     if count > MAX_FRAMES:
-        raise InputError(f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop")
+        raise InputError(
+            f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop"
+        )
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     joins = read.joins()
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
@@ -200,30 +217,50 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
         t_ns = first_ns + round(slot * step_s * NS_PER_S)
         return PlayedFrame(slot, t_ns, timeline.at(t_ns))
 
-    play = Play(frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns)
+    play = Play(
+        frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns
+    )
     told = [*read.told, *joins.told, *coarse_lines(samples)]
     return replace(play, told=told, conventions=read.conventions, span=span_line(samples))
 
 
 def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:
     if wanted.step_s is not None or wanted.speed not in {1.0, math.inf}:
-        raise InputError(f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step")
+        raise InputError(
+            f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step"
+        )
     start_s, stop_s = _span(log, wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
 
     def kept() -> Iterator[FrameRecord]:
         frames = frame_records(log, tell=False)
-        return (one for one in frames if start_s <= (one.swap_ns - first.swap_ns) / NS_PER_S <= stop_s + 1e-9)
+        return (
+            one
+            for one in frames
+            if start_s <= (one.swap_ns - first.swap_ns) / NS_PER_S <= stop_s + 1e-9
+        )
 
     count = sum(1 for _ in kept())
     if not count:
-        raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
-    play = played_again(kept, count, sum(1 for _ in read_attitudes(log)), not math.isinf(wanted.speed), read_recording(log))
+        raise InputError(
+            f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span"
+        )
+    play = played_again(
+        kept,
+        count,
+        sum(1 for _ in read_attitudes(log)),
+        not math.isinf(wanted.speed),
+        read_recording(log),
+    )
     head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
-    drawn_by = DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
+    drawn_by = (
+        DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
+    )
     wrong_sky = WrongSky()
     for event in event_records(log):
         wrong_sky.see(event.kind, event.detail, event.host_ns, event.since_ns)
-    return replace(play, zero_ns=first.t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head), wrong_sky=wrong_sky)
+    return replace(
+        play, zero_ns=first.t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head), wrong_sky=wrong_sky
+    )
 
 
 def _tell_of(play: Play, notices: Notices) -> None:
@@ -258,11 +295,15 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
     start_s = 0.0 if wanted.start_s is None else wanted.start_s
     stop_s = length_s if wanted.stop_s is None else wanted.stop_s
     if not 0 <= start_s <= stop_s <= length_s + 1e-9:
-        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length, {length_s:g}")
+        raise InputError(
+            f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length, {length_s:g}"
+        )
     return start_s, stop_s
 
 
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
+def replay(
+    bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None
+) -> RunSummary:
     """Replay recorded frames: paced, where late ones are missed as on a monitor, or all of them
     as fast as possible.
     """
@@ -318,8 +359,18 @@ class FrameImages:
             return
         path = self._directory / f"frame_{shown.number:06d}.png"
         write_codes_png(path, self._bench.code_values(shown.drawn.levels), self._bits)
-        q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
-        row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
+        q = (
+            ["", "", "", ""]
+            if shown.attitude is None
+            else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
+        )
+        row = [
+            shown.number,
+            f"{shown.t_ns / 1e9:.9f}",
+            *q,
+            shown.drawn.star_count,
+            len(shown.drawn.clipped_hip),
+        ]
         with self._said():
             self._writer.writerow(row)
 
@@ -335,7 +386,9 @@ class FrameImages:
             self._table = make_directory(self._directory) / "frames.csv"
             refuse_ledger(self._table)
             with self._said():
-                file = self._stack.enter_context(self._table.open("w", encoding="ascii", newline=""))
+                file = self._stack.enter_context(
+                    self._table.open("w", encoding="ascii", newline="")
+                )
             self._writer = csv.writer(file, lineterminator="\n")
             self._writer.writerow(COLUMNS)
         return self

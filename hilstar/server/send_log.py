@@ -53,13 +53,17 @@ class SendTally:
 class BadCable:
     """Passes packets on; each meets at most one fault."""
 
-    def __init__(self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]
+    ) -> None:
         self.tally, self._faults, self._rng, self._put = SendTally(), faults, rng, put
         self._held: bytes | None = None
 
     def delay_s(self) -> float:
         """How late the next packet leaves, uniform up to the jitter."""
-        return float(self._rng.uniform(0.0, self._faults.jitter_s)) if self._faults.jitter_s else 0.0
+        return (
+            float(self._rng.uniform(0.0, self._faults.jitter_s)) if self._faults.jitter_s else 0.0
+        )
 
     def carry(self, packet: bytes) -> None:
         """Send a packet, with its fault if it has one. A packet held back leaves right after the
@@ -103,7 +107,9 @@ def spin_samples(
     k = 0
     while True:
         seconds = k / rate_hz
-        yield AttitudeSample(round(seconds * NS_PER_S), propagate(start, rate_cam_rad_s, seconds), rate_cam_rad_s, k)
+        yield AttitudeSample(
+            round(seconds * NS_PER_S), propagate(start, rate_cam_rad_s, seconds), rate_cam_rad_s, k
+        )
         k += 1
 
 
@@ -116,7 +122,10 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
     """
     joins = log_joins(samples)
     after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
-    samples = [replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample for sample in samples]
+    samples = [
+        replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample
+        for sample in samples
+    ]
     if rate_hz is not None:
         samples = _resampled(samples, rate_hz)
     first_ns = samples[0].t_ns
@@ -126,7 +135,9 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
             after = samples[k + 1]
             seconds = (after.t_ns - sample.t_ns) / NS_PER_S
             rate = rate_between_rad_s(sample.q_icrs_to_cam, after.q_icrs_to_cam, seconds)
-        yield AttitudeSample(sample.t_ns - first_ns, sample.q_icrs_to_cam, rate, k, sample.discontinuity)
+        yield AttitudeSample(
+            sample.t_ns - first_ns, sample.q_icrs_to_cam, rate, k, sample.discontinuity
+        )
 
 
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:
@@ -136,7 +147,9 @@ def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSa
     timeline = log_timeline(samples, Policy(0, NS_PER_S))
     count = int((samples[-1].t_ns - samples[0].t_ns) * rate_hz / NS_PER_S + 1e-6) + 1
     if count > MAX_RESAMPLED:
-        raise InputError(f"--rate {rate_hz:g}: gives {count} packets for this log; write a lower rate")
+        raise InputError(
+            f"--rate {rate_hz:g}: gives {count} packets for this log; write a lower rate"
+        )
     resampled = []
     seen = 0
     for k in range(count):
@@ -149,7 +162,9 @@ def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSa
             broken |= samples[seen].discontinuity
             seen += 1
         rate = _rate_between(samples, seen, t_ns)
-        resampled.append(AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate, discontinuity=broken and k > 0))
+        resampled.append(
+            AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate, discontinuity=broken and k > 0)
+        )
     return resampled
 
 
@@ -179,7 +194,13 @@ def send(
         due_ns = start_ns + sample.t_ns
         if HOST_CLOCK.wait_until(due_ns + round(cable.delay_s() * NS_PER_S), stop):
             break
-        stamped = AttitudeSample(due_ns, sample.q_icrs_to_cam, sample.rate_cam_rad_s, sample.sequence, sample.discontinuity)
+        stamped = AttitudeSample(
+            due_ns,
+            sample.q_icrs_to_cam,
+            sample.rate_cam_rad_s,
+            sample.sequence,
+            sample.discontinuity,
+        )
         cable.carry(encode(stamped))
         on_sent(cable.tally.total)
     cable.close()

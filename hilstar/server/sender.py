@@ -43,7 +43,9 @@ Clock = Callable[[], int]
 Numbers = Sequence[float] | FloatArray
 
 
-def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
+def open_sender(
+    to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns
+) -> SenderEnd:
     """The end that `to` names: serial line, UDP, or else ZeroMQ; `clock` (ns) stamps its time
     replies. Raises InputError.
     """
@@ -51,7 +53,9 @@ def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, cl
     if line is None and not to.startswith("udp:"):
         return ZmqSender(to, bind=not connect, keys=keys)
     if keys.given or connect:
-        raise InputError(f"{to}: only ZeroMQ has keys, and a side that connects (--connect); remove them")
+        raise InputError(
+            f"{to}: only ZeroMQ has keys, and a side that connects (--connect); remove them"
+        )
     return UdpSender(to, clock) if line is None else SerialSender(*line, clock)
 
 
@@ -64,12 +68,24 @@ class TwoWay(Closing):
     answer: AnswerPacket | None = None
     statuses = requests = 0  # that came; every request is answered
 
-    def _listen_to(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
+    def _listen_to(
+        self,
+        receive: Callable[[int], list[Arrival[Event]]],
+        send: Callable[[Packet], None],
+        clock: Clock,
+    ) -> None:
         self._answered, self._stop = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._listen, args=(receive, send, clock), name="hilstar-sender", daemon=True)
+        self._thread = threading.Thread(
+            target=self._listen, args=(receive, send, clock), name="hilstar-sender", daemon=True
+        )
         self._thread.start()
 
-    def _listen(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
+    def _listen(
+        self,
+        receive: Callable[[int], list[Arrival[Event]]],
+        send: Callable[[Packet], None],
+        clock: Clock,
+    ) -> None:
         while not self._stop.is_set():
             for arrival in receive(LISTEN_MS):
                 match arrival.event:
@@ -123,11 +139,15 @@ class UdpSender(TwoWay):
     def __init__(self, to: str, clock: Clock = time.monotonic_ns) -> None:
         match = UDP.fullmatch(to)
         if match is None or not 0 < int(match[3]) < 65_536:
-            raise InputError(f"{shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or udp://[::1]:5560")
+            raise InputError(
+                f"{shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or udp://[::1]:5560"
+            )
         try:
             self._datagrams = Datagrams.connected(match[1] or match[2], int(match[3]))
         except OSError as error:
-            raise InputError(f"{shortened(to)}: {error.strerror}; write the address of hilstar's machine") from error
+            raise InputError(
+                f"{shortened(to)}: {error.strerror}; write the address of hilstar's machine"
+            ) from error
         self.endpoint = to
         self.link_counts = LinkCounts()
         self._listen_to(self._receive, lambda packet: self.put(encode(packet)), clock)
@@ -228,9 +248,14 @@ class Sender(Closing):
         refuse. Only a full serial line is waited for, half a second at most.
         """
         at_ns = self._clock() if t_ns is None else int(t_ns)
-        q, rate = tuple(map(float, q_icrs_to_cam)), None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s))
+        q, rate = (
+            tuple(map(float, q_icrs_to_cam)),
+            None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s)),
+        )
         if len(q) != 4 or (rate is not None and len(rate) != 3):
-            raise InputError(f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a rate of 3")
+            raise InputError(
+                f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a rate of 3"
+            )
         sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity)
         if isinstance(sample, Refusal):
             raise InputError(f"{sample.detail} ({sample.reason})")

@@ -18,7 +18,14 @@ from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.links import LockstepLink, Pictures, StreamLink, TrackerCamera
-from hilstar.attitude.wire.packet import AnswerPacket, AttitudeSample, Event, Refusal, Status, rate_refusal
+from hilstar.attitude.wire.packet import (
+    AnswerPacket,
+    AttitudeSample,
+    Event,
+    Refusal,
+    Status,
+    rate_refusal,
+)
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
@@ -86,7 +93,9 @@ class Outlet:
         if self.screen is not None:
             pacer: Pacer = DisplayPacer(self.screen, self.notices, requests=self.requests)
         else:
-            operator = Operator(Aids(), self.notices, requests=self.requests, levels=aid_levels_of(bench))
+            operator = Operator(
+                Aids(), self.notices, requests=self.requests, levels=aid_levels_of(bench)
+            )
             pacer = Pacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
         loop = FrameLoop(bench, sink, pacer, moving, self.notices, faults)
         if self.pulse is not None:
@@ -101,7 +110,9 @@ class Outlet:
         if self.answers is not None:
             self.answers.frame(shown, light_ns)
         if self.ledger.on:
-            self.ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
+            self.ledger.frame(
+                frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown))
+            )
 
     def complete(self, summary: RunSummary, loop: FrameLoop) -> RunSummary:
         """The summary of a run with its faults, pulses, events and screen."""
@@ -119,11 +130,19 @@ class Outlet:
         )
 
 
-def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
+def serve(
+    bench: Bench,
+    link: AnyLink,
+    limit: Limit,
+    sink: FrameSink = ignore,
+    outlet: Outlet | None = None,
+) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     loop = outlet.loop(bench, sink)
-    for kind, line in link.conventions.mounting_notices(Mounting(bench.config.tracker.q_body_to_cam)):
+    for kind, line in link.conventions.mounting_notices(
+        Mounting(bench.config.tracker.q_body_to_cam)
+    ):
         outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
         if link.steps:
@@ -139,10 +158,14 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
     """How a link's quaternions become the camera's."""
     config = bench.config
-    return ReadAs.of(link.conventions, config.attitude.convention, Mounting(config.tracker.q_body_to_cam))
+    return ReadAs.of(
+        link.conventions, config.attitude.convention, Mounting(config.tracker.q_body_to_cam)
+    )
 
 
-def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
+def _serve_stream(
+    bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet
+) -> RunSummary:
     settings, clock = bench.config.attitude, loop.pacer.clock
     timeline = Timeline(policy_of(settings))
     kept = "shared" if settings.source == "scpi" else settings.clock
@@ -175,7 +198,9 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         light_ns = t_ns - receiver.jumps.correction_ns  # by the sender's own clock
         outlet.record(bench, loop, shown, light_ns)
         if link.two_way:
-            receiver.back.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
+            receiver.back.post(
+                statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised)
+            )
         return shown
 
     receiver.start()
@@ -188,7 +213,9 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         loop.paced(limit, draw_slot)
     finally:
         receiver.close()
-    summary = loop.tally.summary((clock.now_ns() - begin_ns) / NS_PER_S, receiver.counts, bench.renderer)
+    summary = loop.tally.summary(
+        (clock.now_ns() - begin_ns) / NS_PER_S, receiver.counts, bench.renderer
+    )
     return replaced(
         summary,
         stale_events=loop.gate.events,
@@ -207,8 +234,13 @@ def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_
         return
     t_ns, rate = middle_ns - round(offset_ms * NS_PER_MS), answer.rate_cam_rad_s
     flags = protocol.ANSWER_VALID | (0 if rate is None else protocol.ANSWER_RATE_VALID)
-    q, rates = tuple(answer.q_icrs_to_cam.tolist()), (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist())
-    receiver.back.pass_on(AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0))
+    q, rates = (
+        tuple(answer.q_icrs_to_cam.tolist()),
+        (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist()),
+    )
+    receiver.back.pass_on(
+        AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0)
+    )
 
 
 class LockstepRun:
@@ -230,17 +262,25 @@ class LockstepRun:
         request leaves the last frame.
         """
         check = self._bench.config.attitude.check_rates
-        self._rates = RateCheck(check, self._loop.notices, used=False, read_as=_read_as(self._bench, link))
+        self._rates = RateCheck(
+            check, self._loop.notices, used=False, read_as=_read_as(self._bench, link)
+        )
         loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
         self._outlet.follower(Running(loop, self.counts, answers=self._outlet.answers))
         tracker = self._bench.config.tracker
         height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
         field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))
-        camera = TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
+        camera = TrackerCamera(
+            Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg
+        )
         link.show_camera(camera, self._outlet.pictures)
         begin_ns = self._clock.now_ns()
         end_ns = begin_ns + self._limit.slots / self._bench.config.monitor.refresh_hz * NS_PER_S
-        while loop.tally.frames < self._limit.frames and self._clock.now_ns() < end_ns and not loop.stop.is_set():
+        while (
+            loop.tally.frames < self._limit.frames
+            and self._clock.now_ns() < end_ns
+            and not loop.stop.is_set()
+        ):
             arrival = link.receive(POLL_MS)
             if arrival is None:
                 loop.idle()
@@ -251,7 +291,10 @@ class LockstepRun:
             link.answer(status, shown_ns, refusal)
             turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
         duration_s = (self._clock.now_ns() - begin_ns) / NS_PER_S
-        return replaced(loop.tally.summary(duration_s, self.counts, self._bench.renderer), turn_ms=turn_ms.percentiles())
+        return replaced(
+            loop.tally.summary(duration_s, self.counts, self._bench.renderer),
+            turn_ms=turn_ms.percentiles(),
+        )
 
     def _take(self, host_ns: int, event: Event, raw: bytes) -> Refusal | None:
         """Show what a request says, or say why it is refused; the last frame then stays."""
@@ -262,7 +305,10 @@ class LockstepRun:
             self._rates.see(sample, host_ns)
             refusal = rate_refusal(self._rates.believed(sample), self._max_rate_rad_s)
         elif refusal is None:
-            refusal = Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
+            refusal = Refusal(
+                "format",
+                f"a {type(event).__name__} packet; a request is an attitude, or a time request",
+            )
         if refusal is not None and self.counts.refuse(refusal):
             line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
             self._loop.notices.mention("refused", line)
@@ -296,7 +342,14 @@ class StatusMaker:
         self._ledger, self._missed, self._refused = ledger, 0, 0
         self._told: dict[str, int] = {}
 
-    def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
+    def status(
+        self,
+        shown: Shown,
+        light_t_ns: int,
+        loop: FrameLoop,
+        counts: PacketCounts,
+        synchronised: bool,
+    ) -> Status:
         """The status after a frame whose light leaves at `light_t_ns` of the sender's clock."""
         missed, refused = loop.tally.missed_frames, counts.refused
         attitude, on_screen = shown.attitude, loop.pacer.operator.look()
@@ -308,7 +361,8 @@ class StatusMaker:
             protocol.HEALTH_MISSED: missed > self._missed,
             protocol.HEALTH_REFUSED: refused > self._refused,
             protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
-            protocol.HEALTH_LEDGER_FAILED: self._ledger is not None and self._ledger.failure is not None,
+            protocol.HEALTH_LEDGER_FAILED: self._ledger is not None
+            and self._ledger.failure is not None,
             protocol.HEALTH_OPERATOR_OVERRIDE: bool(on_screen.operator),
             protocol.HEALTH_HIDDEN: bool(on_screen.hidden),
             protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),

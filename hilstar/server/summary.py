@@ -56,11 +56,15 @@ def verdict_of(summary: "RunSummary") -> RunVerdict:
     wrong = summary.wrong_sky
     reasons = [] if due else ["no frame had an attitude"]
     if summary.missed_frames:
-        reasons.append(f"{summary.missed_frames} of {summary.frames + summary.missed_frames} frames missed")
+        reasons.append(
+            f"{summary.missed_frames} of {summary.frames + summary.missed_frames} frames missed"
+        )
     if stale:
         reasons.append(f"{stale} of {summary.frames} frames with a stale attitude")
     if summary.blank_frames and due:
-        reasons.append(f"{summary.blank_frames} of {summary.frames} frames before the first attitude")
+        reasons.append(
+            f"{summary.blank_frames} of {summary.frames} frames before the first attitude"
+        )
     if wrong.seconds:
         kinds = ", ".join(one.kind for one in wrong.conditions if one.seconds)
         reasons.append(f"{wrong.seconds:.1f} s of a wrong sky ({kinds})")
@@ -137,7 +141,9 @@ class SwapTally:
         self._interval_ms, self._late_ms, self._packet_ms = (RunningStatistics() for _ in range(3))
         self._last_ns: int | None = None
 
-    def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
+    def add(
+        self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None
+    ) -> None:
         """Add one swap; `received_ns` is when the newest packet behind the frame arrived, None
         if there is none.
         """
@@ -170,14 +176,18 @@ class RunTally:
         self.swaps = SwapTally()
         self.blank_frames = 0  # before the first attitude
         self.first_swap_ns: int | None = None
-        self._clipped_max = self.missed_frames = self.stale_frames = self.capped_frames = self.given_up_frames = 0
+        self._clipped_max = self.missed_frames = self.stale_frames = self.capped_frames = (
+            self.given_up_frames
+        ) = 0
 
     @property
     def frames(self) -> int:
         """Frames drawn so far."""
         return self._frame_ms.count
 
-    def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int | str, ...]) -> None:
+    def add(
+        self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int | str, ...]
+    ) -> None:
         """Add one frame; `age_ns` is None until an attitude has come."""
         self._frame_ms.add(frame_ns / NS_PER_MS)
         if age_ns is not None:
@@ -191,7 +201,9 @@ class RunTally:
         """What all kinds of run say; figures without a sample are None."""
         stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
         bodies = sorted(body for body in self.clipped_hip if isinstance(body, str))
-        refused_by = {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS}
+        refused_by = {
+            name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS
+        }
         return RunSummary(
             frames=self.frames,
             duration_s=duration_s,
@@ -206,7 +218,9 @@ class RunTally:
                 counts.lost,
                 counts.shown or UNSET,
             ),
-            stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
+            stars_drawn=StarSummary(
+                self._stars.mean, int(self._stars.max) if self.frames else None
+            ),
             clipped=ClippedSummary(self._clipped_max, stars, bodies),
             missed_frames=self.missed_frames,
             stale_frames=self.stale_frames,

@@ -55,7 +55,9 @@ class Exposures:
             ("lit_s", 0.0 if self.lit_s is None else self.lit_s, False),
         ):
             if not math.isfinite(value) or value < 0 or (zero_is_wrong and not value):
-                raise InputError(f"{name} = {value:g}: write a finite number{' above 0' if zero_is_wrong else ', 0 or more'}")
+                raise InputError(
+                    f"{name} = {value:g}: write a finite number{' above 0' if zero_is_wrong else ', 0 or more'}"
+                )
 
     @property
     def refreshes(self) -> float:
@@ -70,7 +72,9 @@ class Exposures:
     @property
     def lit(self) -> float:
         """The part of a refresh for which a row stays lit."""
-        return 1.0 if self.lit_s is None else min(max(self.lit_s * self.refresh_hz, SHORTEST_LIT), 1.0)
+        return (
+            1.0 if self.lit_s is None else min(max(self.lit_s * self.refresh_hz, SHORTEST_LIT), 1.0)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +146,9 @@ def beat(exposures: Exposures) -> Beat:
     # Phases all over a refresh, and to either side of those at which an exposure begins or ends
     # with a row's light.
     edges = np.array([0.0, exposures.lit, -length, exposures.lit - length])
-    phases = np.concatenate([np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))])
+    phases = np.concatenate(
+        [np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))]
+    )
     seen = seen_at(exposures, phases)
     arcsec = float(np.nanmax(np.abs(seen.off_s))) * ARCSEC_PER_DEG
     dim, bright = float(seen.light.min()), float(seen.light.max())
@@ -203,7 +209,9 @@ class Tolerance:
     def is_broken_by(self, found: Beat) -> bool:
         """Whether a beat costs more."""
         arcsec = found.worst_arcsec_per_deg_s
-        return (arcsec is not None and arcsec * self.turn_deg_s > self.arcsec) or found.worst_mag > self.mag
+        return (
+            arcsec is not None and arcsec * self.turn_deg_s > self.arcsec
+        ) or found.worst_mag > self.mag
 
 
 def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposures:
@@ -216,15 +224,24 @@ def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposu
     return Exposures(hz, tracker.exposure_s, tracker.frame_hz, lit_s, tracker.trigger == "external")
 
 
-def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequence[float] = ()) -> BeatSummary:
+def beat_of(
+    config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequence[float] = ()
+) -> BeatSummary:
     """The beat of a bench, and what to write instead where it costs too much. Raises InputError.
 
     `refresh_hz` is that of the display where it was measured, `modes_hz` are those that the display
     has.
     """
     exposures, render = exposures_of(config, refresh_hz), config.render
-    pixel_arcsec = config.monitor.pixel_pitch_um * MM_PER_UM / config.collimator.focal_length_mm * ARCSEC_PER_RAD
-    tolerance = Tolerance(config.sync.turn_deg_s, render.tolerance_px * pixel_arcsec, render.tolerance_mag)
+    pixel_arcsec = (
+        config.monitor.pixel_pitch_um
+        * MM_PER_UM
+        / config.collimator.focal_length_mm
+        * ARCSEC_PER_RAD
+    )
+    tolerance = Tolerance(
+        config.sync.turn_deg_s, render.tolerance_px * pixel_arcsec, render.tolerance_mag
+    )
     found = beat(exposures)
     matters = tolerance.is_broken_by(found)
     arcsec = found.worst_arcsec_per_deg_s
@@ -243,7 +260,9 @@ def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequ
     )
 
 
-def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float] = ()) -> BeatProposal:
+def propose(
+    exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float] = ()
+) -> BeatProposal:
     """The nearest refresh rate, exposure and rate of the tracker that keep the beat within a
     tolerance, each alone.
 
@@ -253,15 +272,26 @@ def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float
     rates_hz = [hz for hz in modes_hz if hz > 0] or [whole / exposures.exposure_s]
     low_hz = max(MIN_REFRESH_HZ, exposures.refresh_hz / MAX_CHANGE)
     high_hz = min(MAX_REFRESH_HZ, exposures.refresh_hz * MAX_CHANGE)
-    near_hz = sorted((hz for hz in rates_hz if low_hz <= hz <= high_hz), key=lambda hz: abs(hz - exposures.refresh_hz))
-    refresh = [hz for hz in near_hz if not tolerance.is_broken_by(beat(replace(exposures, refresh_hz=hz)))]
+    near_hz = sorted(
+        (hz for hz in rates_hz if low_hz <= hz <= high_hz),
+        key=lambda hz: abs(hz - exposures.refresh_hz),
+    )
+    refresh = [
+        hz for hz in near_hz if not tolerance.is_broken_by(beat(replace(exposures, refresh_hz=hz)))
+    ]
     # So many refreshes, or as many fewer as the tracker's frames have room for.
     if exposures.frame_hz is not None:
         whole = min(whole, math.floor(exposures.refresh_hz / exposures.frame_hz + NO_BEAT))
     exposure_s = whole / exposures.refresh_hz if whole else None
-    cured = exposure_s is not None and not tolerance.is_broken_by(beat(replace(exposures, exposure_s=exposure_s)))
+    cured = exposure_s is not None and not tolerance.is_broken_by(
+        beat(replace(exposures, exposure_s=exposure_s))
+    )
     # The nearest rate of exposures that begins each at one phase.
-    parts = max(round(exposures.refresh_hz / exposures.every_hz), math.ceil(exposures.refreshes - NO_BEAT), 1)
+    parts = max(
+        round(exposures.refresh_hz / exposures.every_hz),
+        math.ceil(exposures.refreshes - NO_BEAT),
+        1,
+    )
     return BeatProposal(
         refresh_hz=refresh[0] if refresh else None,
         exposure_s=exposure_s if cured else None,
@@ -275,16 +305,22 @@ def beat_line(found: BeatSummary) -> str | None:
         return None
     costs = []
     if found.worst_arcsec is not None:
-        arcsec = f"{found.worst_arcsec:.2g}" if found.worst_arcsec < FEW_ARCSEC else f"{found.worst_arcsec:.0f}"
+        arcsec = (
+            f"{found.worst_arcsec:.2g}"
+            if found.worst_arcsec < FEW_ARCSEC
+            else f"{found.worst_arcsec:.0f}"
+        )
         costs.append(f"{arcsec} arcsec at {found.turn_deg_s:g} deg/s")
     if found.worst_mag is None:
         costs.append("all of its light")
     elif found.worst_mag > found.tolerance_mag:
         costs.append(f"{found.worst_mag:.2g} mag")
-    how = "in every exposure alike until the clocks drift" if found.period_s is None else f"in a beat of {found.period_s:.3g} s"
-    subject = (
-        f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of {found.refresh_hz:.6g} Hz"
+    how = (
+        "in every exposure alike until the clocks drift"
+        if found.period_s is None
+        else f"in a beat of {found.period_s:.3g} s"
     )
+    subject = f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of {found.refresh_hz:.6g} Hz"
     proposal, ways = found.proposal or BeatProposal(), []
     if proposal.refresh_hz is not None:
         ways.append(f"[monitor] refresh_hz = {proposal.refresh_hz:.6g}")

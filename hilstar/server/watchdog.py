@@ -32,14 +32,21 @@ class AttitudeWatch:
         if attitude is None:
             if not self._seen and not self._missed and now_ns - self._begun_ns > NONE_YET_NS:
                 self._missed = True
-                self._notices.tell("no-attitude", f"no attitude yet, for {for_s:.0f} s: the frames are blank")
+                self._notices.tell(
+                    "no-attitude", f"no attitude yet, for {for_s:.0f} s: the frames are blank"
+                )
             return
         if not self._seen:
             self._seen = True
-            self._notices.tell("first-attitude", f"the first attitude has come, after {for_s:.1f} s")
+            self._notices.tell(
+                "first-attitude", f"the first attitude has come, after {for_s:.1f} s"
+            )
         if stale and self._stale_ns is None:
             self._stale_ns = now_ns
-            self._notices.tell("stale", f"the attitude is stale: the newest is {attitude.age_ns / NS_PER_S:.3g} s old")
+            self._notices.tell(
+                "stale",
+                f"the attitude is stale: the newest is {attitude.age_ns / NS_PER_S:.3g} s old",
+            )
         elif not stale and self._stale_ns is not None:
             stale_s, self._stale_ns = (now_ns - self._stale_ns) / NS_PER_S, None
             self._notices.tell("fresh", f"the attitude is fresh again, after {stale_s:.1f} s")
@@ -91,7 +98,9 @@ class FrameWatch:
             self._told_ns = now_ns
             took_ms = (now_ns - stages[0][1]) / NS_PER_MS
             ends = zip(stages, [*(begin for _, begin in stages[1:]), now_ns], strict=True)
-            told = ", ".join(f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in ends)
+            told = ", ".join(
+                f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in ends
+            )
             self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {told}")
 
     def idle(self) -> None:
@@ -108,7 +117,8 @@ class FrameWatch:
             if now_ns - stages[-1][1] > STUCK_NS:
                 stuck = stages[-1]
                 self._notices.tell(
-                    "frame-stuck", f"frame {number} hangs in its stage {stuck[0]} since {(now_ns - stuck[1]) / NS_PER_S:.1f} s"
+                    "frame-stuck",
+                    f"frame {number} hangs in its stage {stuck[0]} since {(now_ns - stuck[1]) / NS_PER_S:.1f} s",
                 )
 
     def __enter__(self) -> Self:
@@ -134,7 +144,13 @@ class GpuWatch:
     next frame drawn on black: a driver may lose the GPU's memory without an error.
     """
 
-    def __init__(self, backend: Backend, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self,
+        backend: Backend,
+        notices: Notices,
+        stop: threading.Event,
+        clock: HostClock = HOST_CLOCK,
+    ) -> None:
         self._backend, self._notices, self._stop, self._clock = backend, notices, stop, clock
         backend.remember_tables()
         if fault := backend.fault():  # a fault from before the run
@@ -153,10 +169,17 @@ class GpuWatch:
         fault = self._backend.fault()
         before_ns, self._asleep_ns = self._asleep_ns, self._clock.asleep_ns()
         if not fault and (slept_ns := self._asleep_ns - before_ns) > SLEPT_NS:
-            self._notices.tell("resumed", f"the machine slept for {slept_ns / NS_PER_S:.1f} s; the GPU's tables are compared")
+            self._notices.tell(
+                "resumed",
+                f"the machine slept for {slept_ns / NS_PER_S:.1f} s; the GPU's tables are compared",
+            )
             changed = self._backend.changed_tables()
             self._backend.forget_images()
-            fault = f"the GPU's memory was lost in sleep, {changed} of the tables that make codes" if changed else ""
+            fault = (
+                f"the GPU's memory was lost in sleep, {changed} of the tables that make codes"
+                if changed
+                else ""
+            )
         if fault:
             self.lost(fault)
 

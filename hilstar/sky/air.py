@@ -33,7 +33,9 @@ def air_mass(altitude_rad: FloatArray) -> FloatArray:
     return np.asarray(1 / (np.sin(h) + 0.50572 * (np.degrees(h) + 6.07995) ** -1.6364))
 
 
-def scintillation(aperture_mm: float, masses: FloatArray, height_m: float, exposure_s: float) -> FloatArray:
+def scintillation(
+    aperture_mm: float, masses: FloatArray, height_m: float, exposure_s: float
+) -> FloatArray:
     """One sigma of a star's light relative to its mean, (n,) (Young 1967): 0.09 D^(-2/3) X^1.75
     exp(-h / 8 km) / sqrt(2 t).
 
@@ -43,7 +45,9 @@ def scintillation(aperture_mm: float, masses: FloatArray, height_m: float, expos
     if not exposure_s:
         return np.full_like(masses, MAX_TWINKLE)
     across, down = (aperture_mm / 10) ** (-2 / 3), np.exp(-height_m / 8000)
-    return np.asarray(np.minimum(0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s), MAX_TWINKLE))
+    return np.asarray(
+        np.minimum(0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s), MAX_TWINKLE)
+    )
 
 
 def standard_pressure_hpa(height_m: float) -> float:
@@ -76,10 +80,14 @@ def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
         mag = np.full(len(nm), extinction.value[0])
     else:
         mag = np.interp(nm, extinction.wavelength_nm, extinction.value)
-    return replace(optics, transmission=Curve(nm, optics.transmission(nm) * 10 ** (-0.4 * mag * masses)))
+    return replace(
+        optics, transmission=Curve(nm, optics.transmission(nm) * 10 ** (-0.4 * mag * masses))
+    )
 
 
-def dimmed_mag(rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve) -> FloatArray:
+def dimmed_mag(
+    rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve
+) -> FloatArray:
     """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons
     through optics.
     """
@@ -87,7 +95,9 @@ def dimmed_mag(rates: Callable[[Optics], FloatArray], optics: Optics, extinction
     return np.asarray(-2.5 * np.log10(np.maximum(every, 1e-300) / np.maximum(every[0], 1e-300)))
 
 
-def glow_e_per_s_arcsec2(spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry) -> float:
+def glow_e_per_s_arcsec2(
+    spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry
+) -> float:
     """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as
     zodiacal light's.
     """
@@ -95,7 +105,9 @@ def glow_e_per_s_arcsec2(spectrum: Curve, v_mag_arcsec2: float, optics: Optics, 
     nm, weight_m = integration_nodes(passband, spectrum)
     response = passband(nm) * weight_m * (nm if photometry.weighting == "photon" else 1.0)
     mean = float(spectrum(nm) @ response / response.sum())
-    nm, response = electron_response(replace(optics, transmission=with_knots(optics.transmission, spectrum, optics.range_nm)))
+    nm, response = electron_response(
+        replace(optics, transmission=with_knots(optics.transmission, spectrum, optics.range_nm))
+    )
     share = float(spectrum(nm) @ response) / mean * reference_mean_w_m2_m(photometry)
     return float(flux_ratio(v_mag_arcsec2)) * optics.area_m2 * share
 
@@ -140,7 +152,12 @@ class SiteAir:
             return replace(stars, air=air, electrons_per_s=stars.electrons_per_s * share[0])
         each = stars.colours * share.T
         total = np.maximum(each.sum(axis=1), 1e-300)
-        return replace(stars, air=air, electrons_per_s=stars.electrons_per_s * total, colours=each / total[:, None])
+        return replace(
+            stars,
+            air=air,
+            electrons_per_s=stars.electrons_per_s * total,
+            colours=each / total[:, None],
+        )
 
     def shares(self, row: IntArray, altitude_rad: FloatArray) -> FloatArray:
         """What comes through (channels, n) of stars by row of the catalogue, -1 for sunlight, at
@@ -152,7 +169,9 @@ class SiteAir:
         mag = self.dimming_mag[:, k, row] * (1 - part) + self.dimming_mag[:, k + 1, row] * part
         return np.asarray(flux_ratio(mag))
 
-    def twinkling(self, stars: Stars, utc_ns: int, exposure_s: float, rng: "np.random.Generator") -> Stars:
+    def twinkling(
+        self, stars: Stars, utc_ns: int, exposure_s: float, rng: "np.random.Generator"
+    ) -> Stars:
         """Stars as they twinkle in an exposure, each by itself about its mean; bodies do not."""
         masses = air_mass(self.above(utc_ns).altitude_rad(stars.vectors))
         sigma = scintillation(self.aperture_mm, masses, self.height_m, exposure_s)
@@ -172,7 +191,9 @@ class SiteAir:
 
     def check_sun(self, sun: FloatArray, utc_ns: int) -> None:
         """Warn, once, of a Sun above -12 degrees in a direction (3,)."""
-        altitude_deg = float(np.degrees(np.arcsin(self.above(utc_ns).up @ sun / np.linalg.norm(sun))))
+        altitude_deg = float(
+            np.degrees(np.arcsin(self.above(utc_ns).up @ sun / np.linalg.norm(sun)))
+        )
         if altitude_deg > TWILIGHT_DEG:
             tell(
                 self.told,

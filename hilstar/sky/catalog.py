@@ -107,7 +107,9 @@ class Catalog:
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
         v_mag = self.v_mag.copy()
         v_mag[known] -= self.range_mag[known] / 2 * np.cos(2 * np.pi * turns)
-        count = int(np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()) - len(known)
+        count = int(
+            np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()
+        ) - len(known)
         note = f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch of phase have their mean"
         return replace(self, v_mag=v_mag, notes=(*self.notes, note))
 
@@ -137,16 +139,26 @@ class Catalog:
         if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
             return None
         if self.designation == TYCHO:
-            return int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2]) if len(numbers) == 3 else None
+            return (
+                int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2])
+                if len(numbers) == 3
+                else None
+            )
         return int(numbers[0]) if len(numbers) == 1 else None
 
 
 def column_names() -> list[str]:
     """The names of a catalogue's arrays."""
-    return [field.name for field in fields(Catalog) if field.name not in ("designation", "rows_read", "notes")]
+    return [
+        field.name
+        for field in fields(Catalog)
+        if field.name not in ("designation", "rows_read", "notes")
+    ]
 
 
-def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArray[np.generic]]) -> Catalog:
+def plain_catalog(
+    designation: str, rows_read: int, columns: dict[str, npt.NDArray[np.generic]]
+) -> Catalog:
     """A catalogue of these `columns` (n,) alone, of which hip, v_mag, ra_deg and dec_deg have to be
     there.
 
@@ -187,7 +199,9 @@ def _packaged(faintest_v_mag: float) -> Catalog:
     """
     with np.load(PACKAGED_CATALOG) as packed:
         kept = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
-        catalog = unpack({name: packed[name][kept] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
+        catalog = unpack(
+            {name: packed[name][kept] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"])
+        )
     for name in column_names():
         getattr(catalog, name).setflags(write=False)
     return catalog
@@ -202,7 +216,9 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
     rows_read = 0
     try:
         with open_lines(path, "give the CDS I/239 hip_main.dat", MAX_CATALOGUE_BYTES) as lines:
-            for line_number, row in enumerate(csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE), start=1):
+            for line_number, row in enumerate(
+                csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE), start=1
+            ):
                 if not row:
                     continue
                 rows_read += 1
@@ -212,7 +228,9 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
     except csv.Error as error:
         raise cannot_read(path, error, "give the CDS I/239 hip_main.dat") from error
     if not rows:
-        raise InputError(f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat")
+        raise InputError(
+            f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat"
+        )
     table = np.array(rows, dtype=np.int64)
     return {name: table[:, i] for i, name in enumerate((*FIELDS, *LETTERS))}, rows_read
 
@@ -238,7 +256,9 @@ RANGES: dict[str, tuple[float, float]] = {
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:
     if len(row) != COLUMN_COUNT or row[0] != "H":
-        raise InputError(f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS I/239 file")
+        raise InputError(
+            f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS I/239 file"
+        )
     steps: dict[str, int] = {}
     for name, (column, per_unit) in FIELDS.items():
         text = row[column].strip()
@@ -254,12 +274,16 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
             value = math.nan
         if not low <= value <= high:
             shown = shortened(text)
-            raise InputError(f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to {high:g}")
+            raise InputError(
+                f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to {high:g}"
+            )
         steps[name] = round(value * per_unit)
     for name, column in LETTERS.items():
         text = row[column].strip()
         if len(text) > 1 or not text.isascii():
-            raise InputError(f"{where}: field {column} ({name}) is {shortened(text)!r}; write one letter, or none")
+            raise InputError(
+                f"{where}: field {column} ({name}) is {shortened(text)!r}; write one letter, or none"
+            )
         steps[name] = ord(text) if text else 0
     return [*steps.values()]
 

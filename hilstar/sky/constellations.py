@@ -34,7 +34,10 @@ class _Zone(NamedTuple):
 def _zones() -> tuple[_Zone, ...]:
     with ZONES.open(encoding="utf-8", newline="") as file:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
-        return tuple(_Zone(float(row["from_h"]), float(row["to_h"]), float(row["lowest_deg"]), row["name"]) for row in rows)
+        return tuple(
+            _Zone(float(row["from_h"]), float(row["to_h"]), float(row["lowest_deg"]), row["name"])
+            for row in rows
+        )
 
 
 def constellation_of(direction_icrs: FloatArray) -> str:
@@ -45,5 +48,10 @@ def constellation_of(direction_icrs: FloatArray) -> str:
     zones = _zones()
     # The last zone is the whole of the south polar cap.
     return next(
-        (zone.name for zone in zones if zone.from_h <= hours < zone.to_h and dec_deg >= zone.lowest_deg), zones[-1].name
+        (
+            zone.name
+            for zone in zones
+            if zone.from_h <= hours < zone.to_h and dec_deg >= zone.lowest_deg
+        ),
+        zones[-1].name,
     )

@@ -68,21 +68,29 @@ class TangentImage:
             return whole
         is_of_cube = math.isfinite(self.max_tangent)
         padded = whole.image if is_of_cube else np.pad(whole.image, math.ceil(4 * sigma))
-        return replace(whole, image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"))
+        return replace(
+            whole,
+            image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"),
+        )
 
     def _binned(self, count: int) -> "TangentImage":
         if count < 2:
             return self
         half = -self.image.shape[0] % (2 * count) // 2  # sides are even: the middle stays
         return TangentImage(
-            block_means(np.pad(self.image, half), count), self.axes, self.px_per_tangent / count, self.max_tangent
+            block_means(np.pad(self.image, half), count),
+            self.axes,
+            self.px_per_tangent / count,
+            self.max_tangent,
         )
 
 
 def block_means(image: Any, count: int) -> Any:
     """The means of blocks of `count` by `count` pixels, dark beyond the last row and column."""
     rows, columns = (-(-size // count) for size in image.shape)
-    padded = np.pad(image, [(0, n * count - size) for n, size in zip((rows, columns), image.shape, strict=True)])
+    padded = np.pad(
+        image, [(0, n * count - size) for n, size in zip((rows, columns), image.shape, strict=True)]
+    )
     return padded.reshape(rows, count, columns, count).mean(axis=(1, 3))
 
 
@@ -138,7 +146,9 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
 
     wcs = WCS(hdu.header)
     if hdu.data.ndim != 2 or not wcs.has_celestial:
-        raise InputError(f"{path}: an image of shape {hdu.data.shape} without a place on the sky; {MAP_ADVICE}")
+        raise InputError(
+            f"{path}: an image of shape {hdu.data.shape} without a place on the sky; {MAP_ADVICE}"
+        )
     light = brightness(path, hdu.data, hdu.header.get("BUNIT"))
     frame = wcs_to_celestial_frame(wcs)
     px_rad = math.radians(float(np.min(proj_plane_pixel_scales(wcs))))
@@ -150,13 +160,19 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
 
     def sampled(directions: FloatArray) -> FloatArray:
         x, y, z = (directions @ to_frame.T).T
-        place = wcs.world_to_pixel_values(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1.0, 1.0))))[::-1]
-        return np.asarray(map_coordinates(light, np.nan_to_num(place, nan=-9.0), order=1, mode="grid-constant"))
+        place = wcs.world_to_pixel_values(
+            np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1.0, 1.0)))
+        )[::-1]
+        return np.asarray(
+            map_coordinates(light, np.nan_to_num(place, nan=-9.0), order=1, mode="grid-constant")
+        )
 
     x, y = np.meshgrid(np.linspace(-0.5, columns - 0.5, 33), np.linspace(-0.5, rows - 0.5, 33))
     world = np.radians(wcs.pixel_to_world_values(x.ravel(), y.ravel()))
     lon, lat = world[:, np.isfinite(world).all(axis=0)]
-    seen = to_frame.T @ np.stack([np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)])
+    seen = to_frame.T @ np.stack(
+        [np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)]
+    )
     middle = seen.mean(axis=1)
     middle /= np.linalg.norm(middle) or 1.0
     reach = math.acos(np.clip(float((middle @ seen).min()), -1.0, 1.0))
@@ -180,13 +196,17 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     frames = {"G": "galactic", "C": "icrs", "Q": "icrs", "E": "barycentricmeanecliptic"}
     system = str(header.get("COORDSYS", "")).strip().upper()[:1]
     if system not in frames:
-        raise InputError(f"{path}: COORDSYS = {header.get('COORDSYS')!r}; write G (galactic), C (ICRS) or E (ecliptic)")
+        raise InputError(
+            f"{path}: COORDSYS = {header.get('COORDSYS')!r}; write G (galactic), C (ICRS) or E (ecliptic)"
+        )
     light = brightness(path, np.ravel(hdu.data.field(0)), header.get("TUNIT1"))
     grid = HEALPix(int(header["NSIDE"]), str(header["ORDERING"]).strip().lower())
     if header.get("INDXSCHM", "IMPLICIT").strip() != "IMPLICIT" or len(light) != grid.npix:
         raise InputError(f"{path}: {len(light)} pixels of {grid.npix}; give a map of the whole sky")
     if grid.nside > MAX_NSIDE:
-        nested = light if grid.order == "nested" else light[grid.nested_to_ring(np.arange(grid.npix))]
+        nested = (
+            light if grid.order == "nested" else light[grid.nested_to_ring(np.arange(grid.npix))]
+        )
         grid = HEALPix(MAX_NSIDE, "nested")
         light = nested.reshape(grid.npix, -1).mean(axis=1)
 
@@ -225,7 +245,13 @@ def _cube(sampled: Sampled, side: int) -> tuple[TangentImage, ...]:
     return tuple(face for face in faces if face.image.any())
 
 
-def _face(sampled: Sampled, axes: FloatArray, side: int, px_per_tangent: float, max_tangent: float = math.inf) -> TangentImage:
+def _face(
+    sampled: Sampled,
+    axes: FloatArray,
+    side: int,
+    px_per_tangent: float,
+    max_tangent: float = math.inf,
+) -> TangentImage:
     """A square tangent image, row block by row block."""
     at = (np.arange(side) - (side - 1) / 2) / px_per_tangent
     image = np.empty((side, side), dtype=np.float32)

@@ -84,7 +84,9 @@ class Optics:
     transmission: Curve
 
     def __post_init__(self) -> None:
-        if not len(self.quantum_efficiency.wavelength_nm) and not len(self.transmission.wavelength_nm):
+        if not len(self.quantum_efficiency.wavelength_nm) and not len(
+            self.transmission.wavelength_nm
+        ):
             flat = Curve(np.array(SILICON_RANGE_NM), np.full(2, self.quantum_efficiency.value[0]))
             object.__setattr__(self, "quantum_efficiency", flat)
 
@@ -96,7 +98,11 @@ class Optics:
     @property
     def range_nm(self) -> tuple[float, float]:
         """The wavelengths that the tracker detects: where both curves have values."""
-        ranged = [c.wavelength_nm for c in (self.quantum_efficiency, self.transmission) if len(c.wavelength_nm)]
+        ranged = [
+            c.wavelength_nm
+            for c in (self.quantum_efficiency, self.transmission)
+            if len(c.wavelength_nm)
+        ]
         return max(w[0] for w in ranged), min(w[-1] for w in ranged)
 
 
@@ -115,7 +121,10 @@ def all_channels(channels: Sequence[Optics]) -> Optics:
     ]
     ends = [np.nextafter(curve.wavelength_nm[[0, -1]], [0.0, np.inf]) for curve in curves]
     knots = np.unique(np.concatenate([*ends, *(curve.wavelength_nm for curve in curves)]))
-    return replace(channels[0], quantum_efficiency=Curve(knots, np.sum([curve(knots) for curve in curves], axis=0)))
+    return replace(
+        channels[0],
+        quantum_efficiency=Curve(knots, np.sum([curve(knots) for curve in curves], axis=0)),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +146,9 @@ def v_band_mean_w_m2_m(temperature_k: float | FloatArray, weighting: Weighting) 
     response = passband(wavelength_nm) * weight_m
     if weighting == "photon":
         response = response * wavelength_nm
-    spectrum = blackbody_exitance_w_m2_m(wavelength_nm, np.asarray(temperature_k, dtype=np.float64)[..., None])
+    spectrum = blackbody_exitance_w_m2_m(
+        wavelength_nm, np.asarray(temperature_k, dtype=np.float64)[..., None]
+    )
     return np.asarray(spectrum @ response / response.sum())
 
 
@@ -165,25 +176,33 @@ def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
     ) * electrons_per_j * weight_m
 
 
-def dgs_electrons_per_s(temperature_k: float | FloatArray, optics: Optics, photometry: Photometry) -> FloatArray:
+def dgs_electrons_per_s(
+    temperature_k: float | FloatArray, optics: Optics, photometry: Photometry
+) -> FloatArray:
     """Electron rate of a V = 0 black body by direct integration (thesis eq. 3.1); shape of
     `temperature_k`.
     """
     wavelength_nm, response = electron_response(optics)
     temperature_k = np.asarray(temperature_k, dtype=np.float64)
     exitance = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k[..., None])
-    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(temperature_k, photometry.weighting)
+    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(
+        temperature_k, photometry.weighting
+    )
     return np.asarray(optics.area_m2 * dilution * (exitance @ response))
 
 
-def zodiacal_electrons_per_s_arcsec2(v_mag_arcsec2: float, optics: Optics, photometry: Photometry) -> float:
+def zodiacal_electrons_per_s_arcsec2(
+    v_mag_arcsec2: float, optics: Optics, photometry: Photometry
+) -> float:
     """Electron rate of zodiacal light per square arcsecond of sky: sunlight of that V surface
     brightness.
 
     Zodiacal light is a little redder than the Sun: the WFC3 handbook's spectrum gives 5 % more
     photons from 330 to 1100 nm.
     """
-    return float(flux_ratio(v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry))
+    return float(
+        flux_ratio(v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry)
+    )
 
 
 def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
@@ -197,8 +216,12 @@ def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
     width_m = (high_nm - low_nm) * 1e-9
     mean_qe = optics.quantum_efficiency(wavelength_nm) @ weight_m / width_m
     mean_transmission = optics.transmission(wavelength_nm) @ weight_m / width_m
-    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, photometry.weighting)
-    irradiance_w_m2 = dilution * (blackbody_exitance_w_m2_m(wavelength_nm, REFERENCE_TEMPERATURE_K) @ weight_m)
+    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(
+        REFERENCE_TEMPERATURE_K, photometry.weighting
+    )
+    irradiance_w_m2 = dilution * (
+        blackbody_exitance_w_m2_m(wavelength_nm, REFERENCE_TEMPERATURE_K) @ weight_m
+    )
     mean_wavelength_m = (low_nm + high_nm) / 2 * 1e-9
     photons_per_j = mean_wavelength_m / (PLANCK_J_S * LIGHT_M_S)
     return float(optics.area_m2 * irradiance_w_m2 * photons_per_j * mean_qe * mean_transmission)
@@ -230,9 +253,13 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
     low_k, high_k = TABLE_RANGE_K
     domain = [1.0 / high_k, 1.0 / low_k]
     if not (dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, optics, photometry) > 0):
-        raise InputError("tracker: quantum efficiency times transmission is zero everywhere; no star gives an electron")
+        raise InputError(
+            "tracker: quantum efficiency times transmission is zero everywhere; no star gives an electron"
+        )
     if model == "ags":
-        return RateTable(Chebyshev([np.log(ags_electrons_per_s(optics, photometry))], domain=domain))
+        return RateTable(
+            Chebyshev([np.log(ags_electrons_per_s(optics, photometry))], domain=domain)
+        )
 
     def log_rate(inverse_k: FloatArray) -> FloatArray:
         with np.errstate(divide="ignore"):
@@ -240,7 +267,9 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
 
     table = Chebyshev.interpolate(log_rate, TABLE_DEGREE, domain=domain)
     if not np.isfinite(table.coef).all():
-        raise InputError("tracker: detects no light of the coolest stars at all; give a quantum efficiency that reaches 400 nm")
+        raise InputError(
+            "tracker: detects no light of the coolest stars at all; give a quantum efficiency that reaches 400 nm"
+        )
     return RateTable(table)
 
 
@@ -286,7 +315,9 @@ class PicklesTable:
     bv_range_mag: tuple[float, float]
     over_bv: Spline
 
-    def electrons_per_s(self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray) -> FloatArray:
+    def electrons_per_s(
+        self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray
+    ) -> FloatArray:
         """Electron rates of stars, shape (n,); B-V alone where V-I is NaN; a colour beyond the
         library counts as its end.
         """
@@ -296,7 +327,9 @@ class PicklesTable:
             vi, bv = vi_mag[part], bv_mag[part]
             known = np.isfinite(vi)
             block = log_rate[part]
-            block[known] = self.over_vi(vi[known]) + self.per_bv * np.clip(bv[known], *self.bv_range_mag)
+            block[known] = self.over_vi(vi[known]) + self.per_bv * np.clip(
+                bv[known], *self.bv_range_mag
+            )
             block[~known] = self.over_bv(bv[~known])
         return np.asarray(flux_ratio(v_mag) * np.exp(log_rate))
 
@@ -323,7 +356,9 @@ def tabulate_pickles(optics: Optics, photometry: Photometry) -> PicklesTable:
     library star.
     """
     library = load_library()
-    return fit_table(library.bv_mag, library.vi_mag, library_electrons_per_s(library, optics, photometry))
+    return fit_table(
+        library.bv_mag, library.vi_mag, library_electrons_per_s(library, optics, photometry)
+    )
 
 
 def library_electrons_per_s(library: Library, optics: Optics, photometry: Photometry) -> FloatArray:
@@ -340,9 +375,15 @@ def library_electrons_per_s(library: Library, optics: Optics, photometry: Photom
     dilution = reference_mean_w_m2_m(photometry) / band_mean(
         library, load_curve("johnson-v", "johnson-v"), photometry.weighting
     )
-    rate = optics.area_m2 * dilution * (library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response))
+    rate = (
+        optics.area_m2
+        * dilution
+        * (library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response))
+    )
     if not (rate > 0).all():
-        raise InputError('tracker: a star of the Pickles library gives no electron; write spectrum = "blackbody"')
+        raise InputError(
+            'tracker: a star of the Pickles library gives no electron; write spectrum = "blackbody"'
+        )
     return np.asarray(rate)
 
 
@@ -354,7 +395,9 @@ def band_mean(library: Library, passband: Curve, weighting: Weighting = "energy"
     response = passband(nodes_nm) * weight_m
     if weighting == "photon":
         response = response * nodes_nm
-    return np.asarray(library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response) / response.sum())
+    return np.asarray(
+        library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response) / response.sum()
+    )
 
 
 def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArray) -> PicklesTable:
@@ -366,8 +409,16 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
     *over_vi, per_bv = np.linalg.lstsq(design, log_rate)[0]
     plain = vi_mag < MAX_BV_FIT_VI_MAG
     bv_knots_mag = _knots_at_equal_shares(bv_mag[plain], BV_KNOT_COUNT)
-    over_bv = np.array(np.linalg.lstsq(natural_basis(bv_mag[plain], bv_knots_mag), log_rate[plain])[0], dtype=np.float64)
-    return PicklesTable(Spline(vi_knots_mag, np.array(over_vi)), float(per_bv), bv_range_mag, Spline(bv_knots_mag, over_bv))
+    over_bv = np.array(
+        np.linalg.lstsq(natural_basis(bv_mag[plain], bv_knots_mag), log_rate[plain])[0],
+        dtype=np.float64,
+    )
+    return PicklesTable(
+        Spline(vi_knots_mag, np.array(over_vi)),
+        float(per_bv),
+        bv_range_mag,
+        Spline(bv_knots_mag, over_bv),
+    )
 
 
 def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
@@ -384,7 +435,9 @@ def _knots_at_equal_shares(colour_mag: FloatArray, count: int) -> FloatArray:
     """Quantiles, bit for bit NumPy's, whose own import `numpy.ma`: that takes 10 ms."""
     whole, part = np.divmod(np.linspace(0, 1, count) * (len(colour_mag) - 1), 1)
     low, high = np.sort(colour_mag)[[whole.astype(np.intp), np.ceil(whole + part).astype(np.intp)]]
-    return np.asarray(np.where(part < 0.5, low + (high - low) * part, high - (high - low) * (1 - part)))
+    return np.asarray(
+        np.where(part < 0.5, low + (high - low) * part, high - (high - low) * (1 - part))
+    )
 
 
 def _knots(library: Library) -> Curve:

@@ -103,7 +103,9 @@ class PropagatedPlaces(NamedTuple):
     covariance: FloatArray
 
 
-def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear: float) -> PropagatedPlaces:
+def motion_at(
+    catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear: float
+) -> PropagatedPlaces:
     """The stars' places, motions and their errors at `epoch_jyear`; radial velocity zero (ESA
     SP-1200 vol. 1, 1.5.5).
 
@@ -132,17 +134,27 @@ def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear:
         jacobian[:, 2, k], jacobian[:, 3, k] = d_ra, d_dec
     covariance = jacobian @ _covariance(facts) @ jacobian.transpose(0, 2, 1)
     ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, flat))
-    return PropagatedPlaces(ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance)
+    return PropagatedPlaces(
+        ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance
+    )
 
 
-def _moved(start: npt.NDArray[np.complex128], years: FloatArray) -> tuple[npt.NDArray[np.complex128], ...]:
+def _moved(
+    start: npt.NDArray[np.complex128], years: FloatArray
+) -> tuple[npt.NDArray[np.complex128], ...]:
     """The unit vector (3, n) and the proper motions (n,) after `years`, of ra, dec and motions
     (4, n), radians.
     """
     ra, dec, east, north = start
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
     u0 = np.stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))
-    motion = np.stack((-east * sin_ra - north * sin_dec * cos_ra, east * cos_ra - north * sin_dec * sin_ra, north * cos_dec))
+    motion = np.stack(
+        (
+            -east * sin_ra - north * sin_dec * cos_ra,
+            east * cos_ra - north * sin_dec * sin_ra,
+            north * cos_dec,
+        )
+    )
     squared = east**2 + north**2
     shrink = 1 / np.sqrt(1 + squared * years**2)
     u = (u0 + motion * years) * shrink
@@ -153,12 +165,24 @@ def _moved(start: npt.NDArray[np.complex128], years: FloatArray) -> tuple[npt.ND
 
 def _covariance(facts: dict[str, npt.NDArray[Any]]) -> FloatArray:
     """The covariance (n, 4, 4) of the catalogue's own epoch."""
-    sigma = np.stack([facts[name] for name in ("sigma_ra_mas", "sigma_dec_mas", "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr")])
+    sigma = np.stack(
+        [
+            facts[name]
+            for name in (
+                "sigma_ra_mas",
+                "sigma_dec_mas",
+                "sigma_pm_ra_mas_yr",
+                "sigma_pm_dec_mas_yr",
+            )
+        ]
+    )
     covariance = np.empty((sigma.shape[1], 4, 4))
     for i, one in enumerate(MOTION):
         covariance[:, i, i] = sigma[i] ** 2
         for j in range(i + 1, 4):
-            covariance[:, i, j] = covariance[:, j, i] = sigma[i] * sigma[j] * facts[f"{one}_{MOTION[j]}_correlation"]
+            covariance[:, i, j] = covariance[:, j, i] = (
+                sigma[i] * sigma[j] * facts[f"{one}_{MOTION[j]}_correlation"]
+            )
     return covariance
 
 

@@ -95,10 +95,16 @@ def star_types(catalog: Catalog) -> FloatArray:
     """
     facts = facts_of(catalog.hip)
     kind = read_types(facts["spectral_type"])
-    parallax_mas = np.maximum(catalog.parallax_mas, MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"])
-    absolute_mag = catalog.v_mag - 10 + 5 * np.log10(np.where(parallax_mas > 0, parallax_mas, np.nan))
+    parallax_mas = np.maximum(
+        catalog.parallax_mas, MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"]
+    )
+    absolute_mag = (
+        catalog.v_mag - 10 + 5 * np.log10(np.where(parallax_mas > 0, parallax_mas, np.nan))
+    )
     dwarf = absolute_mag > np.interp(kind[:, 0], GIANT_SUBCLASS, GIANT_MAG)
-    by_mag = np.where(dwarf, CLASSES["V"], np.where(absolute_mag < SUPERGIANT_MAG, 1.0, CLASSES["III"]))
+    by_mag = np.where(
+        dwarf, CLASSES["V"], np.where(absolute_mag < SUPERGIANT_MAG, 1.0, CLASSES["III"])
+    )
     by_mag[np.isnan(absolute_mag)] = np.nan
     kind[:, 1] = np.where(np.isnan(kind[:, 1]), by_mag, kind[:, 1])
     return kind
@@ -144,7 +150,11 @@ class TypeTable:
     weight: FloatArray
 
     def electrons_per_s(
-        self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None = None
+        self,
+        v_mag: FloatArray,
+        bv_mag: FloatArray,
+        vi_mag: FloatArray,
+        kind: FloatArray | None = None,
     ) -> FloatArray:
         """Electron rates of stars (n,) of `kind` (n, 2) as `star_types` gives it.
 
@@ -159,8 +169,12 @@ class TypeTable:
         vi_mag = np.clip(vi_mag[known], self.spectra[:, 2].min(), self.spectra[:, 2].max())
         for begin in range(0, len(known), BLOCK_STARS):
             part = slice(begin, begin + BLOCK_STARS)
-            departure = np.einsum("nk,nk->n", weight[which[part]], _alike_colours(vi_mag[part], self.spectra[:, 2]))
-            rate[known[part]] = flux_ratio(v_mag[known[part]]) * np.exp(departure + _trend(vi_mag[part]) @ self.trend)
+            departure = np.einsum(
+                "nk,nk->n", weight[which[part]], _alike_colours(vi_mag[part], self.spectra[:, 2])
+            )
+            rate[known[part]] = flux_ratio(v_mag[known[part]]) * np.exp(
+                departure + _trend(vi_mag[part]) @ self.trend
+            )
         return rate
 
 
@@ -168,14 +182,21 @@ def _alike_types(kind: FloatArray, other: FloatArray) -> FloatArray:
     """The part of the covariance of ln(rate) that types have, between (n, 2 or more) and (k, 2
     or more), shape (n, k).
     """
-    late = [1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)) for part in (kind, other)]
-    apart = [(kind[:, column, None] - other[:, column]) / length for column, length in enumerate(TYPE_LENGTHS)]
+    late = [
+        1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)) for part in (kind, other)
+    ]
+    apart = [
+        (kind[:, column, None] - other[:, column]) / length
+        for column, length in enumerate(TYPE_LENGTHS)
+    ]
     return np.asarray(late[0][:, None] * late[1] * np.exp(-(apart[0] ** 2 + apart[1] ** 2) / 2))
 
 
 def _alike_colours(vi_mag: FloatArray, other_mag: FloatArray) -> FloatArray:
     """The part that V-I (n,) and (k,) have, shape (n, k)."""
-    return np.asarray(np.exp(-(((vi_mag[:, None] - other_mag) / COLOUR_LENGTH_MAG) ** 2) / 2) + ANY_COLOUR)
+    return np.asarray(
+        np.exp(-(((vi_mag[:, None] - other_mag) / COLOUR_LENGTH_MAG) ** 2) / 2) + ANY_COLOUR
+    )
 
 
 def _trend(vi_mag: FloatArray) -> FloatArray:
@@ -199,7 +220,9 @@ def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) 
     covariance[np.diag_indices(len(rate))] += NOISE**2
     trend = _trend(library.vi_mag)
     # The departures' weights are at right angles to the trend.
-    system = np.block([[covariance, trend], [trend.T, np.zeros((TREND_DEGREE + 1, TREND_DEGREE + 1))]])
+    system = np.block(
+        [[covariance, trend], [trend.T, np.zeros((TREND_DEGREE + 1, TREND_DEGREE + 1))]]
+    )
     found = np.linalg.solve(system, np.concatenate([np.log(rate), np.zeros(TREND_DEGREE + 1)]))
     weight, coefficients = found[: len(rate)], found[len(rate) :]
     by_colour = electrons.fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
@@ -220,6 +243,8 @@ def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
     library = electrons.load_library()
     nm = library.wavelength_nm
     detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
-    shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)
+    shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(
+        detected.sum(axis=1), np.finfo(np.float64).tiny
+    )
     classes = np.array([kind[0] for kind in library.spectral_type])
     return {one: float(shares[classes == one].mean()) for one in LETTERS}

@@ -115,7 +115,12 @@ def constant_curve(value: float) -> Curve:
     return Curve(np.empty(0), np.array([value]))
 
 
-def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in: tuple[str, ...] = BUILT_IN_CURVES) -> Curve:
+def load_curve(
+    source: str | float,
+    what: str,
+    folder: Path = DATA_DIR,
+    built_in: tuple[str, ...] = BUILT_IN_CURVES,
+) -> Curve:
     """A curve from a built-in name, a CSV path (wavelength_nm,value; relative to `folder`) or a
     number.
 
@@ -124,7 +129,9 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in
     """
     if isinstance(source, int | float):
         if not MIN_CONSTANT <= source <= 1.0:
-            raise InputError(f"{what} = {shortened(source)}: write a number from {MIN_CONSTANT:g} to 1")
+            raise InputError(
+                f"{what} = {shortened(source)}: write a number from {MIN_CONSTANT:g} to 1"
+            )
         return constant_curve(float(source))
     if source in built_in:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
@@ -177,7 +184,10 @@ def _curve_columns(table: TextTable, highest: float) -> tuple[Chosen, Chosen]:
     if wavelength is None and not (table.header and not table.commented):
         # A comment that names no wavelength is no header.
         if len(table.columns) != 2:
-            raise table.refusal(table.header_line, f"{len(table.columns)} columns, and no header that says which is which")
+            raise table.refusal(
+                table.header_line,
+                f"{len(table.columns)} columns, and no header that says which is which",
+            )
         table.columns = [Column("", "")] * 2
         return Chosen(0, has_unit=False), Chosen(1)
     if wavelength is None:
@@ -198,16 +208,22 @@ def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> flo
     span = f"wavelengths from {low:g} to {high:g}"
     if not wavelength.has_unit:
         if unit is None:
-            raise InputError(f"{table.path}: {span} without a unit; write it in the header: {', '.join(UNIT_HEADERS.values())}")
+            raise InputError(
+                f"{table.path}: {span} without a unit; write it in the header: {', '.join(UNIT_HEADERS.values())}"
+            )
         if unit != "nm":
-            table.notices.append(f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they are nm")
+            table.notices.append(
+                f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they are nm"
+            )
         size = factor(unit, "nm")
         return 1.0 if size is None else float(size)
     if wavelength.factor is None:
         refuse_other_units(table.path, low, high)
     if high < MIN_STATED_NM:
         stated = table.columns[wavelength.place].header
-        raise InputError(f"{table.path}: {span} nm by its column {stated}, which no tracker sees; check its unit")
+        raise InputError(
+            f"{table.path}: {span} nm by its column {stated}, which no tracker sees; check its unit"
+        )
     return 1.0
 
 
@@ -233,22 +249,32 @@ def _unit_by_range(low: float, high: float) -> str | None:
 def _check_curve(curve: Curve, path: Path, highest: float) -> None:
     wavelength_nm, value = curve.wavelength_nm, curve.value
     if len(wavelength_nm) < 2:
-        raise InputError(f"{path}: {len(wavelength_nm)} rows; write at least two rows wavelength_nm,value")
+        raise InputError(
+            f"{path}: {len(wavelength_nm)} rows; write at least two rows wavelength_nm,value"
+        )
     if not (np.isfinite(wavelength_nm).all() and np.isfinite(value).all()):
         raise InputError(f"{path}: a wavelength or a value is not finite; write numbers")
     if not (np.diff(wavelength_nm) > 0).all() or wavelength_nm[0] <= 0:
-        raise InputError(f"{path}: wavelengths do not rise from row to row; sort them, each once, in nm")
+        raise InputError(
+            f"{path}: wavelengths do not rise from row to row; sort them, each once, in nm"
+        )
     if len(wavelength_nm) > MAX_CURVE_ROWS:
-        raise InputError(f"{path}: {len(wavelength_nm)} rows; at most {MAX_CURVE_ROWS} are read: remove some")
+        raise InputError(
+            f"{path}: {len(wavelength_nm)} rows; at most {MAX_CURVE_ROWS} are read: remove some"
+        )
     if wavelength_nm[0] < RANGE_NM[0] or wavelength_nm[-1] > RANGE_NM[1]:
         ends = f"{wavelength_nm[0]:g} to {wavelength_nm[-1]:g} nm"
-        raise InputError(f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm")
+        raise InputError(
+            f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm"
+        )
     if value.min() < 0 or value.max() > highest:
         what = "fractions from 0 to 1" if highest == 1 else f"numbers from 0 to {highest:g}"
         raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write {what}")
 
 
-def blackbody_exitance_w_m2_m(wavelength_nm: FloatArray, temperature_k: float | FloatArray) -> FloatArray:
+def blackbody_exitance_w_m2_m(
+    wavelength_nm: FloatArray, temperature_k: float | FloatArray
+) -> FloatArray:
     """pi B(lambda, T), W per m2 and m of wavelength (thesis eq. 3.3, 3.4); the shapes broadcast.
 
     Written with exp(-x), so that a small lambda T gives 0 instead of an overflow.
@@ -295,11 +321,16 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     knots = np.sort(np.concatenate(ranged))
     knots = knots[(knots >= low) & (knots <= high) & (np.diff(knots, prepend=-np.inf) > 0)]
     if len(knots) < 2:
-        raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
+        raise InputError(
+            "the quantum efficiency and the transmission share no wavelength; check that both are in nm"
+        )
     pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
     # number within its interval, from 0
     piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    edges = np.append(np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces), knots[-1])
+    edges = np.append(
+        np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces),
+        knots[-1],
+    )
     half = np.diff(edges)[:, None] / 2
     wavelength_nm = (edges[:-1, None] + half * (1 + NODES)).ravel()
     return wavelength_nm, (half * WEIGHTS).ravel() * 1e-9

@@ -36,7 +36,16 @@ from hilstar.basics.files import make_directory, whole_file
 from hilstar.basics.reading import open_regular
 from hilstar.basics.units import plain_unit
 from hilstar.sky import table_reader
-from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
+from hilstar.sky.catalog import (
+    PACKAGED_CATALOG,
+    RANGES,
+    TYC_REGION,
+    TYCHO,
+    Catalog,
+    column_names,
+    load_catalog,
+    plain_catalog,
+)
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
@@ -46,7 +55,13 @@ EPOCHS_JYEAR = (1800.0, 2200.0)
 # Right ascensions below this may be hours, and below 2 pi radians: without a unit they are refused,
 # whatever the rest says.
 HOURS_A_TURN, RAD_A_TURN = 24.0, 2 * math.pi
-TURNS = {"h": HOURS_A_TURN, "hr": HOURS_A_TURN, "hrs": HOURS_A_TURN, "hou": HOURS_A_TURN, "rad": RAD_A_TURN}
+TURNS = {
+    "h": HOURS_A_TURN,
+    "hr": HOURS_A_TURN,
+    "hrs": HOURS_A_TURN,
+    "hou": HOURS_A_TURN,
+    "rad": RAD_A_TURN,
+}
 ROUNDED = 1e-6  # of a turn in radians, as written
 # Half of Hipparcos' stars move by more than 23 mas a year, of its brightest 900 by more than 60. In
 # arcsec a year that is 0.06.
@@ -93,7 +108,12 @@ class Assembled:
     doubts: tuple[str, ...] = ()
 
 
-def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
+def assemble(
+    path: Path,
+    table: table_reader.RawTable,
+    stated_epoch_jyear: float | None,
+    compared: bool = False,
+) -> Assembled:
     """The stars of a table, whose epoch matters where they move or are to be `compared` with stars
     that do.
 
@@ -131,8 +151,14 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
     if _repeats(identifier[kept]):
         columns.notices.append(f"{_repeats(identifier[kept])} of its stars have {NO_IDENTIFIER}")
         designation, identifier = columns.row_numbers()
-    figures |= {"epoch_jyear": epoch, "identifier": identifier, "hip": _once(columns.hip(), kept, v_mag)}
-    catalog = plain_catalog(designation, len(kept), {name: values[kept] for name, values in figures.items()})
+    figures |= {
+        "epoch_jyear": epoch,
+        "identifier": identifier,
+        "hip": _once(columns.hip(), kept, v_mag),
+    }
+    catalog = plain_catalog(
+        designation, len(kept), {name: values[kept] for name, values in figures.items()}
+    )
     rest = "" if kept.all() else f"; not used: {_reasons(reason)}"
     line = f"{path.name}: {len(catalog)} stars of {len(kept)} rows, {words}; {epoch_words}{rest}"
     doubts = tuple(f"{path.name}: {notice}" for notice in columns.notices)
@@ -159,7 +185,10 @@ class _Columns:
     @property
     def is_gaia(self) -> bool:
         """Whether the table has the names of Gaia's archive, which say the units."""
-        return all(name in self.layout.role for name in ("gaia", "g_mag")) and self.pair[0].lower() == "ra"
+        return (
+            all(name in self.layout.role for name in ("gaia", "g_mag"))
+            and self.pair[0].lower() == "ra"
+        )
 
     def has_unit(self, column: str) -> bool:
         return bool((self.table.unit.get(column) or "").strip())
@@ -216,7 +245,9 @@ class _Columns:
             return ""
         median = f"half of its stars move by less than {np.median(moving):.3g}"
         advice = f"{UNIT_ADVICE}: {given[0]}_arcsec_yr or {given[0]}_mas_yr"
-        return f"column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}"
+        return (
+            f"column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}"
+        )
 
     def role(self, role: str, blank: float) -> FloatArray:
         if role not in self.layout.role:
@@ -242,11 +273,15 @@ class _Columns:
         """The magnitudes of each row by the first conversion that its columns allow."""
         v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
         words: list[str] = []
-        for route in (route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes):
+        for route in (
+            route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes
+        ):
             blank = ~(np.isfinite(v) & np.isfinite(bv))
             if not blank.any():
                 break
-            new_v, new_bv, new_vi = route.convert(*(self.role(role, np.nan)[blank] for role in route.roles))
+            new_v, new_bv, new_vi = route.convert(
+                *(self.role(role, np.nan)[blank] for role in route.roles)
+            )
             if np.isfinite(new_v).any() and route.words not in words:
                 words.append(route.words)
             v[blank], bv[blank], vi[blank] = new_v, new_bv, new_vi
@@ -263,7 +298,9 @@ class _Columns:
         if not all(role in self.layout.role for role in roles):
             return {}
         maximum, period, amplitude = (self.role(role, np.nan) for role in roles)
-        known = np.isfinite(maximum) & (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
+        known = (
+            np.isfinite(maximum) & (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
+        )
         return {
             "variable": np.where(known, b"P", b"").astype("S1"),
             "range_mag": np.where(known, 2 * amplitude, np.nan).astype(np.float32),
@@ -282,20 +319,26 @@ class _Columns:
                 columns[role["gaia"]], dtype=np.int64
             )
         if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
-            region, number, part = (np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3"))
+            region, number, part = (
+                np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3")
+            )
             return TYCHO, region * TYC_REGION + number * 10 + part
         return self.row_numbers()
 
     def row_numbers(self) -> tuple[str, npt.NDArray[np.int64]]:
         """The designation and the number of each row, from 1."""
-        return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
+        return f"{self.path.stem[:MAX_STEM]} row", np.arange(
+            1, self.table.row_count + 1, dtype=np.int64
+        )
 
     def hip(self) -> npt.NDArray[np.int64]:
         if "hip" not in self.layout.role:
             return np.zeros(self.table.row_count, dtype=np.int64)
         return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
 
-    def epoch(self, stated_jyear: float | None, dated: bool, designation: str) -> tuple[FloatArray, str]:
+    def epoch(
+        self, stated_jyear: float | None, dated: bool, designation: str
+    ) -> tuple[FloatArray, str]:
         """The epoch of each place, Julian years, and where it comes from. Raises InputError
         where it has to be stated.
         """
@@ -303,22 +346,36 @@ class _Columns:
         if known is None and designation == "Gaia DR3":
             known = GAIA_DR3_JYEAR
         if stated_jyear is not None:
-            return np.full(self.table.row_count, stated_jyear), f"places of J{stated_jyear:g} as stated"
+            return np.full(
+                self.table.row_count, stated_jyear
+            ), f"places of J{stated_jyear:g} as stated"
         if "epoch_jyear" in self.layout.role:
             values = self.role("epoch_jyear", np.nan)
             if not ((values > EPOCHS_JYEAR[0]) & (values < EPOCHS_JYEAR[1])).all():
-                raise InputError(f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year; {_STATE_EPOCH}")
+                raise InputError(
+                    f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year; {_STATE_EPOCH}"
+                )
             return values, f"places of J{float(np.median(values)):g} by its column"
         if known is not None:
-            return np.full(self.table.row_count, known), f"places of J{known:g} by its columns' names"
+            return np.full(
+                self.table.row_count, known
+            ), f"places of J{known:g} by its columns' names"
         if dated:
-            raise InputError(f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}")
+            raise InputError(
+                f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}"
+            )
         return np.full(self.table.row_count, GAIA_DR3_JYEAR), "places without motion"
 
 
 MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
 _STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
-_REASONS = ("", "without a place", "without a magnitude and a colour", "beyond what a star has", "repeated")
+_REASONS = (
+    "",
+    "without a place",
+    "without a magnitude and a colour",
+    "beyond what a star has",
+    "repeated",
+)
 
 
 def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
@@ -348,7 +405,9 @@ def _reasons(reason: npt.NDArray[np.int8]) -> str:
     return ", ".join(f"{counts[k]} {_REASONS[k]}" for k in range(1, len(_REASONS)) if counts[k])
 
 
-def _once(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatArray) -> npt.NDArray[np.int32]:
+def _once(
+    hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatArray
+) -> npt.NDArray[np.int32]:
     """HIP numbers of which each stands once, at the brightest star that has it."""
     usable = np.where(kept & (hip > 0) & (hip < 2**31), hip, 0)
     rows = np.flatnonzero(usable)
@@ -388,32 +447,54 @@ def join(hipparcos: Catalog, table: Catalog) -> Joined:
     held = _held(hipparcos, table, owner, arcsec)
     difference = _differences(hipparcos, table, owner, held)
     added = table.taken(~held)
-    joined: dict[str, Any] = {name: np.concatenate([getattr(hipparcos, name), getattr(added, name)]) for name in column_names()}
-    catalog = replace(hipparcos, **joined, designation=table.designation, rows_read=hipparcos.rows_read + table.rows_read)
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(hipparcos, name), getattr(added, name)])
+        for name in column_names()
+    }
+    catalog = replace(
+        hipparcos,
+        **joined,
+        designation=table.designation,
+        rows_read=hipparcos.rows_read + table.rows_read,
+    )
     line = f"{difference.words}; {len(added)} stars added to Hipparcos' {len(hipparcos)}"
     return Joined(catalog, line, _doubt(table, held, difference))
 
 
-def _nearest_owner(hipparcos: Catalog, table: Catalog, epoch_jyear: float) -> tuple[IntArray, FloatArray]:
+def _nearest_owner(
+    hipparcos: Catalog, table: Catalog, epoch_jyear: float
+) -> tuple[IntArray, FloatArray]:
     """For each star of the table (n,) Hipparcos' nearest star and its distance, arcsec; infinite
     beyond any pair's reach.
     """
     from scipy.spatial import cKDTree
 
-    reach = max(FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC)
+    reach = max(
+        FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC
+    )
     tree = cKDTree(unit_vectors_icrs(hipparcos, epoch_jyear))
-    chord, owner = tree.query(unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC)
-    return np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1), np.asarray(chord) / RAD_PER_ARCSEC
+    chord, owner = tree.query(
+        unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC
+    )
+    return np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1), np.asarray(
+        chord
+    ) / RAD_PER_ARCSEC
 
 
-def _held(hipparcos: Catalog, table: Catalog, owner: IntArray, arcsec: FloatArray) -> npt.NDArray[np.bool_]:
+def _held(
+    hipparcos: Catalog, table: Catalog, owner: IntArray, arcsec: FloatArray
+) -> npt.NDArray[np.bool_]:
     """The stars of the table (n,) whose light is in their owner's magnitude."""
     fainter_mag = table.v_mag - hipparcos.v_mag[owner]
     separation = np.nan_to_num(hipparcos.separation_arcsec[owner].astype(np.float64), nan=-np.inf)
-    held = (arcsec <= SAME_ARCSEC) | ((arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG))
+    held = (arcsec <= SAME_ARCSEC) | (
+        (arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG)
+    )
     alone = np.ones(len(hipparcos), dtype=np.bool_)
     alone[owner[held]] = False
-    return np.asarray(held | (alone[owner] & (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG)))
+    return np.asarray(
+        held | (alone[owner] & (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +504,9 @@ class _Differences:
     words: str
 
 
-def _differences(hipparcos: Catalog, table: Catalog, owner: IntArray, held: npt.NDArray[np.bool_]) -> _Differences:
+def _differences(
+    hipparcos: Catalog, table: Catalog, owner: IntArray, held: npt.NDArray[np.bool_]
+) -> _Differences:
     """Differences between the table's V and B-V and Hipparcos', from single stars in both that
     do not vary.
     """
@@ -502,7 +585,10 @@ def kept(path: Path) -> Kept | None:
         with open_regular(path, "", MAX_STORED_BYTES) as file:
             status = os.fstat(file.fileno())
             # Nothing in it is packed, so that it cannot unfold into more than the file is long.
-            plain = all(entry.compress_type == zipfile.ZIP_STORED for entry in zipfile.ZipFile(file).infolist())
+            plain = all(
+                entry.compress_type == zipfile.ZIP_STORED
+                for entry in zipfile.ZipFile(file).infolist()
+            )
             if status.st_uid != os.getuid() or not plain:
                 return None
             file.seek(0)
@@ -510,7 +596,12 @@ def kept(path: Path) -> Kept | None:
                 columns = {name: packed[name] for name in column_names()}
                 about = json.loads(str(packed["about"]))
         notes = tuple(map(str, about["notes"]))
-        catalog = Catalog(**columns, designation=str(about["designation"]), rows_read=int(about["rows_read"]), notes=notes)
+        catalog = Catalog(
+            **columns,
+            designation=str(about["designation"]),
+            rows_read=int(about["rows_read"]),
+            notes=notes,
+        )
         found = Kept(catalog, tuple(map(str, about["doubts"])))
     except Exception:  # whatever a damaged file raises in the layers of zipfile, NumPy and json
         return None
@@ -521,11 +612,19 @@ def _is_sound(catalog: Catalog) -> bool:
     """Whether each column has its type, one length, and figures that a star can have."""
     for name in column_names():
         values = getattr(catalog, name)
-        if values.shape != catalog.v_mag.shape or values.ndim != 1 or values.dtype != np.dtype(DTYPES.get(name, "f8")):
+        if (
+            values.shape != catalog.v_mag.shape
+            or values.ndim != 1
+            or values.dtype != np.dtype(DTYPES.get(name, "f8"))
+        ):
             return False
         if name in RANGES:
             low, high = RANGES[name]
-            bounds = (values.min(initial=high), values.max(initial=low)) if name in ALWAYS_KNOWN else (low, high)
+            bounds = (
+                (values.min(initial=high), values.max(initial=low))
+                if name in ALWAYS_KNOWN
+                else (low, high)
+            )
             if not (low <= bounds[0] and bounds[1] <= high):  # NaN too
                 return False
     return bool(np.isfinite(catalog.epoch_jyear).all())
@@ -542,7 +641,11 @@ def keep(path: Path, made: Kept) -> None:
         make_directory(path.parent)
         with whole_file(path) as file:
             np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **columns)
-        by_age = sorted(path.parent.glob("catalogue-*.npz"), key=lambda file: file.stat().st_mtime_ns, reverse=True)
+        by_age = sorted(
+            path.parent.glob("catalogue-*.npz"),
+            key=lambda file: file.stat().st_mtime_ns,
+            reverse=True,
+        )
         for old in by_age[KEPT_FILES:]:
             old.unlink(missing_ok=True)
 
@@ -570,9 +673,13 @@ def choose_catalog(choice: TableChoice) -> Catalog:
     packaged = str(choice.source) == "hipparcos"
     if packaged or _is_hip_main(Path(choice.source)):
         if choice.with_hipparcos:
-            raise InputError("[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky] catalogue")
+            raise InputError(
+                "[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky] catalogue"
+            )
         if choice.epoch_jyear is not None:
-            raise InputError("[sky] catalogue_epoch_jyear is for a table; Hipparcos has its own, J1991.25")
+            raise InputError(
+                "[sky] catalogue_epoch_jyear is for a table; Hipparcos has its own, J1991.25"
+            )
         return load_catalog(choice.source, choice.faintest_v_mag)
     path = Path(choice.source)
     made_of = (
@@ -607,10 +714,14 @@ def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
     """The same stars, neighbours together: a bench that sorts them by cell then reads each array
     from its start to its end.
     """
-    return replace(catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes)
+    return replace(
+        catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes
+    )
 
 
-def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+def table_facts(
+    choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArray[Any]]
+) -> dict[str, npt.NDArray[Any]]:
     """Hipparcos' `facts` (n,) of the `stars` of a choice, and in their place what its table says of
     its own stars.
 
@@ -619,15 +730,20 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
     if str(choice.source) == "hipparcos" or _is_hip_main(Path(choice.source)):
         return facts
     columns = _Columns(
-        Path(choice.source), table_reader.read_table(Path(choice.source), table_reader.NAMES | table_reader.ERROR_NAMES)
+        Path(choice.source),
+        table_reader.read_table(Path(choice.source), table_reader.NAMES | table_reader.ERROR_NAMES),
     )
     if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
     by_row = columns.row_numbers()
     identifier = by_row[1] if stars.designation == by_row[0] else columns.identifiers()[1]
     order = np.argsort(identifier, kind="stable")
-    row = order[np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)]
-    own = (identifier[row] == stars.identifier) & ~(choice.with_hipparcos & (stars.hip == stars.identifier))
+    row = order[
+        np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)
+    ]
+    own = (identifier[row] == stars.identifier) & ~(
+        choice.with_hipparcos & (stars.hip == stars.identifier)
+    )
     found = dict(facts)
     for role in table_reader.ERROR_NAMES:
         name = columns.layout.role.get(role)

@@ -64,7 +64,9 @@ class AirAbove:
         w = b * tangent**2
         by = (a + w) * tangent / (1 + (a + 3 * w) / up**2)
         cosine = 1 - by**2 / 2
-        return np.asarray((cosine - by * z / r)[:, None] * level + (cosine * z + by * r)[:, None] * self.up)
+        return np.asarray(
+            (cosine - by * z / r)[:, None] * level + (cosine * z + by * r)[:, None] * self.up
+        )
 
     def lowest_rad(self, axis: FloatArray, radius_rad: float) -> float:
         """The lowest altitude within an angle of a direction (3,)."""
@@ -82,7 +84,11 @@ class AirAbove:
             return which
         up = self.altitude_rad(vectors[which]) > 0
         if lowest_rad < 0 and not up.all():
-            tell(self.told, "horizon", "[site]: the field reaches below the horizon; the stars there are not shown")
+            tell(
+                self.told,
+                "horizon",
+                "[site]: the field reaches below the horizon; the stars there are not shown",
+            )
         return which[up]
 
     def altitude_rad(self, vectors: FloatArray) -> FloatArray:
@@ -99,7 +105,16 @@ def tell(told: set[str], key: str, text: str, *values: object) -> None:
 
 BV_MAG = np.linspace(-0.4, 2.4, 57)  # for light that is no star's
 # Of each star, beside its vector.
-COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row", "colours", "primaries")
+COLUMNS = (
+    "hip",
+    "v_mag",
+    "bv_mag",
+    "temperature_k",
+    "electrons_per_s",
+    "row",
+    "colours",
+    "primaries",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +163,13 @@ class Stars:
         """The electron rates of the stars alone, without bodies."""
         return self.electrons_per_s[: len(self) - len(self.bodies)]
 
-    def near(self, axis: FloatArray, radius_rad: float, edges: FloatArray | None = None, reach_rad: float = 0.0) -> IntArray:
+    def near(
+        self,
+        axis: FloatArray,
+        radius_rad: float,
+        edges: FloatArray | None = None,
+        reach_rad: float = 0.0,
+    ) -> IntArray:
         """Every star seen within `radius_rad` and `reach_rad` of the unit vector `axis` (ICRS), and
         some more; rising.
 
@@ -159,8 +180,12 @@ class Stars:
             reach_rad += MAX_SHIFT * float(np.linalg.norm(self.velocity_km_s)) / LIGHT_KM_S
         if self.air is None:
             return self.grid.near(axis, radius_rad, edges, reach_rad)
-        found = self.grid.near(axis, radius_rad, edges, reach_rad + self.air.most_rad(axis, radius_rad + reach_rad))
-        return self.air.risen(found, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad))
+        found = self.grid.near(
+            axis, radius_rad, edges, reach_rad + self.air.most_rad(axis, radius_rad + reach_rad)
+        )
+        return self.air.risen(
+            found, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad)
+        )
 
     def directions(self, which: IntArray) -> FloatArray:
         """Where stars are seen: ICRS unit vectors (n, 3)."""
@@ -178,7 +203,10 @@ class Stars:
         the others.
         """
         first, named = len(self) - len(self.bodies), (self.hip[which] == 0).tolist()
-        return [self._name(i, first) if has_name else "" for i, has_name in zip(which.tolist(), named, strict=True)]
+        return [
+            self._name(i, first) if has_name else ""
+            for i, has_name in zip(which.tolist(), named, strict=True)
+        ]
 
     def _name(self, star: int, first_body: int) -> str:
         if star >= first_body:
@@ -187,10 +215,15 @@ class Stars:
 
     def designations(self, which: IntArray) -> list[int | str]:
         """The HIP numbers of stars (n,), and the names of those that have none."""
-        return [name or hip for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)]
+        return [
+            name or hip
+            for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)
+        ]
 
 
-def split_by_rate(stars: Stars, faintest_e_per_s: float, drive: FloatArray | float = 1.0) -> tuple[Stars, Stars]:
+def split_by_rate(
+    stars: Stars, faintest_e_per_s: float, drive: FloatArray | float = 1.0
+) -> tuple[Stars, Stars]:
     """The stars of at least `faintest_e_per_s` electrons per second times `drive`, and the fainter
     ones, each in own cells.
 
@@ -203,12 +236,18 @@ def split_by_rate(stars: Stars, faintest_e_per_s: float, drive: FloatArray | flo
 def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
     grid = cell_grid(stars.vectors[kept])
     order = np.flatnonzero(kept)[grid.order]
-    columns = {name: values[order] for name in COLUMNS if (values := getattr(stars, name)) is not None}
+    columns = {
+        name: values[order] for name in COLUMNS if (values := getattr(stars, name)) is not None
+    }
     vectors = np.asfortranarray(stars.vectors[order])
-    return replace(stars, **columns, vectors=vectors, grid=grid, velocity_km_s=None, bodies=(), air=None)
+    return replace(
+        stars, **columns, vectors=vectors, grid=grid, velocity_km_s=None, bodies=(), air=None
+    )
 
 
-def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray) -> Stars:
+def make_stars(
+    catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray
+) -> Stars:
     """Sort a catalogue's stars by cell; their electrons (n,), or by channel (n, channels)."""
     electrons_per_s, colours = total_and_colours(electrons_per_s)
     grid = cell_grid(vectors)
@@ -245,7 +284,11 @@ def total_and_colours(electrons_per_s: FloatArray) -> Flux:
 
 
 def with_bodies(
-    stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found: bool = True, colours: FloatArray | None = None
+    stars: Stars,
+    bodies: tuple[str, ...],
+    bv_mag: FloatArray,
+    found: bool = True,
+    colours: FloatArray | None = None,
 ) -> Stars:
     """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have
     no place or light yet.
@@ -270,8 +313,12 @@ def with_bodies(
             start=np.concatenate([grid.start, cells]),
             count=np.concatenate([grid.count, np.ones(len(cells), dtype=grid.count.dtype)]),
             centre=np.concatenate([grid.centre, np.full((len(cells), 3), np.nan)]),
-            cos_radius=np.concatenate([grid.cos_radius, np.full(len(cells), np.cos(BODY_CELL_RAD))]),
-            sin_radius=np.concatenate([grid.sin_radius, np.full(len(cells), np.sin(BODY_CELL_RAD))]),
+            cos_radius=np.concatenate(
+                [grid.cos_radius, np.full(len(cells), np.cos(BODY_CELL_RAD))]
+            ),
+            sin_radius=np.concatenate(
+                [grid.sin_radius, np.full(len(cells), np.sin(BODY_CELL_RAD))]
+            ),
         ),
         catalog=stars.catalog,
         row=np.concatenate([stars.row, np.full(count, -1)]),
@@ -297,7 +344,13 @@ class CellGrid:
     cos_radius: FloatArray
     sin_radius: FloatArray
 
-    def near(self, axis: FloatArray, radius_rad: float, edges: FloatArray | None = None, reach_rad: float = 0.0) -> IntArray:
+    def near(
+        self,
+        axis: FloatArray,
+        radius_rad: float,
+        edges: FloatArray | None = None,
+        reach_rad: float = 0.0,
+    ) -> IntArray:
         """Positions in `order`, rising, of every star within `radius_rad` and `reach_rad` of the
         unit vector `axis`, and more.
 
@@ -331,8 +384,13 @@ class CellGrid:
         end = start + self.count.take(cells)
         # neighbours in a band follow each other: few ranges
         gaps = (start[1:] != end[:-1]).nonzero()[0]
-        firsts, lasts = [int(start[0]), *start[gaps + 1].tolist()], [*end[gaps].tolist(), int(end[-1])]
-        return np.concatenate([np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)])
+        firsts, lasts = (
+            [int(start[0]), *start[gaps + 1].tolist()],
+            [*end[gaps].tolist(), int(end[-1])],
+        )
+        return np.concatenate(
+            [np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)]
+        )
 
 
 def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
@@ -342,12 +400,16 @@ def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
     bands = max(1, round(180.0 / cell_deg))
     down = np.arccos(np.clip(vectors[:, 2], -1, 1)) / np.pi * bands
     band = np.minimum(down.astype(np.intp), bands - 1)
-    per_band = np.maximum(1, np.round(360.0 / cell_deg * np.sin((np.arange(bands) + 0.5) * np.pi / bands))).astype(np.intp)
+    per_band = np.maximum(
+        1, np.round(360.0 / cell_deg * np.sin((np.arange(bands) + 0.5) * np.pi / bands))
+    ).astype(np.intp)
     along = np.arctan2(vectors[:, 1], vectors[:, 0]) / (2 * np.pi) % 1.0 * per_band[band]
     sector = np.minimum(along.astype(np.intp), per_band[band] - 1)
     cell = (np.cumsum(per_band) - per_band)[band] + sector
     # Few bits make NumPy's stable sort a radix sort, in a fifth of the time.
-    part = ((down - band) * PARTS).astype(np.uint8) * np.uint8(PARTS + 1) + ((along - sector) * PARTS).astype(np.uint8)
+    part = ((down - band) * PARTS).astype(np.uint8) * np.uint8(PARTS + 1) + (
+        (along - sector) * PARTS
+    ).astype(np.uint8)
     order = np.argsort(part, kind="stable")
     order = order[np.argsort(cell.astype(np.min_scalar_type(per_band.sum()))[order], kind="stable")]
     # Not `np.unique`, here and wherever a bench opens: its first call imports `numpy.ma`, which
@@ -388,7 +450,9 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     return u
 
 
-def aberrate(vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float] | FloatArray) -> FloatArray:
+def aberrate(
+    vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float] | FloatArray
+) -> FloatArray:
     """Directions (n, 3) as a moving observer sees them; the velocity is ICRS, barycentric, in km/s.
 
     The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps

@@ -25,7 +25,13 @@ from hilstar.sky.spectrum import (
 
 # F_lambda of magnitude 0, W/m2/m: Bessell, Castelli and Plez 1998, A&A 333, 231, table A2 (thesis
 # table 2.5).
-ZERO_W_M2_M = {"u": 4.175e-2, "b": 6.32e-2, "v": electrons.VEGA_V0_W_M2_M, "r": 2.177e-2, "i": 1.126e-2}
+ZERO_W_M2_M = {
+    "u": 4.175e-2,
+    "b": 6.32e-2,
+    "v": electrons.VEGA_V0_W_M2_M,
+    "r": 2.177e-2,
+    "i": 1.126e-2,
+}
 BANDS = ("u", "b", "r", "i", "g")
 VEGA_V_MAG = 0.03  # the V and the instrument magnitude of Vega (thesis 2.4.3)
 AB_0_W_M2_HZ = 3.631e-23  # Oke and Gunn 1983: 3631 Jy
@@ -49,14 +55,18 @@ def curve_mean(spectrum: Curve, passband: Curve, weighting: str = "energy") -> f
     return float(spectrum(nodes_nm) @ response / response.sum())
 
 
-def colours(spectrum: Spectrum, temperature: str, photometry: electrons.Photometry) -> dict[str, Colour]:
+def colours(
+    spectrum: Spectrum, temperature: str, photometry: electrons.Photometry
+) -> dict[str, Colour]:
     """The colours of BANDS and of "bolometric" (eq. 2.6, 2.7) against V, of the spectra that a
     bench gives its stars.
     """
     johnson_v, light = read_curve_csv(DATA_DIR / "johnson-v.csv"), vega()
     found: dict[str, Colour] = {}
     for band in BANDS:
-        passband = read_curve_csv(DATA_DIR / ("gaia-g.csv" if band == "g" else f"bessell-{band}.csv"))
+        passband = read_curve_csv(
+            DATA_DIR / ("gaia-g.csv" if band == "g" else f"bessell-{band}.csv")
+        )
         # Gaia's G counts photons, and Vega scaled to V = 0 has G = 0.
         weighting = "photon" if band == "g" else "energy"
         zero = curve_mean(light, passband, weighting) / curve_mean(light, johnson_v)
@@ -66,20 +76,35 @@ def colours(spectrum: Spectrum, temperature: str, photometry: electrons.Photomet
     return found
 
 
-def _band(spectrum: Spectrum, temperature: str, passband: Curve, weighting: str, zero: float) -> Colour:
+def _band(
+    spectrum: Spectrum, temperature: str, passband: Curve, weighting: str, zero: float
+) -> Colour:
     if spectrum != "blackbody":
-        means = electrons.band_mean(_spectra(spectrum), passband, "photon" if weighting == "photon" else "energy")
+        means = electrons.band_mean(
+            _spectra(spectrum), passband, "photon" if weighting == "photon" else "energy"
+        )
         return _by_library(spectrum, means / zero)
     nodes_nm, weight_m = integration_nodes(passband)
     response = passband(nodes_nm) * weight_m * (nodes_nm if weighting == "photon" else 1.0)
 
     def log_mean(inverse_k: FloatArray) -> FloatArray:
-        mean = blackbody_exitance_w_m2_m(nodes_nm, 1.0 / inverse_k[..., None]) @ response / response.sum()
-        return np.asarray(np.log(mean / electrons.v_band_mean_w_m2_m(1.0 / inverse_k, "energy") / zero), dtype=np.float64)
+        mean = (
+            blackbody_exitance_w_m2_m(nodes_nm, 1.0 / inverse_k[..., None])
+            @ response
+            / response.sum()
+        )
+        return np.asarray(
+            np.log(mean / electrons.v_band_mean_w_m2_m(1.0 / inverse_k, "energy") / zero),
+            dtype=np.float64,
+        )
 
     low_k, high_k = electrons.TABLE_RANGE_K
-    table = Chebyshev.interpolate(log_mean, electrons.TABLE_DEGREE, domain=[1.0 / high_k, 1.0 / low_k])
-    return lambda bv, _vi, _kind: magnitude(np.exp(table(1.0 / electrons.star_temperatures_k(bv, temperature))))
+    table = Chebyshev.interpolate(
+        log_mean, electrons.TABLE_DEGREE, domain=[1.0 / high_k, 1.0 / low_k]
+    )
+    return lambda bv, _vi, _kind: magnitude(
+        np.exp(table(1.0 / electrons.star_temperatures_k(bv, temperature)))
+    )
 
 
 def _spectra(spectrum: Spectrum) -> electrons.Library:
@@ -89,7 +114,9 @@ def _spectra(spectrum: Spectrum) -> electrons.Library:
 def _by_library(spectrum: Spectrum, relative: FloatArray) -> Colour:
     if spectrum == "mk":
         by_type = fit_types(relative)
-        return lambda bv, vi, kind: magnitude(by_type.electrons_per_s(np.zeros(len(bv)), bv, vi, kind))
+        return lambda bv, vi, kind: magnitude(
+            by_type.electrons_per_s(np.zeros(len(bv)), bv, vi, kind)
+        )
     library = electrons.load_library()
     table = electrons.fit_table(library.bv_mag, library.vi_mag, relative)
     return lambda bv, vi, _: magnitude(table.electrons_per_s(np.zeros(len(bv)), bv, vi))
@@ -98,11 +125,17 @@ def _by_library(spectrum: Spectrum, relative: FloatArray) -> Colour:
 def _bolometric(spectrum: Spectrum, temperature: str, photometry: electrons.Photometry) -> Colour:
     v0 = electrons.reference_mean_w_m2_m(photometry)
     if spectrum != "blackbody":
-        return _by_library(spectrum, v0 * library_exitance_m(_spectra(spectrum)) / electrons.BOLOMETRIC_0_W_M2)
+        return _by_library(
+            spectrum, v0 * library_exitance_m(_spectra(spectrum)) / electrons.BOLOMETRIC_0_W_M2
+        )
 
     def colour(bv_mag: FloatArray, _vi: FloatArray, _kind: FloatArray | None) -> FloatArray:
         kelvin = electrons.star_temperatures_k(bv_mag, temperature)
-        whole = STEFAN_BOLTZMANN_W_M2_K4 * kelvin**4 / electrons.v_band_mean_w_m2_m(kelvin, photometry.weighting)
+        whole = (
+            STEFAN_BOLTZMANN_W_M2_K4
+            * kelvin**4
+            / electrons.v_band_mean_w_m2_m(kelvin, photometry.weighting)
+        )
         return magnitude(v0 * whole / electrons.BOLOMETRIC_0_W_M2)
 
     return colour
@@ -117,10 +150,15 @@ def library_exitance_m(library: electrons.Library) -> FloatArray:
     nm, flux = library.wavelength_nm, library.flux
     total = np.trapezoid(flux, nm, axis=1) * 1e-9
     kelvin = torres2010_k(np.clip(library.bv_mag, *TORRES_BV_MAG))[:, None]
-    for ends, inside in (((10.0, float(nm[0])), nm <= nm[0] + END_NM), ((float(nm[-1]), 100_000.0), nm >= nm[-1] - END_NM)):
+    for ends, inside in (
+        ((10.0, float(nm[0])), nm <= nm[0] + END_NM),
+        ((float(nm[-1]), 100_000.0), nm >= nm[-1] - END_NM),
+    ):
         beyond = np.geomspace(ends[0], ends[1], 2000)
         body = blackbody_exitance_w_m2_m(beyond, kelvin)
-        scale = flux[:, inside].mean(axis=1) / blackbody_exitance_w_m2_m(nm[inside], kelvin).mean(axis=1)
+        scale = flux[:, inside].mean(axis=1) / blackbody_exitance_w_m2_m(nm[inside], kelvin).mean(
+            axis=1
+        )
         total += np.trapezoid(body, beyond, axis=1) * 1e-9 * scale
     return np.asarray(total)
 
@@ -130,7 +168,9 @@ def vega_electrons_per_s(optics: electrons.Optics, photometry: electrons.Photome
     light = vega()
     passband = read_curve_csv(DATA_DIR / "johnson-v.csv")
     scale = (
-        flux_ratio(VEGA_V_MAG) * electrons.reference_mean_w_m2_m(photometry) / curve_mean(light, passband, photometry.weighting)
+        flux_ratio(VEGA_V_MAG)
+        * electrons.reference_mean_w_m2_m(photometry)
+        / curve_mean(light, passband, photometry.weighting)
     )
     return scale * _through(optics, light)
 
@@ -145,5 +185,10 @@ def ab_electrons_per_s(optics: electrons.Optics) -> float:
 def _through(optics: electrons.Optics, light: Curve) -> float:
     nodes_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission, light)
     electrons_per_j = nodes_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    response = optics.quantum_efficiency(nodes_nm) * optics.transmission(nodes_nm) * electrons_per_j * weight_m
+    response = (
+        optics.quantum_efficiency(nodes_nm)
+        * optics.transmission(nodes_nm)
+        * electrons_per_j
+        * weight_m
+    )
     return float(optics.area_m2 * (light(nodes_nm) @ response))

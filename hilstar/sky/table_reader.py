@@ -25,7 +25,14 @@ from numpy.polynomial.polynomial import polyval
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, cannot_read, shortened
 from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
-from hilstar.basics.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, read_bytes, size_text
+from hilstar.basics.reading import (
+    HEAD_BYTES,
+    UTF_16_MARKS,
+    kind_of,
+    open_regular,
+    read_bytes,
+    size_text,
+)
 from hilstar.basics.text_tables import TextTable, open_table
 from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.sky.catalog import load_catalog
@@ -88,8 +95,24 @@ NAMES: dict[str, tuple[str, ...]] = {
 # and the MK type.
 SPECTRAL_TYPE = "spectral_type"
 ERROR_NAMES: dict[str, tuple[str, ...]] = {
-    "sigma_ra_mas": ("ra_error", "e_ra_icrs", "e_raicrs", "e_radeg", "e_raj2000", "e_ramdeg", "sigma_ra_mas"),
-    "sigma_dec_mas": ("dec_error", "e_de_icrs", "e_deicrs", "e_dedeg", "e_dej2000", "e_demdeg", "sigma_dec_mas"),
+    "sigma_ra_mas": (
+        "ra_error",
+        "e_ra_icrs",
+        "e_raicrs",
+        "e_radeg",
+        "e_raj2000",
+        "e_ramdeg",
+        "sigma_ra_mas",
+    ),
+    "sigma_dec_mas": (
+        "dec_error",
+        "e_de_icrs",
+        "e_deicrs",
+        "e_dedeg",
+        "e_dej2000",
+        "e_demdeg",
+        "sigma_dec_mas",
+    ),
     "sigma_parallax_mas": ("parallax_error", "e_plx", "sigma_parallax_mas"),
     "sigma_pm_ra_mas_yr": ("pmra_error", "e_pmra", "sigma_pm_ra_mas_yr"),
     "sigma_pm_dec_mas_yr": ("pmdec_error", "e_pmde", "sigma_pm_dec_mas_yr"),
@@ -115,7 +138,12 @@ SEXAGESIMAL = {"h:m:s": "hourangle", "d:m:s": "deg"}
 MAX_WHOLE_FLOAT = {4: 2.0**24, 8: 2.0**53}  # by a float's bytes: beyond, it holds no identifier
 UNITS = {
     "deg": ("ra_deg", "dec_deg"),
-    "mas / yr": ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr"),
+    "mas / yr": (
+        "pm_ra_cosdec_mas_yr",
+        "pm_dec_mas_yr",
+        "sigma_pm_ra_mas_yr",
+        "sigma_pm_dec_mas_yr",
+    ),
     "mas": ("parallax_mas", "sigma_ra_mas", "sigma_dec_mas", "sigma_parallax_mas"),
 }
 UNIT_OF = {role: unit for unit, roles in UNITS.items() for role in roles}
@@ -200,8 +228,12 @@ ROUTES = (
     Route(("v_mag", "bv_mag"), "V and B-V as given", _given),
     Route(("v_mag", "vi_mag"), "V and V-I as given, B-V of Hipparcos' stars of that V-I", _by_vi),
     Route(("v_mag", "b_mag"), "B and V as given", lambda v, b: _given(v, b - v)),
-    Route(("vt_mag", "bt_mag"), "V and B-V from Tycho's BT and VT (Mamajek et al. 2002)", _by_tycho),
-    Route(("g_mag", "bp_rp_mag"), "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)", _by_gaia),
+    Route(
+        ("vt_mag", "bt_mag"), "V and B-V from Tycho's BT and VT (Mamajek et al. 2002)", _by_tycho
+    ),
+    Route(
+        ("g_mag", "bp_rp_mag"), "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)", _by_gaia
+    ),
     Route(
         ("g_mag", "bp_mag", "rp_mag"),
         "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)",
@@ -225,7 +257,9 @@ class Layout:
         return sorted({*self.role.values(), *(name for pair in self.places for name in pair)})
 
 
-def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, ...]] = NAMES) -> Layout:
+def layout_of(
+    path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, ...]] = NAMES
+) -> Layout:
     """Which of a table's columns have the `roles`, by their names with or without a unit at the end
     (`ra_hours`).
 
@@ -234,14 +268,24 @@ def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, .
     """
     known = _plain_names(names, roles)
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
-    role = {role: known[found] for role, words in roles.items() if (found := next((w for w in words if w in known), None))}
+    role = {
+        role: known[found]
+        for role, words in roles.items()
+        if (found := next((w for w in words if w in known), None))
+    }
     magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
-    found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
+    found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (
+        ", ..." if len(names) > MAX_NAMED else ""
+    )
     if not places:
         pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])
-        raise InputError(f"{path}: has no right ascension and declination among its columns ({found}); name them {pairs}")
+        raise InputError(
+            f"{path}: has no right ascension and declination among its columns ({found}); name them {pairs}"
+        )
     if not magnitudes:
-        raise InputError(f"{path}: has no magnitude with a colour among its columns ({found}); {COLUMNS_WANTED}")
+        raise InputError(
+            f"{path}: has no magnitude with a colour among its columns ({found}); {COLUMNS_WANTED}"
+        )
     layout = Layout(role, places, magnitudes)
     small = [name.strip().lower() for name in names]
     for name in layout.needed():
@@ -298,9 +342,15 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
     if by_spelling is not None and (plain_unit(unit) not in HOURS or role == "ra_deg"):
         return float(by_spelling)
     try:
-        return float(u.Unit(unit, parse_strict="raise").to(u.Unit(wanted), equivalencies=u.dimensionless_angles()))
+        return float(
+            u.Unit(unit, parse_strict="raise").to(
+                u.Unit(wanted), equivalencies=u.dimensionless_angles()
+            )
+        )
     except (ValueError, TypeError, u.UnitConversionError) as error:
-        raise InputError(f"{path}: column {column} is in {shortened(unit)!r}; give it in {wanted.replace(' ', '')}") from error
+        raise InputError(
+            f"{path}: column {column} is in {shortened(unit)!r}; give it in {wanted.replace(' ', '')}"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +382,9 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     if kind == "a gzip file" and is_fits(packed := read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)):
         return _read_packed_fits(path, packed, roles)
     if kind is not None and kind != "a FITS file" and not head.startswith(UTF_16_MARKS):
-        raise cannot_read(path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED)
+        raise cannot_read(
+            path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED
+        )
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
         return _read_fits(path, path, roles)
@@ -353,9 +405,13 @@ def _quiet(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except MemoryError as error:
-        raise cannot_read(path, "it needs more memory than there is", "cut it to the stars that are used") from error
+        raise cannot_read(
+            path, "it needs more memory than there is", "cut it to the stars that are used"
+        ) from error
     except Exception as error:
-        raise cannot_read(path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED) from error
+        raise cannot_read(
+            path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED
+        ) from error
 
 
 def _read_packed_fits(path: Path, packed: bytes, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
@@ -366,11 +422,15 @@ def _read_packed_fits(path: Path, packed: bytes, roles: Mapping[str, tuple[str, 
     return _read_fits(path, io.BytesIO(data), roles)
 
 
-def _read_fits(path: Path, source: Path | io.BytesIO, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
+def _read_fits(
+    path: Path, source: Path | io.BytesIO, roles: Mapping[str, tuple[str, ...]]
+) -> RawTable:
     from astropy.io import fits
 
     with _quiet(path), fits.open(source, memmap=isinstance(source, Path)) as hdus:
-        table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None)
+        table = next(
+            (hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None
+        )
         if table is None:
             raise InputError(f"{path}: holds no table; {FILE_WANTED}")
         layout = layout_of(path, table.columns.names, roles)
@@ -381,7 +441,10 @@ def _read_fits(path: Path, source: Path | io.BytesIO, roles: Mapping[str, tuple[
             null = by_name[name].null
             values = np.asarray(table.data[name])
             mask = values == null if null is not None and values.dtype.kind in "iu" else None
-            columns[name], unit[name] = _numbers(path, layout, name, values, mask), by_name[name].unit or unit_by_name(name)
+            columns[name], unit[name] = (
+                _numbers(path, layout, name, values, mask),
+                by_name[name].unit or unit_by_name(name),
+            )
         return RawTable(layout, columns, unit, len(table.data))
 
 
@@ -390,9 +453,15 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
 
     if path.stat().st_size > MAX_XML_BYTES:
         size = size_text(path.stat().st_size)
-        raise cannot_read(path, f"a VOTable of {size}, {size_text(MAX_XML_BYTES)} at most", "give it as FITS")
+        raise cannot_read(
+            path, f"a VOTable of {size}, {size_text(MAX_XML_BYTES)} at most", "give it as FITS"
+        )
     if ELSEWHERE.search(path.read_bytes()):
-        raise cannot_read(path, "its data are in another file or at another place", "give a VOTable that holds them")
+        raise cannot_read(
+            path,
+            "its data are in another file or at another place",
+            "give a VOTable that holds them",
+        )
     with _quiet(path):
         table = votable.parse_single_table(path, verify="ignore")
         fields = {field.name: field for field in table.fields}
@@ -400,8 +469,12 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
         _check_rows(path, len(table.array))
         columns, unit = {}, {}
         for name in layout.needed():
-            column = table.array[fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name]
-            columns[name] = _numbers(path, layout, name, np.asarray(column.data), np.ma.getmaskarray(column))
+            column = table.array[
+                fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name
+            ]
+            columns[name] = _numbers(
+                path, layout, name, np.asarray(column.data), np.ma.getmaskarray(column)
+            )
             unit[name] = unit_by_name(name) if fields[name].unit is None else str(fields[name].unit)
         return RawTable(layout, columns, unit, len(table.array))
 
@@ -463,7 +536,9 @@ def _ecsv_units(path: Path) -> dict[str, str | None]:
     from astropy.table import meta
 
     with _quiet(path):
-        header = meta.get_header_from_yaml([line for line in comments if not line.startswith("%ECSV")])
+        header = meta.get_header_from_yaml(
+            [line for line in comments if not line.startswith("%ECSV")]
+        )
     return {column["name"]: column.get("unit") for column in header["datatype"]}
 
 
@@ -499,7 +574,9 @@ def _chunks(table: TextTable, places: list[int]) -> Iterator[Any]:
         try:
             yield text.read(block, **options)
         except text.InconsistentTableError:
-            yield text.read(_even_block(table, number, lines), **(options | {"delimiter": UNIT_SEPARATOR}))
+            yield text.read(
+                _even_block(table, number, lines), **(options | {"delimiter": UNIT_SEPARATOR})
+            )
 
 
 def _plain_block(table: TextTable, block: str) -> str:
@@ -521,7 +598,9 @@ def _even_block(table: TextTable, number: int, lines: list[str]) -> str:
             try:
                 rows.append(UNIT_SEPARATOR.join(table.row_of(line, text)))
             except InputError as error:
-                raise cannot_read(table.path, str(error).removeprefix(f"{table.path}:"), FILE_WANTED) from error
+                raise cannot_read(
+                    table.path, str(error).removeprefix(f"{table.path}:"), FILE_WANTED
+                ) from error
     return _plain_block(table, "\n".join(rows) + "\n")
 
 
@@ -530,7 +609,10 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
     InputError for other text.
     """
     if name == layout.role.get(SPECTRAL_TYPE):
-        texts = np.array([str(text).strip().encode("ascii", "replace") for text in values.tolist()], dtype=np.bytes_)
+        texts = np.array(
+            [str(text).strip().encode("ascii", "replace") for text in values.tolist()],
+            dtype=np.bytes_,
+        )
         return texts if mask is None else np.where(mask, b"", texts)
     whole = name in {layout.role.get(role) for role in Whole}
     if values.dtype.kind not in "iufb":
@@ -560,4 +642,6 @@ def _whole_numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 def _check_rows(path: Path, count: int) -> None:
     if count > MAX_ROWS:
-        raise InputError(f"{path}: has more than {MAX_ROWS} rows; cut it to the magnitudes that the tracker sees")
+        raise InputError(
+            f"{path}: has more than {MAX_ROWS} rows; cut it to the magnitudes that the tracker sees"
+        )

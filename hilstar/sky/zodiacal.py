@@ -41,7 +41,11 @@ class Sunward(NamedTuple):
     @property
     def elongation_deg(self) -> FloatArray:
         """Angles from the Sun (n,)."""
-        return np.asarray(np.degrees(np.arccos(np.cos(np.radians(self.dlon_deg)) * np.cos(np.radians(self.lat_deg)))))
+        return np.asarray(
+            np.degrees(
+                np.arccos(np.cos(np.radians(self.dlon_deg)) * np.cos(np.radians(self.lat_deg)))
+            )
+        )
 
 
 def sunward(vectors_icrs: FloatArray, tdb_jd: float) -> Sunward:
@@ -76,9 +80,15 @@ def tabled_light(seen: Sunward) -> TabledLight:
     )
     u = (seen.dlon_deg - dlon_deg[i]) / (dlon_deg[i + 1] - dlon_deg[i])
     v = (seen.lat_deg - lat_deg[j]) / (lat_deg[j + 1] - lat_deg[j])
-    corners = ((i, j, (1 - u) * (1 - v)), (i + 1, j, u * (1 - v)), (i, j + 1, (1 - u) * v), (i + 1, j + 1, u * v))
+    corners = (
+        (i, j, (1 - u) * (1 - v)),
+        (i + 1, j, u * (1 - v)),
+        (i, j + 1, (1 - u) * v),
+        (i + 1, j + 1, u * v),
+    )
     value, missing = (
-        np.sum([share * of[row, column] for row, column, share in corners], axis=0) for of in (log_radiance, blank)
+        np.sum([share * of[row, column] for row, column, share in corners], axis=0)
+        for of in (log_radiance, blank)
     )
     return TabledLight(np.exp(value), missing < ROUNDING)
 
@@ -95,11 +105,15 @@ def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     blank = np.isnan(log_radiance)
     lon, lat = np.radians(np.broadcast_arrays(dlon_deg[:, None], lat_deg))
     vectors = np.stack([np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)], axis=-1)
-    log_radiance[blank] = log_radiance[~blank][np.argmax(vectors[blank] @ vectors[~blank].T, axis=1)]
+    log_radiance[blank] = log_radiance[~blank][
+        np.argmax(vectors[blank] @ vectors[~blank].T, axis=1)
+    ]
     return dlon_deg, lat_deg, log_radiance, blank.astype(np.float64)
 
 
-def relative_spectrum(wavelength_nm: FloatArray, slopes: tuple[float, float] = FAR_SLOPES) -> FloatArray:
+def relative_spectrum(
+    wavelength_nm: FloatArray, slopes: tuple[float, float] = FAR_SLOPES
+) -> FloatArray:
     """Zodiacal light over its value at 500 nm, per wavelength: table 19's, or with the other
     `slopes` of equation 22.
     """
@@ -128,7 +142,9 @@ class ZodiacalLight:
         """The light that a tracker detects (thesis eq. 4.9 to 4.11, for another spectrum)."""
         wavelength_nm, response = electron_response(optics)
         near, far = (
-            float(optics.area_m2 * W_M2_SR_M * (relative_spectrum(wavelength_nm, slopes) @ response))
+            float(
+                optics.area_m2 * W_M2_SR_M * (relative_spectrum(wavelength_nm, slopes) @ response)
+            )
             for slopes in (NEAR_SLOPES, FAR_SLOPES)
         )
         return cls(near, far)
@@ -138,4 +154,6 @@ class ZodiacalLight:
         between 30 and 90 degrees.
         """
         far = np.clip((seen.elongation_deg - NEAR_DEG) / (FAR_DEG - NEAR_DEG), 0.0, 1.0)
-        return light.radiance * (self.near_e_per_s_sr + far * (self.far_e_per_s_sr - self.near_e_per_s_sr))
+        return light.radiance * (
+            self.near_e_per_s_sr + far * (self.far_e_per_s_sr - self.near_e_per_s_sr)
+        )

@@ -79,11 +79,18 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
     for _ in range(FIT_STEPS):
         shares = told(x, y)
         slopes = [
-            (told(x + dx, y + dy) - told(x - dx, y - dy)) / (2 * SLOPE_PX) for dx, dy in ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
+            (told(x + dx, y + dy) - told(x - dx, y - dy)) / (2 * SLOPE_PX)
+            for dx, dy in ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
         ]
         parts = np.stack([shares, *slopes], axis=1).reshape(len(stamps), 3, -1)
-        normal, seen = parts @ parts.transpose(0, 2, 1), (parts @ stamps.reshape(len(stamps), -1, 1))
-        normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+        normal, seen = (
+            parts @ parts.transpose(0, 2, 1),
+            (parts @ stamps.reshape(len(stamps), -1, 1)),
+        )
+        normal += (
+            np.eye(3)
+            * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+        )
         found = np.linalg.solve(normal, seen)[..., 0]  # flux, and flux times each step
         # where there is no light, no step
         flux = np.where(found[:, 0] > MIN_LIGHT, found[:, 0], np.inf)
@@ -97,7 +104,9 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
 def brightest(stamps: FloatArray) -> Pixels:
     """The brightest pixel of each square, two or more from its edge."""
     side = stamps.shape[1]
-    rows, columns = np.divmod(stamps[:, 2 : side - 2, 2 : side - 2].reshape(len(stamps), -1).argmax(axis=1), side - 4)
+    rows, columns = np.divmod(
+        stamps[:, 2 : side - 2, 2 : side - 2].reshape(len(stamps), -1).argmax(axis=1), side - 4
+    )
     return rows + 2, columns + 2
 
 
@@ -114,14 +123,23 @@ def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     return x, y
 
 
-def _window(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, wide: float = 1.0, steps: int = WINDOW_STEPS) -> Places:
+def _window(
+    stamps: FloatArray,
+    sigma_px: Sigma,
+    pixels: Pixels,
+    wide: float = 1.0,
+    steps: int = WINDOW_STEPS,
+) -> Places:
     at, (x, y) = _axis(stamps), _box(stamps, 2, pixels)
     sigmas = [wide * max(sigma, MIN_WINDOW_PX) for sigma in sigma_px]
     for _ in range(steps):
         across, down = (
-            np.exp(-np.square(at - place[:, None]) / (2 * sigma**2)) for place, sigma in zip((x, y), sigmas, strict=True)
+            np.exp(-np.square(at - place[:, None]) / (2 * sigma**2))
+            for place, sigma in zip((x, y), sigmas, strict=True)
         )
-        sums = _sums(stamps, np.stack([down, at * down], axis=1), np.stack([across, at * across], axis=2))
+        sums = _sums(
+            stamps, np.stack([down, at * down], axis=1), np.stack([across, at * across], axis=2)
+        )
         light = np.maximum(sums[:, 0, 0], MIN_LIGHT)
         dx, dy = PACE * (sums[:, 0, 1] / light - x), PACE * (sums[:, 1, 0] / light - y)
         x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
@@ -141,7 +159,10 @@ def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     at, (x, y) = _axis(stamps), _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
     flux = stamps.sum(axis=(1, 2))
     for _ in range(FIT_STEPS):
-        across, down = (np.stack(_profile(at, place, sigma), axis=1) for place, sigma in zip((x, y), sigma_px, strict=True))
+        across, down = (
+            np.stack(_profile(at, place, sigma), axis=1)
+            for place, sigma in zip((x, y), sigma_px, strict=True)
+        )
         step = _fit_step(_sums(stamps, down, across.transpose(0, 2, 1)), across, down, flux)
         flux = np.maximum(flux + step[:, 0], MIN_LIGHT)
         dx, dy = (np.clip(step[:, k], -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
@@ -151,21 +172,39 @@ def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     return x, y
 
 
-def _fit_step(seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray) -> FloatArray:
+def _fit_step(
+    seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray
+) -> FloatArray:
     """What least squares adds to flux, x and y, (n, 3).
 
     `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows,
     `seen` (n, 2, 2) the square's sums under their products.
     """
     (xx, xd, dd), (yy, yd, ee) = (
-        [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))] for part in (across, down)
+        [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))]
+        for part in (across, down)
     )
     one = flux * yy * xd, flux * yd * xx  # the star with its slopes
     normal = np.stack(
-        [xx * yy, *one, one[0], flux**2 * yy * dd, flux**2 * yd * xd, one[1], flux**2 * yd * xd, flux**2 * ee * xx], axis=-1
+        [
+            xx * yy,
+            *one,
+            one[0],
+            flux**2 * yy * dd,
+            flux**2 * yd * xd,
+            one[1],
+            flux**2 * yd * xd,
+            flux**2 * ee * xx,
+        ],
+        axis=-1,
     ).reshape(-1, 3, 3)
-    left = np.stack([seen[:, 0, 0], flux * seen[:, 0, 1], flux * seen[:, 1, 0]], axis=-1) - flux[:, None] * normal[:, 0]
-    normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+    left = (
+        np.stack([seen[:, 0, 0], flux * seen[:, 0, 1], flux * seen[:, 1, 0]], axis=-1)
+        - flux[:, None] * normal[:, 0]
+    )
+    normal += (
+        np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+    )
     return np.asarray(np.linalg.solve(normal, left[..., None])[..., 0])
 
 
@@ -185,7 +224,9 @@ def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE
     box = stamps[np.arange(len(stamps))[:, None, None], y, x]
     box = np.where(box > share * box.max(axis=(1, 2), keepdims=True), box, 0.0)
     light = np.maximum(box.sum(axis=(1, 2)), MIN_LIGHT)
-    return (box * (x - side // 2)).sum(axis=(1, 2)) / light, (box * (y - side // 2)).sum(axis=(1, 2)) / light
+    return (box * (x - side // 2)).sum(axis=(1, 2)) / light, (box * (y - side // 2)).sum(
+        axis=(1, 2)
+    ) / light
 
 
 _KINDS: dict[Kind, Callable[[FloatArray, Sigma, Pixels], Places]] = {

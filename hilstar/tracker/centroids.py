@@ -79,15 +79,26 @@ class CentroidSettings:
     def __post_init__(self) -> None:
         if self.window not in get_args(Window):
             raise InputError(f'centroids: window = {self.window!r}; write "gaussian" or "plain"')
-        limits = {"threshold_sigma": 0, "minimum_pixels": 1, "window_sigma_px": 0.1, "iterations": 1}
+        limits = {
+            "threshold_sigma": 0,
+            "minimum_pixels": 1,
+            "window_sigma_px": 0.1,
+            "iterations": 1,
+        }
         for name, low in limits.items():
             value = getattr(self, name)
             if not low <= value < math.inf:
                 raise InputError(f"centroids: {name} = {value:g}; write a number from {low:g} up")
         if self.window_radius_px is not None and not 1 <= self.window_radius_px <= 1000:
-            raise InputError(f"centroids: window_radius_px = {self.window_radius_px}; write 1 to 1000 pixels")
-        if self.psf_sigma_px is not None and not all(0.05 <= sigma <= 100 for sigma in self.psf_sigma_px):
-            raise InputError(f"centroids: psf_sigma_px = {self.psf_sigma_px}; write two numbers from 0.05 to 100")
+            raise InputError(
+                f"centroids: window_radius_px = {self.window_radius_px}; write 1 to 1000 pixels"
+            )
+        if self.psf_sigma_px is not None and not all(
+            0.05 <= sigma <= 100 for sigma in self.psf_sigma_px
+        ):
+            raise InputError(
+                f"centroids: psf_sigma_px = {self.psf_sigma_px}; write two numbers from 0.05 to 100"
+            )
 
     @property
     def radius_px(self) -> int:
@@ -143,7 +154,11 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
     _check(image)
-    values, counts = _counted(image) if image.dtype in COUNTED_TYPES else (image.astype(np.float64).ravel(), None)
+    values, counts = (
+        _counted(image)
+        if image.dtype in COUNTED_TYPES
+        else (image.astype(np.float64).ravel(), None)
+    )
     median = _median(values, counts)
     sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
     # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its
@@ -151,7 +166,9 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     kept = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
     shares = None if counts is None else counts[kept]
     level = float(np.average(values[kept], weights=shares))
-    noise = math.sqrt(float(np.average((values[kept] - level) ** 2, weights=shares))) / CLIPPED_SIGMA
+    noise = (
+        math.sqrt(float(np.average((values[kept] - level) ** 2, weights=shares))) / CLIPPED_SIGMA
+    )
     return LocalBackground(level, max(noise, step / math.sqrt(12)))
 
 
@@ -186,7 +203,11 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     """
     rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
     height, width = image.shape[0] // rows, image.shape[1] // columns
-    blocks = image[: rows * height, : columns * width].reshape(rows, height, columns, width).swapaxes(1, 2)
+    blocks = (
+        image[: rows * height, : columns * width]
+        .reshape(rows, height, columns, width)
+        .swapaxes(1, 2)
+    )
     whole = image.dtype in COUNTED_TYPES
     # Sorted in two thirds of the time of float64, and exact for whole steps up to 2^24.
     values: npt.NDArray[Any] = blocks.reshape(rows * columns, -1).astype(np.float32)
@@ -195,9 +216,13 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     # The median deviation of whole steps is a whole one: half a step more, so that nothing of the
     # noise is cut off.
     kept = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
-    noise = np.sqrt((values**2 * kept).sum(axis=1, dtype=np.float64) / kept.sum(axis=1)) / CLIPPED_SIGMA
+    noise = (
+        np.sqrt((values**2 * kept).sum(axis=1, dtype=np.float64) / kept.sum(axis=1)) / CLIPPED_SIGMA
+    )
     level = _median(*_counted(image)) if whole else float(np.median(image))
-    return LocalBackground(level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+    return LocalBackground(
+        level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12))
+    )
 
 
 def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -209,7 +234,9 @@ def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def find_stars(
-    image: npt.NDArray[Any], settings: CentroidSettings | None = None, background: LocalBackground | None = None
+    image: npt.NDArray[Any],
+    settings: CentroidSettings | None = None,
+    background: LocalBackground | None = None,
 ) -> Centroids:
     """The stars of an image (height, width) of DN or electrons. Raises InputError for NaN, infinity
     or another shape.
@@ -221,7 +248,9 @@ def find_stars(
     settings = settings or CentroidSettings()
     _check(image)
     under = background or estimate_background(image)
-    blobs = _find_blobs(image, under.level, settings.threshold_sigma * under.noise, settings.minimum_pixels)
+    blobs = _find_blobs(
+        image, under.level, settings.threshold_sigma * under.noise, settings.minimum_pixels
+    )
     x_px, y_px = _refine(image, under.level, blobs, settings)
     stamps, _, _ = squares(image, under.level, x_px, y_px, settings.radius_px)
     flux = stamps.sum(axis=(1, 2))
@@ -236,17 +265,30 @@ def find_stars(
             for place, curve in zip((x_px, y_px), curves, strict=True)
         )
     order = np.argsort(-flux, kind="stable")
-    return Centroids(x_px[order], y_px[order], flux[order], blobs.peak[order], blobs.pixels[order], ~inside[order])
+    return Centroids(
+        x_px[order],
+        y_px[order],
+        flux[order],
+        blobs.peak[order],
+        blobs.pixels[order],
+        ~inside[order],
+    )
 
 
 def _check(image: npt.NDArray[Any]) -> None:
     if image.ndim != 2 or 0 in image.shape or image.dtype.kind not in "fiu":
-        raise InputError(f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height, width)")
+        raise InputError(
+            f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height, width)"
+        )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
-        raise InputError("centroids: the image has a pixel that is NaN or infinite; give finite numbers")
+        raise InputError(
+            "centroids: the image has a pixel that is NaN or infinite; give finite numbers"
+        )
 
 
-def _find_blobs(image: npt.NDArray[Any], level: float, threshold: float, minimum_pixels: int) -> _Blobs:
+def _find_blobs(
+    image: npt.NDArray[Any], level: float, threshold: float, minimum_pixels: int
+) -> _Blobs:
     """Connected pixels more than the threshold above the level, diagonals included, in the order
     of the rows that meet them.
     """
@@ -273,7 +315,11 @@ def _find_blobs(image: npt.NDArray[Any], level: float, threshold: float, minimum
 
 
 def squares(
-    image: npt.NDArray[Any], level: float, x_px: FloatArray | IntArray, y_px: FloatArray | IntArray, radius_px: int
+    image: npt.NDArray[Any],
+    level: float,
+    x_px: FloatArray | IntArray,
+    y_px: FloatArray | IntArray,
+    radius_px: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squares of an image around n places: values over the level (n, k, k), and the pixels' offsets
     dx (n, 1, k), dy (n, k, 1).
@@ -283,7 +329,12 @@ def squares(
     reach = np.arange(-radius_px, radius_px + 1)
     column, row = (np.rint(place).astype(np.intp)[:, None] + reach for place in (x_px, y_px))
     height, width = image.shape
-    values = image[row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]].astype(np.float64) - level
+    values = (
+        image[row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]].astype(
+            np.float64
+        )
+        - level
+    )
     for place, size, axes in ((row, height, np.s_[:, :, None]), (column, width, np.s_[:, None, :])):
         beyond = (place < 0) | (place >= size)
         if beyond.any():
@@ -291,8 +342,12 @@ def squares(
     return values, (column - x_px[:, None])[:, None, :], (row - y_px[:, None])[:, :, None]
 
 
-def _refine(image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings) -> tuple[FloatArray, FloatArray]:
-    return (_gaussian_centres if settings.window == "gaussian" else _plain_centres)(image, level, blobs, settings)
+def _refine(
+    image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
+) -> tuple[FloatArray, FloatArray]:
+    return (_gaussian_centres if settings.window == "gaussian" else _plain_centres)(
+        image, level, blobs, settings
+    )
 
 
 def _gaussian_centres(
@@ -314,7 +369,8 @@ def _gaussian_centres(
         lost |= total <= 0
         total = np.where(lost, 1.0, total)
         first, second = (
-            np.stack([(weighted * offset**power).sum(axis=(1, 2)) for offset in (dx, dy)]) / total for power in (1, 2)
+            np.stack([(weighted * offset**power).sum(axis=(1, 2)) for offset in (dx, dy)]) / total
+            for power in (1, 2)
         )
         step = first / np.maximum(1 - second / sigma2, MIN_SLOPE)
         moved = np.where(lost, start, place + step)
@@ -372,19 +428,26 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     for that star.
     """
     if settings.psf_sigma_px is None:
-        raise InputError("centroids: an S-curve needs psf_sigma_px; write the star's sigma along x and y")
+        raise InputError(
+            "centroids: an S-curve needs psf_sigma_px; write the star's sigma along x and y"
+        )
     tile_px = 2 * settings.radius_px + 5
     middle_px = tile_px // 2
     true_px = np.linspace(-0.5, 0.5, S_CURVE_PHASES, endpoint=False)
     pixel = np.arange(tile_px) - middle_px - true_px[:, None]
-    share_x, share_y = (ndtr((pixel + 0.5) / sigma) - ndtr((pixel - 0.5) / sigma) for sigma in settings.psf_sigma_px)
+    share_x, share_y = (
+        ndtr((pixel + 0.5) / sigma) - ndtr((pixel - 0.5) / sigma) for sigma in settings.psf_sigma_px
+    )
     tiles = share_y[:, :, None] * share_x[:, None, :]
     strip = tiles.transpose(1, 0, 2).reshape(tile_px, -1)
     offset_px = tile_px * np.arange(S_CURVE_PHASES) + middle_px
     ones = np.ones(S_CURVE_PHASES)
     stars = _Blobs(offset_px + true_px, middle_px + true_px, ones, ones.astype(np.intp))
     x_px, y_px = _refine(strip, 0.0, stars, settings)
-    curves = SCurve(x_px - offset_px, x_px - offset_px - true_px), SCurve(y_px - middle_px, y_px - middle_px - true_px)
+    curves = (
+        SCurve(x_px - offset_px, x_px - offset_px - true_px),
+        SCurve(y_px - middle_px, y_px - middle_px - true_px),
+    )
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(
             f"centroids: window_sigma_px = {settings.window_sigma_px:g} is too narrow for psf_sigma_px = "

@@ -65,7 +65,9 @@ def cosmic_rays_e(
     area_cm2 = width * height * (pixel_pitch_um * 1e-4) ** 2
     expected = settings.cosmic_rays_per_cm2_s * area_cm2 * exposure_s
     if expected > MAX_HITS:
-        raise InputError(f"{expected:.3g} cosmic rays in a frame; lower cosmic_rays_per_cm2_s or the exposure")
+        raise InputError(
+            f"{expected:.3g} cosmic rays in a frame; lower cosmic_rays_per_cm2_s or the exposure"
+        )
     hits = int(rng.poisson(expected))
     cosine = np.sqrt(1.0 - rng.random(hits))
     azimuth_rad = rng.uniform(0.0, 2 * np.pi, hits)
@@ -78,7 +80,11 @@ def cosmic_rays_e(
     charge_e *= np.divide(seen_px, length_px, out=np.ones(hits), where=length_px > 0)
     steps = np.ceil(seen_px / RAY_STEP_PX).astype(np.intp) + 1
     ray = np.repeat(np.arange(hits), steps)
-    along_px = (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[ray] * seen_px[ray]
+    along_px = (
+        (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5)
+        / steps[ray]
+        * seen_px[ray]
+    )
     column = np.floor(start_px[ray, 0] + along_px * np.cos(azimuth_rad[ray])).astype(np.intp)
     row = np.floor(start_px[ray, 1] + along_px * np.sin(azimuth_rad[ray])).astype(np.intp)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -101,13 +107,21 @@ def false_stars_e(
     reach = math.ceil(FALSE_STAR_REACH_SIGMAS * sigma_px) + 1
     column = np.rint(x_px).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
     row = np.rint(y_px).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
-    share_x = ndtr((column - x_px[:, None] + 0.5) / sigma_px) - ndtr((column - x_px[:, None] - 0.5) / sigma_px)
-    share_y = ndtr((row - y_px[:, None] + 0.5) / sigma_px) - ndtr((row - y_px[:, None] - 0.5) / sigma_px)
+    share_x = ndtr((column - x_px[:, None] + 0.5) / sigma_px) - ndtr(
+        (column - x_px[:, None] - 0.5) / sigma_px
+    )
+    share_y = ndtr((row - y_px[:, None] + 0.5) / sigma_px) - ndtr(
+        (row - y_px[:, None] - 0.5) / sigma_px
+    )
     share_x *= (column >= 0) & (column < width)
     share_y *= (row >= 0) & (row < height)
     light_e = settings.false_star_e_per_s * exposure_s * share_y[:, :, None] * share_x[:, None, :]
     image_e = np.zeros(shape)
-    np.add.at(image_e, (row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]), light_e)
+    np.add.at(
+        image_e,
+        (row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]),
+        light_e,
+    )
     return image_e
 
 
@@ -115,7 +129,10 @@ class Detector:
     """One device: its settings, and its fixed maps, shape (height, width), made once."""
 
     def __init__(
-        self, settings: DetectorSettings, resolution_px: tuple[int, int], pixel_pitch_um: float = DEFAULT_PITCH_UM
+        self,
+        settings: DetectorSettings,
+        resolution_px: tuple[int, int],
+        pixel_pitch_um: float = DEFAULT_PITCH_UM,
     ) -> None:
         """`resolution_px` is (width, height). Raises InputError where it is not positive, or the
         pitch is not a sensor's.
@@ -123,7 +140,9 @@ class Detector:
         check_value("pixel_pitch_um", pixel_pitch_um, PixelPitch)
         width, height = resolution_px
         if width < 1 or height < 1:
-            raise InputError(f"resolution {width} x {height} px; write a width and a height of 1 or more")
+            raise InputError(
+                f"resolution {width} x {height} px; write a width and a height of 1 or more"
+            )
         self.settings = settings
         self.pixel_pitch_um = pixel_pitch_um
         self.shape = (height, width)
@@ -140,12 +159,16 @@ class Detector:
         kind = np.float64 if settings.noise_version == 1 else np.float32
         self.gain_map: ChargeArray = gain_map.astype(kind, copy=False)
         self.dark_map_e_per_s: ChargeArray = dark_map_e_per_s.astype(kind, copy=False)
-        self.column_e: ChargeArray = (settings.column_noise_e * column.standard_normal(width)).astype(kind)
+        self.column_e: ChargeArray = (
+            settings.column_noise_e * column.standard_normal(width)
+        ).astype(kind)
         self.offset_map_e: ChargeArray = (
             settings.dsnu_e * offset.standard_normal(self.shape if settings.dsnu_e else 0)
         ).astype(kind)
 
-    def expose(self, mean_e: npt.ArrayLike, exposure_s: float, rng: np.random.Generator) -> CodeArray:
+    def expose(
+        self, mean_e: npt.ArrayLike, exposure_s: float, rng: np.random.Generator
+    ) -> CodeArray:
         """One frame, DN, of `mean_e` (height, width): the electrons that the light makes on average
         in the exposure.
 
@@ -163,7 +186,9 @@ class Detector:
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
             rays_e = cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         codes = np.empty(self.shape, dtype=np.uint16)
-        spilt_e, normal = (np.empty(self.shape if settings.blooming else 0, dtype=np.float32) for _ in range(2))
+        spilt_e, normal = (
+            np.empty(self.shape if settings.blooming else 0, dtype=np.float32) for _ in range(2)
+        )
 
         def draw(part: slice, words: Word64Array) -> None:
             expected_e: Float32Array = light_e[part].astype(np.float32)
@@ -178,18 +203,28 @@ class Detector:
             else:  # without read noise a dark pixel needs no number
                 charge_e = read = np.zeros_like(expected_e)
                 lit = np.flatnonzero(bright)
-                charge_e.ravel()[lit] = poisson(expected_e.ravel()[lit], normal_pairs(words, lit)[0], 0.0)
+                charge_e.ravel()[lit] = poisson(
+                    expected_e.ravel()[lit], normal_pairs(words, lit)[0], 0.0
+                )
             if rays_e is not None:
                 charge_e += rays_e[part]
             if settings.blooming:
                 spilt_e[part], normal[part] = charge_e, read
             else:
-                codes[part] = self._read_out(np.minimum(charge_e, np.float32(settings.full_well_e)), read, part)
+                codes[part] = self._read_out(
+                    np.minimum(charge_e, np.float32(settings.full_well_e)), read, part
+                )
 
         draw_blocks(self.shape, rng, draw)
-        return self._read_out(bloom(spilt_e, settings.full_well_e), normal) if settings.blooming else codes
+        return (
+            self._read_out(bloom(spilt_e, settings.full_well_e), normal)
+            if settings.blooming
+            else codes
+        )
 
-    def _expose_by_generator(self, light_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> CodeArray:
+    def _expose_by_generator(
+        self, light_e: FloatArray, exposure_s: float, rng: np.random.Generator
+    ) -> CodeArray:
         """`noise_version = 1`: NumPy's own draws of the whole frame."""
         settings = self.settings
         self._check_light(light_e)
@@ -200,9 +235,14 @@ class Detector:
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
             collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         kept_e = self._fill_wells(collected_e)
-        return self._read_out(kept_e, rng.standard_normal(self.shape, dtype=np.float32) if settings.electronics_e else None)
+        return self._read_out(
+            kept_e,
+            rng.standard_normal(self.shape, dtype=np.float32) if settings.electronics_e else None,
+        )
 
-    def _read_out(self, charge_e: ChargeArray, normal: Float32Array | None, part: slice = slice(None)) -> CodeArray:
+    def _read_out(
+        self, charge_e: ChargeArray, normal: Float32Array | None, part: slice = slice(None)
+    ) -> CodeArray:
         """DN of the charge in the wells, the rows `part`, with the noise of the electronics;
         `charge_e` is changed.
         """
@@ -224,7 +264,9 @@ class Detector:
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)
         self._check_light(light_e)
-        expected_e = light_e.astype(np.float64) + settings.dark_e_per_s * settings.dark_factor * exposure_s
+        expected_e = (
+            light_e.astype(np.float64) + settings.dark_e_per_s * settings.dark_factor * exposure_s
+        )
         self._check_largest(expected_e)
         return self._convert(self._fill_wells(expected_e))
 
@@ -234,7 +276,9 @@ class Detector:
         """
         light_e = np.asarray(mean_e)
         if light_e.dtype.kind not in "fiu" or light_e.shape != self.shape:
-            raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
+            raise InputError(
+                f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}"
+            )
         if not 0 <= exposure_s <= MAX_E:
             raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
         shift_s = self.settings.row_shift_us * 1e-6
@@ -245,7 +289,9 @@ class Detector:
 
     def _check_light(self, light_e: npt.NDArray[Any]) -> None:
         if not light_e.min() >= 0:  # NaN propagates through min
-            raise InputError("a pixel's electrons are negative or NaN; give expected electrons, 0 or more")
+            raise InputError(
+                "a pixel's electrons are negative or NaN; give expected electrons, 0 or more"
+            )
         self._check_largest(light_e)
 
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
@@ -257,7 +303,11 @@ class Detector:
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
         full_e = self.settings.full_well_e
-        return bloom(collected_e, full_e) if self.settings.blooming else np.minimum(collected_e, full_e)
+        return (
+            bloom(collected_e, full_e)
+            if self.settings.blooming
+            else np.minimum(collected_e, full_e)
+        )
 
     def _convert(self, charge_e: ChargeArray) -> CodeArray:
         """The ADC: electrons to the nearest code (a half goes to the even one), clipped to the
@@ -314,7 +364,10 @@ def bloom(charge_e: ChargeArray, full_well_e: float) -> ChargeArray:
     columns = np.flatnonzero((charge_e > full_well_e).any(axis=0))
     excess_e = charge_e[:, columns] - kept_e[:, columns]
     wells_e = kept_e[:, columns]
-    for spilt_e, rows in ((excess_e / 2, range(len(wells_e))), (excess_e / 2, reversed(range(len(wells_e))))):
+    for spilt_e, rows in (
+        (excess_e / 2, range(len(wells_e))),
+        (excess_e / 2, reversed(range(len(wells_e)))),
+    ):
         carried_e = np.zeros(len(columns))
         for row in rows:
             offered_e = wells_e[row] + carried_e + spilt_e[row]

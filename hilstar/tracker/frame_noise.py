@@ -45,7 +45,9 @@ ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
 
 
-def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Float32Array, Float32Array]:
+def normal_pairs(
+    words: Word64Array, which: IntArray | None = None
+) -> tuple[Float32Array, Float32Array]:
     """Two independent standard normal numbers for each random word: two arrays of its shape, up to
     6.77 sigmas.
 
@@ -57,7 +59,10 @@ def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Flo
     halves, shape = words.view(np.uint32).reshape(parts, 2, -1), words.shape
     if which is not None:
         part, place = np.divmod(which, halves.shape[2])
-        halves, shape = np.stack([halves[part, 0, place], halves[part, 1, place]])[None], which.shape
+        halves, shape = (
+            np.stack([halves[part, 0, place], halves[part, 1, place]])[None],
+            which.shape,
+        )
     radius = halves[:, 0].astype(np.float32).reshape(shape)
     radius += np.float32(0.5)
     radius *= np.float32(2.0**-32)
@@ -73,7 +78,9 @@ def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Flo
     return angle, sine
 
 
-def poisson(mean_e: Float32Array, normal: Float32Array, smallest_e: float | None = None) -> Float32Array:
+def poisson(
+    mean_e: Float32Array, normal: Float32Array, smallest_e: float | None = None
+) -> Float32Array:
     """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape.
 
     `smallest_e` is the smallest mean beside which these stand (None: of these alone).
@@ -88,12 +95,20 @@ def poisson(mean_e: Float32Array, normal: Float32Array, smallest_e: float | None
     if not large_count:
         return _by_table(mean_e, normal)
     if large_count == mean_e.size:
-        return _by_expansion(mean_e, normal, max(TABLE_BELOW_E, float(mean_e.min()) if smallest_e is None else smallest_e))
+        return _by_expansion(
+            mean_e,
+            normal,
+            max(TABLE_BELOW_E, float(mean_e.min()) if smallest_e is None else smallest_e),
+        )
     # The many all at once, and the few again by themselves.
     if large_count < mean_e.size / 2:
         large = np.flatnonzero(is_large)
-        counts = _by_table(np.minimum(mean_e, np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))), normal)
-        counts.ravel()[large] = _by_expansion(mean_e.ravel()[large], normal.ravel()[large], TABLE_BELOW_E)
+        counts = _by_table(
+            np.minimum(mean_e, np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))), normal
+        )
+        counts.ravel()[large] = _by_expansion(
+            mean_e.ravel()[large], normal.ravel()[large], TABLE_BELOW_E
+        )
         return counts
     counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal, TABLE_BELOW_E)
     small = np.flatnonzero(~is_large)
@@ -115,7 +130,11 @@ def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
     step = rows.astype(np.intp) * UNSURE + counts.ravel()[doubts].astype(np.intp)
     low, high = table.step_number.take(step), table.step_number.take(step + UNSURE)
     above = numbers - (low + (rows - np.floor(rows)) * (high - low))
-    sure = (np.abs(above) > STEP_NUMBER_ERROR) & (rows > STRAIGHT_ABOVE_E * ROWS_PER_E) & (np.abs(numbers) < ONE_STEP_SIGMAS)
+    sure = (
+        (np.abs(above) > STEP_NUMBER_ERROR)
+        & (rows > STRAIGHT_ABOVE_E * ROWS_PER_E)
+        & (np.abs(numbers) < ONE_STEP_SIGMAS)
+    )
     counts.ravel()[doubts] += (above > 0) & sure
     _decide(counts, mean_e, normal, doubts[~sure])
     return counts
@@ -145,30 +164,50 @@ def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float)
     bend *= np.float32(ERROR_PER_BEND2)
     quantile += bend
     doubts = np.flatnonzero(quantile > 0.5 - ERROR_E_TIMES_MEAN / smallest_e)
-    means, numbers = mean_e.ravel()[doubts].astype(np.float64), normal.ravel()[doubts].astype(np.float64)
+    means, numbers = (
+        mean_e.ravel()[doubts].astype(np.float64),
+        normal.ravel()[doubts].astype(np.float64),
+    )
     square, root = numbers**2, np.sqrt(means)
     bends = numbers * (2 + square) / (72 * root)
-    finer = means + numbers * root + square / 6 - bends + 1 / 3 + (square * (7 / 810 + square / 270) - 8 / 405) / means
+    finer = (
+        means
+        + numbers * root
+        + square / 6
+        - bends
+        + 1 / 3
+        + (square * (7 / 810 + square / 270) - 8 / 405) / means
+    )
     counts.ravel()[doubts] = np.floor(finer)
-    near = np.abs(finer - np.rint(finer)) < FINER_ERROR_PER_BEND3 * np.abs(bends) ** 3 + FINER_ERROR_E / root**3
+    near = (
+        np.abs(finer - np.rint(finer))
+        < FINER_ERROR_PER_BEND3 * np.abs(bends) ** 3 + FINER_ERROR_E / root**3
+    )
     counts.ravel()[doubts[near]] = np.rint(finer[near]) - 1
     _decide(counts, mean_e, normal, doubts[near])
     return counts
 
 
-def _decide(counts: Float32Array, mean_e: Float32Array, normal: Float32Array, doubts: npt.NDArray[np.intp]) -> None:
+def _decide(
+    counts: Float32Array, mean_e: Float32Array, normal: Float32Array, doubts: npt.NDArray[np.intp]
+) -> None:
     """Raise the counts of the pixels `doubts`, lower bounds so far, to where the cumulative
     probability is reached.
     """
     from scipy.special import ndtr, pdtr
 
     numbers = normal.ravel()[doubts]
-    means, counted = mean_e.ravel()[doubts].astype(np.float64), np.maximum(counts.ravel()[doubts], 0.0).astype(np.float64)
+    means, counted = (
+        mean_e.ravel()[doubts].astype(np.float64),
+        np.maximum(counts.ravel()[doubts], 0.0).astype(np.float64),
+    )
     low = pdtr(counted, means) < ndtr(numbers.astype(np.float64))
     counted += low
     climbing = np.flatnonzero(low & (np.abs(numbers) > ONE_STEP_SIGMAS))
     while len(climbing):
-        short = pdtr(counted[climbing], means[climbing]) < ndtr(numbers[climbing].astype(np.float64))
+        short = pdtr(counted[climbing], means[climbing]) < ndtr(
+            numbers[climbing].astype(np.float64)
+        )
         climbing = climbing[short]
         counted[climbing] += 1
     counts.ravel()[doubts] = counted
@@ -197,7 +236,11 @@ def _count_table() -> CountTable:
 
     def counts(margin: float) -> npt.NDArray[np.intp]:
         steps = np.zeros((len(mean_e), COLUMNS), dtype=np.intp)
-        np.add.at(steps, (np.arange(len(mean_e))[:, None], np.ceil(edge + margin).astype(np.intp)), number < 6.8)
+        np.add.at(
+            steps,
+            (np.arange(len(mean_e))[:, None], np.ceil(edge + margin).astype(np.intp)),
+            number < 6.8,
+        )
         return steps.cumsum(axis=1)
 
     smallest = counts(MARGIN_COLUMNS)[:-1]
@@ -206,7 +249,9 @@ def _count_table() -> CountTable:
     return CountTable(cells.astype(np.uint8).ravel(), number.astype(np.float32).ravel())
 
 
-def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]) -> None:
+def draw_blocks(
+    shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]
+) -> None:
     """Call `draw` for the rows of each block of an image (height, width) with random words, on
     every core.
 
@@ -227,7 +272,10 @@ def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable
 
     blocks = range(0, height, 2 * rows)
     asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
-    threads = min(len(blocks), int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)))
+    threads = min(
+        len(blocks),
+        int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)),
+    )
     if threads == 1:
         for first in blocks:
             draw_block(first)

@@ -22,7 +22,14 @@ CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02
 REFITS, REJECTED = 4, 4.0  # stars farther off than so many times the median are left out
 FIELD_ERROR = 0.02  # share of the field of view that the database leaves open
 GAIA_RECORD = np.dtype(
-    [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
+    [
+        ("id", "<i8"),
+        ("ra", "<f8"),
+        ("dec", "<f8"),
+        ("mag", "<f4"),
+        ("pm_ra", "<f4"),
+        ("pm_dec", "<f4"),
+    ]
 )  # of its catalogue's file: degrees, and motions of mas/yr
 
 
@@ -69,7 +76,9 @@ StarsNear = Callable[[FloatArray], tuple[IntArray, FloatArray]]
 Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # pixels of directions (m, 3), cam
 
 
-def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, place: Place) -> Identified | None:
+def identify(
+    found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, place: Place
+) -> Identified | None:
     """The attitude near an expected one, by stars where they are expected; None where too few
     are there.
     """
@@ -115,7 +124,13 @@ class LostInSpace:
     see; the database is made of them in a second. Raises InputError where the extra is missing.
     """
 
-    def __init__(self, directions: FloatArray, v_mag: FloatArray, focal_length_px: float, size_px: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        directions: FloatArray,
+        v_mag: FloatArray,
+        focal_length_px: float,
+        size_px: tuple[int, int],
+    ) -> None:
         try:
             import tetra3rs
         except ImportError as error:
@@ -124,16 +139,26 @@ class LostInSpace:
             ) from error
         self._result = tetra3rs.SolveResult
         width, height = size_px
-        self._camera = tetra3rs.CameraModel(focal_length_px=focal_length_px, image_width=width, image_height=height)
+        self._camera = tetra3rs.CameraModel(
+            focal_length_px=focal_length_px, image_width=width, image_height=height
+        )
         field_deg = float(np.degrees(2 * np.arctan(width / 2 / focal_length_px)))
         order = np.argsort(v_mag, kind="stable")
         rows = np.zeros(len(order), dtype=GAIA_RECORD)
         x, y, z = directions[order].T
         rows["id"], rows["mag"] = order + 1, v_mag[order]
-        rows["ra"], rows["dec"] = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(np.clip(z, -1, 1)))
+        rows["ra"], rows["dec"] = (
+            np.degrees(np.arctan2(y, x)) % 360,
+            np.degrees(np.arcsin(np.clip(z, -1, 1))),
+        )
         with tempfile.TemporaryDirectory(prefix="hilstar-") as folder:
             path = Path(folder) / "stars.bin"
-            path.write_bytes(b"GDR3" + np.array([1], "<u4").tobytes() + np.array([len(rows)], "<u8").tobytes() + rows.tobytes())
+            path.write_bytes(
+                b"GDR3"
+                + np.array([1], "<u4").tobytes()
+                + np.array([len(rows)], "<u8").tobytes()
+                + rows.tobytes()
+            )
             self._database = tetra3rs.SolverDatabase.generate_from_gaia(
                 str(path),
                 max_fov_deg=field_deg * (1 + FIELD_ERROR),
@@ -148,4 +173,6 @@ class LostInSpace:
         """
         places = np.column_stack([slopes * self._camera.focal_length_px, flux_e])
         solved = self._database.solve_from_centroids(places, camera_model=self._camera)
-        return normalise(np.asarray(solved.quaternion)) if isinstance(solved, self._result) else None
+        return (
+            normalise(np.asarray(solved.quaternion)) if isinstance(solved, self._result) else None
+        )

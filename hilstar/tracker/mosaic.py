@@ -40,7 +40,11 @@ def of_colour(bayer: str, channel: str) -> list[tuple[slice, slice]]:
     """The pixels of a channel in an image of a pattern, whose first row is the top: green has
     two of four.
     """
-    return [np.s_[place // 2 :: 2, place % 2 :: 2] for place, colour in enumerate(bayer) if colour == channel]
+    return [
+        np.s_[place // 2 :: 2, place % 2 :: 2]
+        for place, colour in enumerate(bayer)
+        if colour == channel
+    ]
 
 
 def luminance(image: npt.NDArray[Any]) -> FloatArray:

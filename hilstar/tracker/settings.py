@@ -55,7 +55,9 @@ class PixelNoise:
     @property
     def total_e2(self) -> FloatArray:
         """The sum: the square of n_TOT (thesis table 4.1, eq. 4.14)."""
-        thermal_e2 = self.dark_e2 + self.read_e2 + self.reset_e2 + self.quantisation_e2 + self.dsnu_e2
+        thermal_e2 = (
+            self.dark_e2 + self.read_e2 + self.reset_e2 + self.quantisation_e2 + self.dsnu_e2
+        )
         return np.asarray(self.shot_e2 + self.prnu_e2 + thermal_e2)
 
 
@@ -85,7 +87,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     read_noise_corner_hz: Amount = 0.0
     #: Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is
     #: straight. Default: none
-    read_noise_table: Annotated[tuple[tuple[Charge, Amount], ...], Meta(extra={"form": "[[hz, e], ...]"})] = ()
+    read_noise_table: Annotated[
+        tuple[tuple[Charge, Amount], ...], Meta(extra={"form": "[[hz, e], ...]"})
+    ] = ()
     #: `"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one
     #: before. `"frame-transfer"`: no shutter while rows are shifted under the mask, so light smears
     #: along the columns ([real glass](optics.md#the-shutter)).
@@ -107,7 +111,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     dark_distribution: Literal["normal", "gamma", "log-normal"] = "normal"
     #: Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution`
     #: is fitted to them, and gives `dark_e_per_s` and `dsnu_e_per_s`. Default: none
-    dark_quantiles: Annotated[tuple[tuple[Share, Amount], ...], Meta(extra={"form": "[[share, e/s], ...]"})] = ()
+    dark_quantiles: Annotated[
+        tuple[tuple[Share, Amount], ...], Meta(extra={"form": "[[share, e/s], ...]"})
+    ] = ()
     prnu: Share = 0.0  #: Relative sigma of the gain map (PRNU), which is fixed for a device.
     #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is
     #: the frame's.
@@ -156,7 +162,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         for name, kind in _KINDS.items():
             check_value(name, getattr(self, name), kind)
         if self.dark_quantiles:
-            mean, sigma = fitted_dark(self.dark_distribution, np.array(self.dark_quantiles, dtype=np.float64))
+            mean, sigma = fitted_dark(
+                self.dark_distribution, np.array(self.dark_quantiles, dtype=np.float64)
+            )
             msgspec.structs.force_setattr(self, "dark_e_per_s", mean)
             msgspec.structs.force_setattr(self, "dsnu_e_per_s", sigma)
         low_k, high_k = DATASHEET_RANGE_K
@@ -173,9 +181,15 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
                     f'{name} is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", or {name} = 0'
                 )
         if self.dark_distribution != "normal" and self.dsnu_e_per_s and not self.dark_e_per_s:
-            raise InputError(f'dark_distribution = "{self.dark_distribution}" has no mean of 0; write dark_e_per_s above 0')
+            raise InputError(
+                f'dark_distribution = "{self.dark_distribution}" has no mean of 0; write dark_e_per_s above 0'
+            )
         hz = [point[0] for point in self.read_noise_table]
-        if hz and self.readout_hz and not (sorted(set(hz)) == hz and hz[0] <= self.readout_hz <= hz[-1]):
+        if (
+            hz
+            and self.readout_hz
+            and not (sorted(set(hz)) == hz and hz[0] <= self.readout_hz <= hz[-1])
+        ):
             raise InputError(
                 f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table, whose frequencies rise: "
                 f"{hz[0]:g} to {hz[-1]:g}"
@@ -196,16 +210,24 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             return _arrhenius(self.dark_activation_ev, cold_k, warm_k)
         if self.dark_law in E2V_DARK:
             return e2v_dark(self.dark_law, warm_k) / e2v_dark(self.dark_law, cold_k)
-        cold_ev, warm_ev = (self.dark_gap_ev or silicon_gap_ev(kelvin) for kelvin in (cold_k, warm_k))
-        depletion = math.pow(warm_k / cold_k, 1.5) * math.exp((cold_ev / cold_k - warm_ev / warm_k) / (2 * BOLTZMANN_EV_PER_K))
-        return (1 - self.dark_depletion_share) * depletion**2 + self.dark_depletion_share * depletion
+        cold_ev, warm_ev = (
+            self.dark_gap_ev or silicon_gap_ev(kelvin) for kelvin in (cold_k, warm_k)
+        )
+        depletion = math.pow(warm_k / cold_k, 1.5) * math.exp(
+            (cold_ev / cold_k - warm_ev / warm_k) / (2 * BOLTZMANN_EV_PER_K)
+        )
+        return (
+            1 - self.dark_depletion_share
+        ) * depletion**2 + self.dark_depletion_share * depletion
 
     @property
     def hot_factor(self) -> float:
         """What the temperature does to the extra dark current of hot pixels."""
         if not self.hot_pixel_activation_ev:
             return self.dark_factor
-        return _arrhenius(self.hot_pixel_activation_ev, self.dark_reference_temperature_k, self.temperature_k)
+        return _arrhenius(
+            self.hot_pixel_activation_ev, self.dark_reference_temperature_k, self.temperature_k
+        )
 
     @property
     def read_noise_now_e(self) -> float:
@@ -218,12 +240,16 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             hz, table_e = np.log(np.maximum(self.read_noise_table, 1e-12)).T
             return math.exp(float(np.interp(math.log(self.readout_hz), hz, table_e)))
         corner_hz = self.read_noise_corner_hz
-        return self.read_noise_e * math.sqrt((self.readout_hz + corner_hz) / (self.read_noise_reference_hz + corner_hz))
+        return self.read_noise_e * math.sqrt(
+            (self.readout_hz + corner_hz) / (self.read_noise_reference_hz + corner_hz)
+        )
 
     @property
     def reset_noise_e(self) -> float:
         """kTC noise: sqrt(k T C) / q, e-."""
-        return math.sqrt(BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C)
+        return math.sqrt(
+            BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C
+        )
 
     def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
         """The noise of pixels that light gives `light_e` electrons on average, background among
@@ -239,7 +265,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             dark_e2=self.dark_e_per_s * seconds,
             read_e2=self.read_noise_now_e**2,
             reset_e2=self.reset_noise_e**2,
-            quantisation_e2=self.gain_e_per_dn**2 / 12 + (self.adc_noise_e**2 if self.quantisation_noise else 0.0),
+            quantisation_e2=self.gain_e_per_dn**2 / 12
+            + (self.adc_noise_e**2 if self.quantisation_noise else 0.0),
             prnu_e2=(self.prnu * light) ** 2,
             dsnu_e2=math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s) ** 2 * seconds**2
             + self.column_noise_e**2
@@ -251,7 +278,11 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's
         for `quantisation_noise`.
         """
-        return math.hypot(self.read_noise_now_e, self.reset_noise_e, self.adc_noise_e if self.quantisation_noise else 0.0)
+        return math.hypot(
+            self.read_noise_now_e,
+            self.reset_noise_e,
+            self.adc_noise_e if self.quantisation_noise else 0.0,
+        )
 
     @property
     def adc_noise_e(self) -> float:
@@ -268,7 +299,9 @@ def _check_shutter(detector: DetectorSettings) -> None:
     for name, shutter in (("row_time_us", "rolling"), ("row_shift_us", "frame-transfer")):
         if (getattr(detector, name) > 0) != (detector.shutter == shutter):
             way = "above 0" if detector.shutter == shutter else f'= 0, or shutter = "{shutter}"'
-            raise InputError(f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write {name} {way}')
+            raise InputError(
+                f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write {name} {way}'
+            )
 
 
 def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
@@ -282,22 +315,36 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
 
     share, rate = points.reshape(-1, 2).T
     low = 0.0 if law == "normal" else 1e-9
-    if len(share) < 2 or not (share[0] > 0 and share[-1] < 1 and (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()):
-        raise InputError("dark_quantiles: write two points or more, shares between 0 and 1, both columns rising")
+    if len(share) < 2 or not (
+        share[0] > 0 and share[-1] < 1 and (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()
+    ):
+        raise InputError(
+            "dark_quantiles: write two points or more, shares between 0 and 1, both columns rising"
+        )
     if rate[0] < low:
-        raise InputError(f'dark_quantiles: dark_distribution = "{law}" has no rate of 0; write rates above 0')
+        raise InputError(
+            f'dark_quantiles: dark_distribution = "{law}" has no rate of 0; write rates above 0'
+        )
     if law == "gamma":
 
         def misfit(log_shape: float) -> float:
-            return float(np.var(np.log(rate / np.maximum(gammaincinv(math.exp(log_shape), share), 1e-300))))
+            return float(
+                np.var(np.log(rate / np.maximum(gammaincinv(math.exp(log_shape), share), 1e-300)))
+            )
 
-        shape = math.exp(minimize_scalar(misfit, bounds=(math.log(0.02), math.log(1e6)), method="bounded").x)
+        shape = math.exp(
+            minimize_scalar(misfit, bounds=(math.log(0.02), math.log(1e6)), method="bounded").x
+        )
         mean = shape * math.exp(float(np.log(rate / gammaincinv(shape, share)).mean()))
         return mean, mean / math.sqrt(shape)
-    slope, middle = map(float, np.polyfit(ndtri(share), rate if law == "normal" else np.log(rate), 1))
+    slope, middle = map(
+        float, np.polyfit(ndtri(share), rate if law == "normal" else np.log(rate), 1)
+    )
     if law == "normal":
         if middle < 0:
-            raise InputError('dark_quantiles: their normal law has a mean below 0; write dark_distribution = "gamma"')
+            raise InputError(
+                'dark_quantiles: their normal law has a mean below 0; write dark_distribution = "gamma"'
+            )
         return middle, slope
     mean = math.exp(middle + slope**2 / 2)
     return mean, mean * math.sqrt(math.expm1(slope**2))

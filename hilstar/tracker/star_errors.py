@@ -13,7 +13,15 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import magnitude
-from hilstar.tracker.centroiders import BOX_SHARE, FAMILY, Centroider, Pixels, Sigma, brightest, star_places
+from hilstar.tracker.centroiders import (
+    BOX_SHARE,
+    FAMILY,
+    Centroider,
+    Pixels,
+    Sigma,
+    brightest,
+    star_places,
+)
 
 # a pixel's width twice: a star is sampled by squares, and shown by squares
 SQUARES_VARIANCE = 1 / 6
@@ -96,7 +104,12 @@ class Judge:
         self._wanted = wanted
         self._places: dict[Centroider, FloatArray] = {}
 
-    def errors(self, shown: FloatArray, share: float | FloatArray = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
+    def errors(
+        self,
+        shown: FloatArray,
+        share: float | FloatArray = 1.0,
+        kinds: tuple[Centroider, ...] = FAMILY,
+    ) -> StarErrors:
         """The errors of an image of the same stars, whose light should be `share` of those
         wanted: all's, or each one's.
         """
@@ -105,19 +118,26 @@ class Judge:
         for kind in kinds:
             if kind not in self._places:
                 self._places[kind] = self._found(self._wanted, kind)
-            off_px[kind] = np.where(light > 0, self._found(shown, kind) - self._places[kind], np.inf)
+            off_px[kind] = np.where(
+                light > 0, self._found(shown, kind) - self._places[kind], np.inf
+            )
         return StarErrors(np.asarray(magnitude(light / (share * self._light))), off_px)
 
     def _found(self, image: FloatArray, kind: Centroider) -> FloatArray:
         """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
         if kind == "moment":  # no blur and no pixel changes it
             tiles = self._tiles(image, self._tile)
-            at, light = np.arange(self._tile), np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
+            at, light = (
+                np.arange(self._tile),
+                np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny),
+            )
             return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
-        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed), self._box_share)
+        places = star_places(
+            stamps, kind, self._sigma_px, self._middles(stamps, boxed), self._box_share
+        )
         return np.stack(places) * pixel_px
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
@@ -134,16 +154,30 @@ class Judge:
         return image.reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side)
 
     def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
-        return [_collected(place_px, self._tile, pixel_px, blur_px, half) for place_px in self._in_tile_px]
+        return [
+            _collected(place_px, self._tile, pixel_px, blur_px, half)
+            for place_px in self._in_tile_px
+        ]
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
         """The tracker's pixels about each star, (n, side, side)."""
         (columns, rows), count, tile = self._views[pixel_px], self._count, self._tile
         side = rows.shape[1]
         # (column, y, side)
-        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(0, 2, 1)
-        lines = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
-        return np.asarray((rows @ lines).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
+        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(
+            0, 2, 1
+        )
+        lines = (
+            wide.reshape(count, count, tile, side)
+            .transpose(1, 2, 0, 3)
+            .reshape(count, tile, count * side)
+        )
+        return np.asarray(
+            (rows @ lines)
+            .reshape(count, side, count, side)
+            .transpose(0, 2, 1, 3)
+            .reshape(-1, side, side)
+        )
 
 
 def stamp_errors(
@@ -173,20 +207,28 @@ def stamp_errors(
 
     half = max(BOX_SIDE // 2, math.ceil(side / 2 / sampled_px))
     whole, boxed = (
-        [seen(images, *how) for images in (wanted, shown)] for how in ((sampled_px, half), (pixel_px, BOX_SIDE // 2))
+        [seen(images, *how) for images in (wanted, shown)]
+        for how in ((sampled_px, half), (pixel_px, BOX_SIDE // 2))
     )
     middle = np.full(count, half)
     off_px: dict[Centroider, FloatArray] = {}
     for kind in FAMILY:
         views, width_px, pixels = (
-            (boxed, pixel_px, brightest(boxed[0])) if kind in BOXES else (whole, sampled_px, (middle, middle))
+            (boxed, pixel_px, brightest(boxed[0]))
+            if kind in BOXES
+            else (whole, sampled_px, (middle, middle))
         )
-        there, here = (np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px for view in views)
+        there, here = (
+            np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px
+            for view in views
+        )
         off_px[kind] = np.where(shown.sum(axis=(1, 2)) > 0, here - there, np.inf)
     return off_px
 
 
-def _collected(star_px: FloatArray, side: int, pixel_px: float, blur_px: float, half: int) -> FloatArray:
+def _collected(
+    star_px: FloatArray, side: int, pixel_px: float, blur_px: float, half: int
+) -> FloatArray:
     """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor
     pixels, along one axis.
 
@@ -208,4 +250,6 @@ def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:
     from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
     sigmas = to_px / blur_px
-    return np.asarray(blur_px * (sigmas * ndtr(sigmas) + np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi)))
+    return np.asarray(
+        blur_px * (sigmas * ndtr(sigmas) + np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi))
+    )

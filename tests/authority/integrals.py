@@ -13,7 +13,11 @@ from hilstar.sky.spectrum import DATA_DIR
 
 def read(name: str) -> tuple[np.ndarray, np.ndarray]:
     """The columns of one of hilstar's data files."""
-    rows = [row for row in csv.reader((DATA_DIR / f"{name}.csv").read_text().splitlines()) if row[0][0].isdigit()]
+    rows = [
+        row
+        for row in csv.reader((DATA_DIR / f"{name}.csv").read_text().splitlines())
+        if row[0][0].isdigit()
+    ]
     return np.array(rows, dtype=float).T
 
 

@@ -98,7 +98,9 @@ def test_stars_stand_where_astropy_has_them_in_altitude_and_azimuth():
         relative_humidity=0.3,
         obswl=wavelength_nm * u.nm,
     )
-    x, y, z = unit_vectors_icrs(stars.catalog.taken(stars.row[which]), file.config.sky.epoch_jyear).T
+    x, y, z = unit_vectors_icrs(
+        stars.catalog.taken(stars.row[which]), file.config.sky.epoch_jyear
+    ).T
     with warnings.catch_warnings(), iers.conf.set_temp("auto_download", False):
         warnings.simplefilter("ignore")
         table = iers.IERS_A.read(iers.IERS_A_FILE)
@@ -109,19 +111,33 @@ def test_stars_stand_where_astropy_has_them_in_altitude_and_azimuth():
     off_arcsec = np.degrees(np.linalg.norm(enu - wanted, axis=1)) * 3600
     assert len(which) > 50
     assert off_arcsec.max() < REFRACTION_LIMIT_ARCSEC
-    bent_arcsec = np.degrees(np.linalg.norm(seen.directions(which) - replace(seen, air=None).directions(which), axis=1)) * 3600
+    bent_arcsec = (
+        np.degrees(
+            np.linalg.norm(
+                seen.directions(which) - replace(seen, air=None).directions(which), axis=1
+            )
+        )
+        * 3600
+    )
     assert bent_arcsec.max() > 300
 
 
 def mean_wavelength_nm(file) -> float:
     nm, qe = read("ccd47-20")
     weight = qe * nm
-    return integral(lambda w: float(np.interp(w, nm, weight)) * w, nm) / integral(lambda w: float(np.interp(w, nm, weight)), nm)
+    return integral(lambda w: float(np.interp(w, nm, weight)) * w, nm) / integral(
+        lambda w: float(np.interp(w, nm, weight)), nm
+    )
 
 
 def dimmed(file, masses: float, v_mag, bv_mag, vi_mag) -> np.ndarray:
     """How many magnitudes the air of `[site]` takes of stars of these colours."""
-    catalog = replace(stars_and_sky()[1].catalog.taken(np.arange(len(bv_mag))), v_mag=v_mag, bv_mag=bv_mag, vi_mag=vi_mag)
+    catalog = replace(
+        stars_and_sky()[1].catalog.taken(np.arange(len(bv_mag))),
+        v_mag=v_mag,
+        bv_mag=bv_mag,
+        vi_mag=vi_mag,
+    )
     air = site_air(file.config, file.folder, catalog)
     altitude = brentq(lambda a: float(air_mass(np.array([a]))[0]) - masses, 0.01, math.pi / 2)
     return -2.5 * np.log10(air.shares(np.arange(len(bv_mag)), np.full(len(bv_mag), altitude))[0])
@@ -133,9 +149,14 @@ def test_extinction_is_that_of_each_stars_own_spectrum(masses: float):
     optics = bench_channels(file.config.tracker, file.folder)[0]
     nm, extinction = np.arange(300.0, 1050.5, 0.5), extinction_curve("lick")
     through = Curve(
-        nm, optics.transmission(nm) * 10 ** (-0.4 * masses * np.interp(nm, extinction.wavelength_nm, extinction.value))
+        nm,
+        optics.transmission(nm)
+        * 10 ** (-0.4 * masses * np.interp(nm, extinction.wavelength_nm, extinction.value)),
     )
-    own = [library_electrons_per_s(library, one, Photometry()) for one in (replace(optics, transmission=through), optics)]
+    own = [
+        library_electrons_per_s(library, one, Photometry())
+        for one in (replace(optics, transmission=through), optics)
+    ]
     usual = library.vi_mag < 2.0
     mag = dimmed(file, masses, np.zeros(len(usual)), library.bv_mag, library.vi_mag)[usual]
     off = mag + 2.5 * np.log10(own[0] / own[1])[usual]
@@ -147,16 +168,26 @@ def test_extinction_is_that_of_each_stars_own_spectrum(masses: float):
 
 def test_extinction_of_a_black_body_is_its_integral(tmp_path):
     knots, mag = read_columns("extinction", 4)
-    (tmp_path / "k.csv").write_text("wavelength_nm,value\n" + "".join(f"{a},{b}\n" for a, b in zip(knots, mag, strict=True)))
+    (tmp_path / "k.csv").write_text(
+        "wavelength_nm,value\n" + "".join(f"{a},{b}\n" for a, b in zip(knots, mag, strict=True))
+    )
     file = bench(tmp_path, 'extinction = "k.csv"', 'spectrum = "blackbody"')
     nm, qe = read("ccd47-20")
     temperature_k = 7000.0
-    bv = brentq(lambda b: float(TEMPERATURE_SCALES["ballesteros2012"](np.array([b]))[0]) - temperature_k, -0.2, 1.5)
+    bv = brentq(
+        lambda b: float(TEMPERATURE_SCALES["ballesteros2012"](np.array([b]))[0]) - temperature_k,
+        -0.2,
+        1.5,
+    )
 
     def rate(masses: float) -> float:
         def light(w: float) -> float:
             spectrum = w**-4 / np.expm1(1.438776877e7 / (w * temperature_k))
-            return float(np.interp(w, nm, qe)) * spectrum * 10 ** (-0.4 * masses * float(np.interp(w, knots, mag)))
+            return (
+                float(np.interp(w, nm, qe))
+                * spectrum
+                * 10 ** (-0.4 * masses * float(np.interp(w, knots, mag)))
+            )
 
         return integral(light, np.union1d(nm, knots[(knots > nm[0]) & (knots < nm[-1])]))
 
@@ -173,7 +204,9 @@ def read_columns(name: str, column: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_skys_glow_is_the_integral_of_its_spectrum():
     file = bench(Path(), "sky_v_mag_arcsec2 = 20.5")
-    glow = site_glow_e_per_s_sr(file.config, file.folder, bench_channels(file.config.tracker, file.folder)[0])
+    glow = site_glow_e_per_s_sr(
+        file.config, file.folder, bench_channels(file.config.tracker, file.folder)[0]
+    )
     nm, qe = read("ccd47-20")
     knots, flux = read("night_sky")
 
@@ -188,9 +221,19 @@ def test_the_skys_glow_is_the_integral_of_its_spectrum():
         lambda w: np.interp(w, v_nm, response), visible
     )
     per_joule = 1e-9 / (6.62607015e-34 * 299792458)
-    electrons = per_joule * plain(lambda w: spectrum(w) * np.interp(w, nm, qe) * w, np.union1d(nm[nm > knots[0]], inside))
+    electrons = per_joule * plain(
+        lambda w: spectrum(w) * np.interp(w, nm, qe) * w, np.union1d(nm[nm > knots[0]], inside)
+    )
     area_m2 = math.pi / 4 * 0.0184**2
-    wanted = 3.631e-2 * 10 ** (-0.4 * 20.5) / mean * electrons * 1e-9 * area_m2 * (180 * 3600 / math.pi) ** 2
+    wanted = (
+        3.631e-2
+        * 10 ** (-0.4 * 20.5)
+        / mean
+        * electrons
+        * 1e-9
+        * area_m2
+        * (180 * 3600 / math.pi) ** 2
+    )
     assert glow == pytest.approx(wanted, rel=GLOW_LIMIT)
 
 
@@ -223,7 +266,9 @@ def test_stars_twinkle_by_youngs_law(tmp_path):
     freedom = 59 * light.shape[1]
     # The field is 6 degrees high: X^1.75 changes by a tenth over it. 4 sigmas of the scatter's own
     # error beside that.
-    assert light.std(ddof=1, axis=0).mean() == pytest.approx(sigma, rel=0.1 + 4 / math.sqrt(2 * freedom))
+    assert light.std(ddof=1, axis=0).mean() == pytest.approx(
+        sigma, rel=0.1 + 4 / math.sqrt(2 * freedom)
+    )
     correlation = np.corrcoef(light.T)[np.triu_indices(light.shape[1], 1)]
     assert abs(correlation.mean()) < 4 / math.sqrt(60 * len(correlation))  # each by itself
     # and no warning
@@ -234,7 +279,9 @@ def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
     """An attitude towards the north at an altitude."""
     east = np.cross([0.0, 0.0, 1.0], up)
     north = np.cross(up, east / np.linalg.norm(east))
-    x, y, z = math.sin(math.radians(altitude_deg)) * up + math.cos(math.radians(altitude_deg)) * north
+    x, y, z = (
+        math.sin(math.radians(altitude_deg)) * up + math.cos(math.radians(altitude_deg)) * north
+    )
     return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.asin(z)), 0.0)
 
 
@@ -242,7 +289,10 @@ def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
     file = bench(tmp_path, "sky_v_mag_arcsec2 = 20.5")
     with Simulator(file) as simulator:
         up = simulator.moving.air.above(simulator.moving.utc_ns(None)).up
-        found = [simulator.expose(simulator.view(facing(up, altitude), np.zeros(3)), None) for altitude in (45.0, 0.0, -20.0)]
+        found = [
+            simulator.expose(simulator.view(facing(up, altitude), np.zeros(3)), None)
+            for altitude in (45.0, 0.0, -20.0)
+        ]
     high, level, low = found
     assert len(low.truth) == 0
     assert low.mean_e.max() == 0
@@ -265,7 +315,9 @@ def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
 )
 def test_a_wrong_site_is_one_line(tmp_path, keys, said):
     (tmp_path / "bench.toml").write_text(BENCH.format(site=keys, sky=""))
-    result = run_hilstar_here("frame", tmp_path / "bench.toml", "--radec", "40,45,0", "-o", tmp_path / "frame.fits")
+    result = run_hilstar_here(
+        "frame", tmp_path / "bench.toml", "--radec", "40,45,0", "-o", tmp_path / "frame.fits"
+    )
     assert result.returncode == 2
     assert said in result.stderr
     assert result.stderr.count("\n") == 1

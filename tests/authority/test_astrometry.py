@@ -40,7 +40,9 @@ def moved_by_astropy(catalog: Catalog, epoch_jyear: float) -> np.ndarray:
         obstime=Time(1991.25, format="jyear", scale="tcb"),
         frame="icrs",
     )
-    moved = coordinates.apply_space_motion(new_obstime=Time(epoch_jyear, format="jyear", scale="tcb"))
+    moved = coordinates.apply_space_motion(
+        new_obstime=Time(epoch_jyear, format="jyear", scale="tcb")
+    )
     ra, dec = moved.ra.rad, moved.dec.rad
     return np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
 
@@ -68,7 +70,9 @@ def test_stars_within_an_arcsecond_of_a_pole_move_as_well_as_any():
         "pm_dec_mas_yr": np.array([-300.0, 800.0, 2000.0, -100.0, 3000.0]),
     }
     catalog = plain_catalog("HIP", 5, columns)
-    error_mas = separation_rad(unit_vectors_icrs(catalog, 2026.0), moved_by_astropy(catalog, 2026.0)) / MAS
+    error_mas = (
+        separation_rad(unit_vectors_icrs(catalog, 2026.0), moved_by_astropy(catalog, 2026.0)) / MAS
+    )
     assert error_mas.max() < LIMIT_MAS
 
 
@@ -98,7 +102,9 @@ def test_aberration_is_the_exact_formula_at_any_speed(rng):
         assert np.abs(np.einsum("ij,ij->i", seen, np.cross(stars, velocity))).max() < 1e-12
 
 
-def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the_earth(bench_with, rng):
+def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the_earth(
+    bench_with, rng
+):
     """The Earth's velocity in the bench file, the spacecraft's with each frame; another frame's
     is not left behind.
     """
@@ -111,7 +117,12 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
         sprites = bench.light(bench.view(q, velocity_km_s=velocity_km_s))
         assert sprites is not None
         rows = {int(hip): row for row, hip in enumerate(still.shown_stars.hip)}
-        natural = np.array([still.shown_stars.vectors[rows[int(hip)]] for hip in bench.shown_stars.hip[sprites.star]])
+        natural = np.array(
+            [
+                still.shown_stars.vectors[rows[int(hip)]]
+                for hip in bench.shown_stars.hip[sprites.star]
+            ]
+        )
         beta = (earth_km_s + velocity_km_s) / LIGHT_KM_S
         seen = erfa.ab(natural, beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))
         x_px, y_px = bench.camera.project(seen @ rotation.T)
@@ -125,12 +136,16 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
 
 def test_a_spacecraft_s_velocity_joins_that_of_the_earth_by_the_ephemeris(bench_with):
     """As Basilisk's does about the Earth: from its centre, and from there aberrated once more."""
-    bench = bench_with('[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n[spacecraft]\norbit = "geocentre"\n')
+    bench = bench_with(
+        '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n[spacecraft]\norbit = "geocentre"\n'
+    )
     velocity_km_s, q = np.array([3.0, -6.5, 2.5]), from_radec_roll_deg(200.0, 35.0, 10.0)
     sprites = bench.light(bench.view(q, velocity_km_s=velocity_km_s))
     assert sprites is not None
     beta = velocity_km_s / LIGHT_KM_S
-    seen = erfa.ab(bench.shown_stars.vectors[sprites.star], beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))
+    seen = erfa.ab(
+        bench.shown_stars.vectors[sprites.star], beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta)
+    )
     x_px, y_px = bench.camera.project(seen @ (bench.camera.cam_to_image @ to_matrix(q)).T)
     assert len(sprites) > 30
     assert np.hypot(x_px - sprites.x_px, y_px - sprites.y_px).max() < ORBIT_LIMIT_PX
@@ -138,7 +153,9 @@ def test_a_spacecraft_s_velocity_joins_that_of_the_earth_by_the_ephemeris(bench_
 
 def test_pixels_are_those_of_astropy_s_tangent_projection(bench_with, rng):
     """Our camera against WCSLIB's TAN, alignment and principal point included."""
-    bench = bench_with("q_cam_to_mon = [0.99, 0.05, -0.1, 0.0854]\nprincipal_point_px = [140.0, 130.5]\n")
+    bench = bench_with(
+        "q_cam_to_mon = [0.99, 0.05, -0.1, 0.0854]\nprincipal_point_px = [140.0, 130.5]\n"
+    )
     for ra, dec, roll in ((84.0, -1.2, 0.0), (0.001, 89.7, 33.0), (359.9, -60.0, 250.0)):
         q = from_radec_roll_deg(ra, dec, roll)
         sprites = bench.sprites(q)

@@ -9,7 +9,14 @@ import astropy.units as u
 import erfa
 import numpy as np
 import pytest
-from astropy.coordinates import GCRS, Distance, EarthLocation, SkyCoord, get_body, solar_system_ephemeris
+from astropy.coordinates import (
+    GCRS,
+    Distance,
+    EarthLocation,
+    SkyCoord,
+    get_body,
+    solar_system_ephemeris,
+)
 from astropy.time import Time
 from skyfield.api import EarthSatellite
 from skyfield.jpllib import SpiceKernel
@@ -61,14 +68,21 @@ def theirs() -> Iterator[tuple[Timescale, SpiceKernel]]:
 
 
 def in_skyfield(
-    theirs: tuple[Timescale, SpiceKernel], utcs_ns: list[int], satellite: EarthSatellite | None = None
+    theirs: tuple[Timescale, SpiceKernel],
+    utcs_ns: list[int],
+    satellite: EarthSatellite | None = None,
 ) -> np.ndarray:
     """Apparent unit vectors of ALL_BODIES at UTCs (n,), shape (n, 9, 3)."""
     scale, kernel = theirs
     days, rest_ns = np.divmod(np.array(utcs_ns), 86_400 * 10**9)
     observer = kernel["earth"] if satellite is None else kernel["earth"] + satellite
     now = observer.at(scale.utc(1970, 1, 1 + days, 0, 0, rest_ns / 1e9))
-    return unit(np.stack([now.observe(kernel[SKYFIELD_NAMES[name]]).apparent().xyz.au.T for name in ALL_BODIES], axis=1))
+    return unit(
+        np.stack(
+            [now.observe(kernel[SKYFIELD_NAMES[name]]).apparent().xyz.au.T for name in ALL_BODIES],
+            axis=1,
+        )
+    )
 
 
 def test_200_random_dates_agree_with_skyfield(rng, theirs):
@@ -99,14 +113,68 @@ def test_astropys_route_through_erfa_agrees(rng):
 SITE_DEG_M = (-67.787260, -22.959748, 5186.0)
 HORIZONS_EQUINOX_ARCSEC = 0.05102376467
 MOON_RA_DEG = (
-    *(170.167332531, 170.560688674, 170.923834838, 171.271663481, 171.620188972, 171.985340827, 172.381766539, 172.821772139),
-    *(173.314502650, 173.865422398, 174.476108551, 175.144332386, 175.864375310, 176.627519827, 177.422655853, 178.236955730),
-    *(179.056584831, 179.867427392, 180.655815385, 181.409252074, 182.117113814, 182.771311578, 183.366872837, 183.902395443),
+    *(
+        170.167332531,
+        170.560688674,
+        170.923834838,
+        171.271663481,
+        171.620188972,
+        171.985340827,
+        172.381766539,
+        172.821772139,
+    ),
+    *(
+        173.314502650,
+        173.865422398,
+        174.476108551,
+        175.144332386,
+        175.864375310,
+        176.627519827,
+        177.422655853,
+        178.236955730,
+    ),
+    *(
+        179.056584831,
+        179.867427392,
+        180.655815385,
+        181.409252074,
+        182.117113814,
+        182.771311578,
+        183.366872837,
+        183.902395443,
+    ),
 )
 MOON_DEC_DEG = (
-    *(10.269112037, 10.058820647, 9.837152044, 9.603724551, 9.358956528, 9.104012390, 8.840674927, 8.571162442),
-    *(8.297917326, 8.023394488, 7.749873882, 7.479312991, 7.213246666, 6.952732614, 6.698336823, 6.450150213),
-    *(6.207828142, 5.970645962, 5.737565957, 5.507313851, 5.278462034, 5.049521497, 4.819038911, 4.585696512),
+    *(
+        10.269112037,
+        10.058820647,
+        9.837152044,
+        9.603724551,
+        9.358956528,
+        9.104012390,
+        8.840674927,
+        8.571162442,
+    ),
+    *(
+        8.297917326,
+        8.023394488,
+        7.749873882,
+        7.479312991,
+        7.213246666,
+        6.952732614,
+        6.698336823,
+        6.450150213,
+    ),
+    *(
+        6.207828142,
+        5.970645962,
+        5.737565957,
+        5.507313851,
+        5.278462034,
+        5.049521497,
+        4.819038911,
+        4.585696512,
+    ),
 )
 
 
@@ -118,9 +186,9 @@ class Site:
     @cache  # noqa: B019 - it lives as long as the test; Astropy takes 0.1 s
     def state(self, utc_ns: int) -> tuple[np.ndarray, np.ndarray]:
         lon, lat, height = SITE_DEG_M
-        place, velocity = EarthLocation.from_geodetic(lon * u.deg, lat * u.deg, height * u.m).get_gcrs_posvel(
-            Time(utc_ns / 1e9, format="unix", scale="utc")
-        )
+        place, velocity = EarthLocation.from_geodetic(
+            lon * u.deg, lat * u.deg, height * u.m
+        ).get_gcrs_posvel(Time(utc_ns / 1e9, format="unix", scale="utc"))
         return place.xyz.to_value(u.km), velocity.xyz.to_value(u.km / u.s)
 
 
@@ -130,7 +198,9 @@ def test_the_moon_over_a_turning_earth_is_where_horizons_has_it():
         utc = start + hour * 3600 * 10**9
         tdb = tdb_of_utc(utc)
         seen = erfa.pnm06a(tdb.whole, tdb.part) @ seen_at(utc, orbit=Site())[1]
-        theirs = erfa.s2c(np.radians(ra_deg) + HORIZONS_EQUINOX_ARCSEC * ARCSEC, np.radians(dec_deg))
+        theirs = erfa.s2c(
+            np.radians(ra_deg) + HORIZONS_EQUINOX_ARCSEC * ARCSEC, np.radians(dec_deg)
+        )
         assert apart_arcsec(seen, theirs) < HORIZONS_MOON_LIMIT_ARCSEC
 
 
@@ -165,15 +235,28 @@ def test_stars_near_and_far_are_seen_where_astropy_has_them(rng):
         parallax_mas = rng.uniform(1.0, 800.0, size=len(vectors))
         parallax_mas[0] = np.nan
         far = Distance(np.where(np.isnan(parallax_mas), 1e12, 1000 / parallax_mas), u.pc)
-        theirs = SkyCoord(ra * u.rad, dec * u.rad, distance=far).transform_to(frame).cartesian.xyz.value.T
-        assert apart_arcsec(moving_sky(utc).stars_seen(vectors, parallax_mas), unit(theirs)).max() < ASTROPY_LIMIT_ARCSEC
+        theirs = (
+            SkyCoord(ra * u.rad, dec * u.rad, distance=far)
+            .transform_to(frame)
+            .cartesian.xyz.value.T
+        )
+        assert (
+            apart_arcsec(moving_sky(utc).stars_seen(vectors, parallax_mas), unit(theirs)).max()
+            < ASTROPY_LIMIT_ARCSEC
+        )
 
 
-def test_from_a_low_orbit_bodies_are_where_skyfield_has_them_and_the_moon_by_a_degree_elsewhere(theirs):
-    satellite = EarthSatellite(*STATION_TLE.splitlines()[1:], STATION_TLE.splitlines()[0], theirs[0])
+def test_from_a_low_orbit_bodies_are_where_skyfield_has_them_and_the_moon_by_a_degree_elsewhere(
+    theirs,
+):
+    satellite = EarthSatellite(
+        *STATION_TLE.splitlines()[1:], STATION_TLE.splitlines()[0], theirs[0]
+    )
     utcs = [utc_ns(STATION_UTC) + minute * 60 * 10**9 for minute in range(0, 93, 7)]
     ours = np.array([seen_at(utc, orbit=TleOrbit(STATION_TLE, "station.tle")) for utc in utcs])
     assert apart_arcsec(ours, in_skyfield(theirs, utcs, satellite)).max() < ORBIT_LIMIT_ARCSEC
-    parallax_deg = [apart_arcsec(seen[1], seen_at(utc)[1]) / 3600 for seen, utc in zip(ours, utcs, strict=True)]
+    parallax_deg = [
+        apart_arcsec(seen[1], seen_at(utc)[1]) / 3600 for seen, utc in zip(ours, utcs, strict=True)
+    ]
     # 6720 km at right angles to the way to the Moon, 369 000 km that day, is 1.04 deg
     assert 1.0 < max(parallax_deg) < 1.05

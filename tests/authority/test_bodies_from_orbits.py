@@ -34,7 +34,11 @@ DAY_NS = 86_400 * 10**9
 MINUTE_NS = 60 * 10**9
 KINDS = ("geocentre", "low", "geostationary", "Molniya")
 # Eccentricity, inclination (degrees), revolutions a day
-ORBITS = {"low": (0.001, 51.6, 15.5), "geostationary": (0.0002, 0.05, 1.00273), "Molniya": (0.74, 63.4, 2.00577)}
+ORBITS = {
+    "low": (0.001, 51.6, 15.5),
+    "geostationary": (0.0002, 0.05, 1.00273),
+    "Molniya": (0.74, 63.4, 2.00577),
+}
 
 
 def elements(kind: str, utc_ns: int, rng: np.random.Generator) -> list[str]:
@@ -55,9 +59,16 @@ def message(satellite: EarthSatellite, scale, utc_ns: int) -> str:
     state = satellite.at(scale.utc(1970, 1, 1 + days, 0, 0, rest_ns / 1e9))
     numbers = np.concatenate([state.xyz.km, state.velocity.km_per_s]).T
     rows = [
-        f"{np.datetime64(int(t), 'ns')} " + " ".join(f"{n:.9f}" for n in row) for t, row in zip(stamps, numbers, strict=True)
+        f"{np.datetime64(int(t), 'ns')} " + " ".join(f"{n:.9f}" for n in row)
+        for t, row in zip(stamps, numbers, strict=True)
     ]
-    meta = ["OBJECT_NAME = X", "OBJECT_ID = 1998-067A", "CENTER_NAME = EARTH", "REF_FRAME = ICRF", "TIME_SYSTEM = UTC"]
+    meta = [
+        "OBJECT_NAME = X",
+        "OBJECT_ID = 1998-067A",
+        "CENTER_NAME = EARTH",
+        "REF_FRAME = ICRF",
+        "TIME_SYSTEM = UTC",
+    ]
     head = ["CCSDS_OEM_VERS = 2.0", "CREATION_DATE = 2008-09-20T00:00:00", "ORIGINATOR = X"]
     return "\n".join([*head, "META_START", *meta, "META_STOP", *rows, ""])
 
@@ -73,9 +84,17 @@ def test_places_and_magnitudes_on_fifty_dates_of_each_observer_are_skyfield_s(ki
             observer = kernel["earth"] if satellite is None else kernel["earth"] + satellite
             sky = moving_sky(utc_ns, orbit=orbit)
             seen = [observer.at(now).observe(kernel[SKYFIELD_NAMES[name]]) for name in ALL_BODIES]
-            theirs = np.array([one.apparent().xyz.au / one.apparent().distance().au for one in seen])
-            beside = np.ones(len(theirs), bool) if satellite is None else clear_of_earth(theirs, -satellite.at(now).xyz.km)
-            off_arcsec += (np.linalg.norm(sky.sight(0).directions - theirs, axis=1) / ARCSEC)[beside].tolist()
+            theirs = np.array(
+                [one.apparent().xyz.au / one.apparent().distance().au for one in seen]
+            )
+            beside = (
+                np.ones(len(theirs), bool)
+                if satellite is None
+                else clear_of_earth(theirs, -satellite.at(now).xyz.km)
+            )
+            off_arcsec += (np.linalg.norm(sky.sight(0).directions - theirs, axis=1) / ARCSEC)[
+                beside
+            ].tolist()
             mine = sky.among(NO_STARS).v_mag
             about_sun = observer.at(now) - kernel["sun"].at(now)
             for name, v_mag, one in zip(ALL_BODIES[2:], mine[2:], seen[2:], strict=True):
@@ -83,16 +102,23 @@ def test_places_and_magnitudes_on_fifty_dates_of_each_observer_are_skyfield_s(ki
                 one.center_barycentric = about_sun
                 off_mag.append(abs(v_mag - float(planetary_magnitude(one))))
             to_sun, to_moon = seen[0].xyz.km, seen[1].xyz.km
-            assert mine[0] == pytest.approx(SUN_V_MAG + 5 * np.log10(seen[0].distance().au), abs=MAGNITUDE_MAG)
+            assert mine[0] == pytest.approx(
+                SUN_V_MAG + 5 * np.log10(seen[0].distance().au), abs=MAGNITUDE_MAG
+            )
             size = np.linalg.norm(to_sun - to_moon) / KM_PER_AU, np.linalg.norm(to_moon)
-            assert mine[1] == pytest.approx(moon_v_mag(*size, phase_angle_deg(to_moon - to_sun, to_moon)), abs=MOON_MAG)
+            assert mine[1] == pytest.approx(
+                moon_v_mag(*size, phase_angle_deg(to_moon - to_sun, to_moon)), abs=MOON_MAG
+            )
             centre = kernel["earth"].at(now).observe(kernel["moon"]).xyz.km
             parallax_deg.append(phase_angle_deg(centre, to_moon))
     # Neptune's before 2000 are open at phases over 1.9 degrees, which it has near quadrature
     assert np.isfinite(off_mag).sum() > DATES * (len(PLANETS) - 1)
     assert np.max(off_arcsec) < MEASURED_ARCSEC[kind] < PLACE_ARCSEC
     assert np.nanmax(off_mag) < MAGNITUDE_MAG
-    assert max(mag for mag, name in direct_mag if name != "Mercury" and not np.isnan(mag)) < MAGNITUDE_MAG
+    assert (
+        max(mag for mag, name in direct_mag if name != "Mercury" and not np.isnan(mag))
+        < MAGNITUDE_MAG
+    )
     if kind == "low":
         assert 0.9 < max(parallax_deg) < 1.1
 

@@ -9,7 +9,14 @@ import pytest
 from skyfield import magnitudelib
 
 from hilstar.sky.bodies import light
-from hilstar.sky.bodies.light import KM_PER_AU, bodies_bv_mag, bodies_electrons_per_s, body_v_mag, moon_v_mag, phase_angle_deg
+from hilstar.sky.bodies.light import (
+    KM_PER_AU,
+    bodies_bv_mag,
+    bodies_electrons_per_s,
+    body_v_mag,
+    moon_v_mag,
+    phase_angle_deg,
+)
 from hilstar.sky.bodies.moving import PLANETS
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
@@ -34,7 +41,9 @@ def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray,
     km.
     """
     phase = np.radians(phase_deg)
-    return np.array([sun_au, 0, 0]) * KM_PER_AU, distance_au * KM_PER_AU * np.array([np.cos(phase), np.sin(phase), 0])
+    return np.array([sun_au, 0, 0]) * KM_PER_AU, distance_au * KM_PER_AU * np.array(
+        [np.cos(phase), np.sin(phase), 0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -50,7 +59,9 @@ def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray,
     ],
 )
 def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase_deg, v_mag):
-    assert body_v_mag(name, *at(sun_au, distance_au, phase_deg), 2020.0) == pytest.approx(v_mag, abs=PRINTED_MAG)
+    assert body_v_mag(name, *at(sun_au, distance_au, phase_deg), 2020.0) == pytest.approx(
+        v_mag, abs=PRINTED_MAG
+    )
 
 
 def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
@@ -65,17 +76,28 @@ def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
         for name in PLANETS:
             here = seen.seen_km[ALL_BODIES.index(name)]
             sun = here + seen.view.from_sun_km
-            sizes = np.linalg.norm(sun) / KM_PER_AU, np.linalg.norm(here) / KM_PER_AU, phase_angle_deg(sun, here)
+            sizes = (
+                np.linalg.norm(sun) / KM_PER_AU,
+                np.linalg.norm(here) / KM_PER_AU,
+                phase_angle_deg(sun, here),
+            )
             if name in poles:
-                tilts = [np.degrees(np.arccos(poles[name] @ v / np.linalg.norm(v))) - 90 for v in (sun, here)]
+                tilts = [
+                    np.degrees(np.arccos(poles[name] @ v / np.linalg.norm(v))) - 90
+                    for v in (sun, here)
+                ]
                 theirs = functions[name](*sizes, *tilts)
             else:
-                theirs = functions[name](*sizes, jyear) if name == "Neptune" else functions[name](*sizes)
+                theirs = (
+                    functions[name](*sizes, jyear) if name == "Neptune" else functions[name](*sizes)
+                )
             if np.isnan(theirs):
                 # Neptune before 2000, at phases over 1.9 degrees, which Skyfield leaves open
                 continue
             limit = SKYFIELD_FAR_MAG if name in {"Uranus", "Neptune"} else SKYFIELD_MAG
-            assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=limit), name
+            assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=limit), (
+                name
+            )
 
 
 def rolo_albedo(phase_deg: float) -> float:
@@ -84,10 +106,17 @@ def rolo_albedo(phase_deg: float) -> float:
     """
     g = np.radians(phase_deg)
     log_a = -2.10782 - 1.66736 * g + 0.41697 * g**2 - 0.22026 * g**3
-    return float(np.exp(log_a + 0.36814 * np.exp(-phase_deg / 4.06054) - 0.09815 * np.exp(-phase_deg / 12.8802)))
+    return float(
+        np.exp(
+            log_a + 0.36814 * np.exp(-phase_deg / 4.06054) - 0.09815 * np.exp(-phase_deg / 12.8802)
+        )
+    )
 
 
-@pytest.mark.parametrize(("phase_deg", "limit_mag"), [(2, 0.17), *((g, ROLO_MAG) for g in (6, 10, 20, 30, 45, 60, 75, 90, 97))])
+@pytest.mark.parametrize(
+    ("phase_deg", "limit_mag"),
+    [(2, 0.17), *((g, ROLO_MAG) for g in (6, 10, 20, 30, 45, 60, 75, 90, 97))],
+)
 def test_the_moon_is_as_bright_as_in_the_rolo_model(phase_deg, limit_mag):
     """V = V_Sun - 2.5 log10(A Omega / pi), eq. 8, with the Moon's 6.4177e-5 sr at 384 400 km."""
     rolo = -26.76 - 2.5 * np.log10(rolo_albedo(phase_deg) * 6.4177e-5 / np.pi)
@@ -97,7 +126,20 @@ def test_the_moon_is_as_bright_as_in_the_rolo_model(phase_deg, limit_mag):
 # Allen 1973, Astrophysical Quantities, 3rd edition, p. 143: phase in degrees, magnitudes below the
 # full Moon.
 ALLEN = {
-    **{0: 0.0, 5: 0.08, 10: 0.23, 20: 0.51, 30: 0.79, 40: 1.06, 50: 1.35, 60: 1.62, 70: 1.91, 80: 2.24, 90: 2.63, 100: 3.04},
+    **{
+        0: 0.0,
+        5: 0.08,
+        10: 0.23,
+        20: 0.51,
+        30: 0.79,
+        40: 1.06,
+        50: 1.35,
+        60: 1.62,
+        70: 1.91,
+        80: 2.24,
+        90: 2.63,
+        100: 3.04,
+    },
     **{110: 3.48, 120: 3.93, 130: 4.44, 140: 5.07, 150: 5.9, 160: 7.5},
 }
 
@@ -105,7 +147,9 @@ ALLEN = {
 def test_the_moon_is_as_bright_as_in_allen_s_table_and_its_crescent_goes_as_the_cube_of_what_is_lit():
     for phase_deg, below_full in ALLEN.items():
         limit = ALLEN_MAG if phase_deg < 160 else ALLEN_THIN_MAG
-        assert moon_v_mag(1.0, 384_400.0, phase_deg) - moon_v_mag(1.0, 384_400.0, 0) == pytest.approx(below_full, abs=limit)
+        assert moon_v_mag(1.0, 384_400.0, phase_deg) - moon_v_mag(
+            1.0, 384_400.0, 0
+        ) == pytest.approx(below_full, abs=limit)
     # Russell 1916, ApJ 43, 103, p. 117
     dimmer = moon_v_mag(1.0, 384_400.0, 175.0) - moon_v_mag(1.0, 384_400.0, 160.0)
     assert dimmer == pytest.approx(2.5 * np.log10((20 / 5) ** 3), abs=1e-9)
@@ -114,14 +158,24 @@ def test_the_moon_is_as_bright_as_in_allen_s_table_and_its_crescent_goes_as_the_
 def test_the_earth_is_as_bright_as_in_skyfield():
     for phase_deg in (0.0, 45.0, 90.0, 150.0, 170.0):
         theirs = magnitudelib._earth_magnitude(0.99, 0.0026, phase_deg)
-        assert body_v_mag("Earth", *at(0.99, 0.0026, phase_deg), 2020.0) == pytest.approx(float(theirs), abs=SKYFIELD_MAG)
+        assert body_v_mag("Earth", *at(0.99, 0.0026, phase_deg), 2020.0) == pytest.approx(
+            float(theirs), abs=SKYFIELD_MAG
+        )
 
 
 def test_colours_are_those_of_the_paper():
     """B-V of its table 3, within what rounding of table 7's albedos leaves (0.001 of 0.06 for
     Mars: 0.02 mag).
     """
-    published = {"Mercury": 0.97, "Venus": 0.70, "Mars": 1.36, "Jupiter": 0.86, "Saturn": 1.07, "Uranus": 0.50, "Neptune": 0.39}
+    published = {
+        "Mercury": 0.97,
+        "Venus": 0.70,
+        "Mars": 1.36,
+        "Jupiter": 0.86,
+        "Saturn": 1.07,
+        "Uranus": 0.50,
+        "Neptune": 0.39,
+    }
     assert bodies_bv_mag(tuple(published)) == pytest.approx(list(published.values()), abs=0.02)
     assert bodies_bv_mag(("Moon",))[0] == pytest.approx(0.92, abs=0.03)  # Allen 1973
 

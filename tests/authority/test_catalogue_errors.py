@@ -33,7 +33,9 @@ def star_pm(start, years, parallax_arcsec):
     """ra, dec, pm_ra (with cos dec) and pm_dec, radians, by ERFA."""
     ra, dec, pm_ra, pm_dec = start
     jd = 2448349.0625  # J1991.25
-    found = erfa.starpm(ra, dec, pm_ra / np.cos(dec), pm_dec, parallax_arcsec, 0.0, jd, 0.0, jd, years * 365.25)
+    found = erfa.starpm(
+        ra, dec, pm_ra / np.cos(dec), pm_dec, parallax_arcsec, 0.0, jd, 0.0, jd, years * 365.25
+    )
     return np.array([found[0], found[1], found[2] * np.cos(found[1]), found[3]])
 
 
@@ -42,7 +44,10 @@ def test_errors_are_those_of_erfa(epoch_jyear):
     catalog = load_catalog()
     # Every 389th star, and the fastest and the most northern ones.
     fast = np.argsort(-np.hypot(catalog.pm_ra_cosdec_mas_yr, catalog.pm_dec_mas_yr))[:5]
-    rows = np.union1d(np.arange(0, len(catalog), 389)[: STARS - 10], np.append(fast, np.argsort(-np.abs(catalog.dec_deg))[:5]))
+    rows = np.union1d(
+        np.arange(0, len(catalog), 389)[: STARS - 10],
+        np.append(fast, np.argsort(-np.abs(catalog.dec_deg))[:5]),
+    )
     stars = catalog.taken(rows)
     facts = facts_of(stars.hip)
     ours = motion_at(stars, facts, epoch_jyear).covariance
@@ -62,13 +67,20 @@ def test_errors_are_those_of_erfa(epoch_jyear):
             change[0] = (change[0] + np.pi) % (2 * np.pi) - np.pi
             jacobian[:, j] = change / (2 * step)
         jacobian[0] *= np.cos(star_pm(start, years, parallax)[1])
-        sigma = [facts[f"sigma_{name}_mas" + ("_yr" if name.startswith("pm") else "")][k] for name in MOTION]
+        sigma = [
+            facts[f"sigma_{name}_mas" + ("_yr" if name.startswith("pm") else "")][k]
+            for name in MOTION
+        ]
         correlation = np.eye(4)
         for i in range(4):
             for j in range(i + 1, 4):
-                correlation[i, j] = correlation[j, i] = facts[f"{MOTION[i]}_{MOTION[j]}_correlation"][k]
+                correlation[i, j] = correlation[j, i] = facts[
+                    f"{MOTION[i]}_{MOTION[j]}_correlation"
+                ][k]
         theirs = jacobian @ (np.outer(sigma, sigma) * correlation) @ jacobian.T
-        assert np.sqrt(np.diag(ours[k])) == pytest.approx(np.sqrt(np.diag(theirs)), rel=SIGMA_LIMIT), stars.hip[k]
+        assert np.sqrt(np.diag(ours[k])) == pytest.approx(
+            np.sqrt(np.diag(theirs)), rel=SIGMA_LIMIT
+        ), stars.hip[k]
 
 
 def test_errors_of_1991_are_the_catalogue_s():
@@ -91,9 +103,13 @@ def test_vega_and_ab_are_zero_points():
     assert vega == pytest.approx(CALSPEC_VEGA_E_PER_S * flux_ratio(0.03), rel=BINNED_LIMIT)
     # AB 0 from 400 to 800 nm, by hand: area F_nu / h ln(800 / 400).
     flat = Optics(20.0, Curve(np.array([400.0, 800.0]), np.ones(2)), constant_curve(1.0))
-    assert ab_electrons_per_s(flat) == pytest.approx(np.pi * 0.01**2 * 3.631e-23 / 6.62607015e-34 * np.log(2), rel=1e-9)
+    assert ab_electrons_per_s(flat) == pytest.approx(
+        np.pi * 0.01**2 * 3.631e-23 / 6.62607015e-34 * np.log(2), rel=1e-9
+    )
 
 
 def test_the_sun_s_bolometric_correction():
     colour = colours("pickles", "ballesteros2012", Photometry())["bolometric"]
-    assert colour(np.array([0.653]), np.array([0.702]), None)[0] == pytest.approx(SUN_BC_MAG, abs=BC_LIMIT_MAG)
+    assert colour(np.array([0.653]), np.array([0.702]), None)[0] == pytest.approx(
+        SUN_BC_MAG, abs=BC_LIMIT_MAG
+    )

@@ -28,7 +28,9 @@ GAIA_ZERO_MAG, GAIA_MEDIAN_MAG, GAIA_STAR_MAG, GAIA_VI_MAG, COOL_MAG = 0.03, 0.0
 def columns(name: str) -> dict[str, np.ndarray]:
     lines = [line for line in (HERE / name).read_text().splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))
-    return {key: np.array([float(row[key]) for row in rows]) for key in rows[0] if key.endswith("_mag")}
+    return {
+        key: np.array([float(row[key]) for row in rows]) for key in rows[0] if key.endswith("_mag")
+    }
 
 
 def test_tycho_magnitudes_become_those_of_the_ground():
@@ -47,9 +49,15 @@ def test_tycho_magnitudes_become_those_of_the_ground():
 def test_tycho_s_relation_is_the_published_one():
     """By hand at BT - VT = 0.3 and 1: the two polynomials of B - V, and that of V."""
     v, bv = from_tycho(np.array([10.3, 11.0]), np.array([10.0, 10.0]))
-    assert bv == pytest.approx([0.3 - 0.006 - 0.03207 + 0.013131, 1 - 0.007813 - 0.1489 + 0.03384], abs=1e-12)
+    assert bv == pytest.approx(
+        [0.3 - 0.006 - 0.03207 + 0.013131, 1 - 0.007813 - 0.1489 + 0.03384], abs=1e-12
+    )
     assert v == pytest.approx(
-        [10 + 0.00097 - 0.04002 + 0.0049374 - 0.00053946, 10 + 0.00097 - 0.1334 + 0.05486 - 0.01998], abs=1e-12
+        [
+            10 + 0.00097 - 0.04002 + 0.0049374 - 0.00053946,
+            10 + 0.00097 - 0.1334 + 0.05486 - 0.01998,
+        ],
+        abs=1e-12,
     )
 
 

@@ -18,7 +18,13 @@ from scipy.stats import norm
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.tracker.centroids import CentroidSettings, LocalBackground, estimate_background, find_stars, s_curves
+from hilstar.tracker.centroids import (
+    CentroidSettings,
+    LocalBackground,
+    estimate_background,
+    find_stars,
+    s_curves,
+)
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 
@@ -53,7 +59,9 @@ def profile(place_px: FloatArray, sigma_px: float, size_px: int) -> FloatArray:
 
 
 def star(x_px: float, y_px: float, sigma_px: float, size_px: int = 61) -> FloatArray:
-    return np.outer(profile(np.array(y_px), sigma_px, size_px), profile(np.array(x_px), sigma_px, size_px))
+    return np.outer(
+        profile(np.array(y_px), sigma_px, size_px), profile(np.array(x_px), sigma_px, size_px)
+    )
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,11 @@ def star_field(sigma_px: float, flux_e: float, rng: np.random.Generator, tile_px
     shares = (profile(middle + phase, sigma_px, tile_px) for phase in (phase_y, phase_x))
     y, x = shares
     tiles = flux_e * y[:, :, None] * x[:, None, :]
-    image = tiles.reshape(side, side, tile_px, tile_px).transpose(0, 2, 1, 3).reshape(side * tile_px, side * tile_px)
+    image = (
+        tiles.reshape(side, side, tile_px, tile_px)
+        .transpose(0, 2, 1, 3)
+        .reshape(side * tile_px, side * tile_px)
+    )
     row, column = np.divmod(np.arange(STARS), side)
     return Field(image, column * tile_px + middle + phase_x, row * tile_px + middle + phase_y)
 
@@ -139,7 +151,9 @@ def bias_px(sigma_px: float, settings: CentroidSettings) -> FloatArray:
     """Error of noiseless stars in x, at PHASES_PX; the y place is another one."""
     biases = []
     for phase in PHASES_PX:
-        found = find_stars(1e6 * star(30 + phase, 30.3, sigma_px), settings, LocalBackground(0.0, 20.0))
+        found = find_stars(
+            1e6 * star(30 + phase, 30.3, sigma_px), settings, LocalBackground(0.0, 20.0)
+        )
         assert len(found) == 1
         biases.append(found.x_px[0] - 30 - phase)
     return np.array(biases)
@@ -158,7 +172,9 @@ def test_the_plain_windows_s_curve_is_that_of_theory(sigma_px):
     settings = CentroidSettings(window="plain", window_radius_px=math.ceil(6 * sigma_px) + 1)
     theory = -np.exp(-2 * np.pi**2 * sigma_px**2) / np.pi * np.sin(2 * np.pi * PHASES_PX)
     second_harmonic = math.exp(-8 * math.pi**2 * sigma_px**2) / (2 * math.pi)
-    np.testing.assert_allclose(bias_px(sigma_px, settings), theory, rtol=0, atol=second_harmonic + NUMERICAL_PX)
+    np.testing.assert_allclose(
+        bias_px(sigma_px, settings), theory, rtol=0, atol=second_harmonic + NUMERICAL_PX
+    )
 
 
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)
@@ -168,10 +184,18 @@ def test_the_gaussian_windows_s_curve_is_the_zero_of_its_own_definition(sigma_px
 
     def moment(x: float, light: FloatArray) -> float:
         inside = np.abs(pixel - np.rint(x)) <= settings.radius_px
-        return float(np.sum(light * inside * np.exp(-0.5 * ((pixel - x) / half_px) ** 2) * (pixel - x)))
+        return float(
+            np.sum(light * inside * np.exp(-0.5 * ((pixel - x) / half_px) ** 2) * (pixel - x))
+        )
 
     theory = [
-        brentq(moment, 30 + phase - 0.3, 30 + phase + 0.3, args=(profile(np.array(30 + phase), sigma_px, 61),), xtol=1e-10)
+        brentq(
+            moment,
+            30 + phase - 0.3,
+            30 + phase + 0.3,
+            args=(profile(np.array(30 + phase), sigma_px, 61),),
+            xtol=1e-10,
+        )
         - (30 + phase)
         for phase in PHASES_PX
     ]
@@ -180,7 +204,9 @@ def test_the_gaussian_windows_s_curve_is_the_zero_of_its_own_definition(sigma_px
 
 def test_the_s_curve_of_the_benchs_star_is_what_the_module_says():
     # centroids.py: 0.017 px at 0.55 px and a window of 1 px; two digits are given.
-    assert np.abs(bias_px(0.55, CentroidSettings(window_sigma_px=1.0))).max() == pytest.approx(0.0165, abs=0.0005)
+    assert np.abs(bias_px(0.55, CentroidSettings(window_sigma_px=1.0))).max() == pytest.approx(
+        0.0165, abs=0.0005
+    )
 
 
 @pytest.mark.parametrize("window", ["gaussian", "plain"])
@@ -197,7 +223,8 @@ def test_an_elliptical_stars_axes_have_an_s_curve_each():
     settings = replace(window_for(0.5), psf_sigma_px=(0.8, 0.5))
     image = 1e6 * np.outer(profile(np.array(30.21), 0.5, 61), profile(np.array(30.21), 0.8, 61))
     plain, corrected = (
-        find_stars(image, s, LocalBackground(0.0, 20.0)) for s in (replace(settings, psf_sigma_px=None), settings)
+        find_stars(image, s, LocalBackground(0.0, 20.0))
+        for s in (replace(settings, psf_sigma_px=None), settings)
     )
     assert abs(plain.y_px[0] - 30.21) > 10 * abs(plain.x_px[0] - 30.21) > 10 * CORRECTED_PX
     assert abs(corrected.x_px[0] - 30.21) < CORRECTED_PX
@@ -210,7 +237,9 @@ def test_the_scatter_is_the_pixels_noise_propagated(sigma_px, snr):
     settings = replace(window_for(sigma_px), psf_sigma_px=(sigma_px, sigma_px))
     errors = measure(sigma_px, snr, settings, seed=11)
     assert errors.found == 1.0
-    assert errors.scatter_px == pytest.approx(predicted_scatter_px(sigma_px, snr, settings), rel=SCATTER_TOLERANCE)
+    assert errors.scatter_px == pytest.approx(
+        predicted_scatter_px(sigma_px, snr, settings), rel=SCATTER_TOLERANCE
+    )
     # No S-curve is left in the noise: its amplitude's own error is scatter sqrt(2 / n).
     assert abs(errors.s_curve_px) < SIGMAS * errors.scatter_px * math.sqrt(2 / len(errors.error_px))
 
@@ -221,7 +250,9 @@ def test_the_first_column_is_x_and_the_first_pixels_centre_is_nought():
     found = find_stars(image, CentroidSettings(window_radius_px=2), LocalBackground(0.0, 1.0))
     assert (found.x_px[0], found.y_px[0]) == (7.0, 3.0)
     # A whole pixel to the right and half a pixel down.
-    found = find_stars(100 * star(12.0, 8.5, 1.0, 21), CentroidSettings(), LocalBackground(0.0, 1.0))
+    found = find_stars(
+        100 * star(12.0, 8.5, 1.0, 21), CentroidSettings(), LocalBackground(0.0, 1.0)
+    )
     assert found.x_px[0] == pytest.approx(12.0, abs=NUMERICAL_PX)
     assert found.y_px[0] == pytest.approx(8.5, abs=NUMERICAL_PX)
 
@@ -231,7 +262,9 @@ def test_a_mirrored_image_has_mirrored_stars(window):
     image = 1e5 * (star(20.3, 25.1, 0.8) + 0.5 * star(40.7, 33.2, 0.8))
     settings = CentroidSettings(window=window)
     found = find_stars(image, settings, LocalBackground(0.0, 10.0))
-    mirrored = find_stars(np.ascontiguousarray(image[::-1, ::-1]), settings, LocalBackground(0.0, 10.0))
+    mirrored = find_stars(
+        np.ascontiguousarray(image[::-1, ::-1]), settings, LocalBackground(0.0, 10.0)
+    )
     np.testing.assert_allclose(60 - mirrored.x_px, found.x_px, atol=NUMERICAL_PX)
     np.testing.assert_allclose(60 - mirrored.y_px, found.y_px, atol=NUMERICAL_PX)
 
@@ -261,8 +294,14 @@ def test_small_blobs_can_be_left_out():
 def test_pixels_that_touch_by_a_corner_are_one_star():
     image = np.zeros((20, 20))
     image[10, 10] = image[11, 11] = 50.0
-    found = find_stars(image, CentroidSettings(window="plain", window_radius_px=3), LocalBackground(0.0, 1.0))
-    assert (found.x_px.tolist(), found.y_px.tolist(), found.pixels.tolist()) == ([10.5], [10.5], [2])
+    found = find_stars(
+        image, CentroidSettings(window="plain", window_radius_px=3), LocalBackground(0.0, 1.0)
+    )
+    assert (found.x_px.tolist(), found.y_px.tolist(), found.pixels.tolist()) == (
+        [10.5],
+        [10.5],
+        [2],
+    )
 
 
 def test_stars_whose_windows_leave_the_image_say_so():
@@ -316,13 +355,19 @@ def test_stars_through_the_detector_keep_their_places_and_their_light():
     sigma_px, flux_e = 0.55, 20_000.0
     settings = CentroidSettings(psf_sigma_px=(sigma_px, sigma_px))
     field = star_field(sigma_px, flux_e, np.random.default_rng(8), 2 * settings.radius_px + 9)
-    sensor = DetectorSettings(gain_e_per_dn=4.0, bits=14, offset_dn=100.0, read_noise_e=READ_NOISE_E, dark_e_per_s=203.0)
+    sensor = DetectorSettings(
+        gain_e_per_dn=4.0, bits=14, offset_dn=100.0, read_noise_e=READ_NOISE_E, dark_e_per_s=203.0
+    )
     detector = Detector(sensor, field.mean_e.shape[::-1])
     found = find_stars(detector.expose(field.mean_e, 0.1, np.random.default_rng(9)), settings)
     assert len(found) == STARS
-    distance_px = np.hypot(found.x_px - field.x_px[:, None], found.y_px - field.y_px[:, None]).min(axis=1)
+    distance_px = np.hypot(found.x_px - field.x_px[:, None], found.y_px - field.y_px[:, None]).min(
+        axis=1
+    )
     # Over noise of 10 e- the signal to noise is 140: first order, 0.0045 px an axis.
-    snr = flux_e / math.sqrt(flux_e + 4 * math.pi * (sigma_px**2 + 1 / 12) * (READ_NOISE_E**2 + 20.3 + 16 / 12))
+    snr = flux_e / math.sqrt(
+        flux_e + 4 * math.pi * (sigma_px**2 + 1 / 12) * (READ_NOISE_E**2 + 20.3 + 16 / 12)
+    )
     expected_px = predicted_scatter_px(sigma_px, snr, settings) * math.sqrt(2)
     assert math.sqrt(np.mean(distance_px**2)) == pytest.approx(expected_px, rel=SCATTER_TOLERANCE)
     # The level under 81 pixels of window is known to 0.02 of its noise (see above), 11 e-.
@@ -336,7 +381,14 @@ def test_a_window_too_narrow_to_tell_two_places_apart_is_refused():
 
 
 @pytest.mark.parametrize(
-    "image", [np.zeros(5), np.zeros((0, 4)), np.full((5, 5), np.nan), np.full((5, 5), np.inf), np.full((5, 5), "a")]
+    "image",
+    [
+        np.zeros(5),
+        np.zeros((0, 4)),
+        np.full((5, 5), np.nan),
+        np.full((5, 5), np.inf),
+        np.full((5, 5), "a"),
+    ],
 )
 def test_what_is_no_image_is_refused(image):
     with pytest.raises(InputError, match="centroids"):
@@ -362,18 +414,26 @@ def test_settings_that_make_no_sense_are_refused(wrong):
 
 
 if __name__ == "__main__":
-    print("largest bias, noiseless, px; scatter (both axes) over SNR 10, 30, 100, px, and the share found at 4 sigma")
-    print("sigma  window   bias     corrected   SNR 10            SNR 30            SNR 100           predicted 30, 100")
+    print(
+        "largest bias, noiseless, px; scatter (both axes) over SNR 10, 30, 100, px, and the share found at 4 sigma"
+    )
+    print(
+        "sigma  window   bias     corrected   SNR 10            SNR 30            SNR 100           predicted 30, 100"
+    )
     for sigma in SIGMAS_PX:
         for window in ("gaussian", "plain"):
             raw = replace(window_for(sigma), window=window)
             if window == "plain":
                 raw = replace(raw, window_radius_px=math.ceil(3 * sigma) + 1)
             known = replace(raw, psf_sigma_px=(sigma, sigma))
-            cells = [f"{sigma:5} {window:9}{np.abs(bias_px(sigma, raw)).max():.1e}  {np.abs(bias_px(sigma, known)).max():.1e} "]
+            cells = [
+                f"{sigma:5} {window:9}{np.abs(bias_px(sigma, raw)).max():.1e}  {np.abs(bias_px(sigma, known)).max():.1e} "
+            ]
             for signal_to_noise in (10.0, *FIRST_ORDER_SNR):
                 got = measure(sigma, signal_to_noise, known, seed=11)
                 cells.append(f"{got.scatter_px:.4f} ({100 * got.found:5.1f} %)")
             if window == "gaussian":
-                cells += [f"{predicted_scatter_px(sigma, value, known):.4f}" for value in FIRST_ORDER_SNR]
+                cells += [
+                    f"{predicted_scatter_px(sigma, value, known):.4f}" for value in FIRST_ORDER_SNR
+                ]
             print("  ".join(cells))

@@ -21,8 +21,16 @@ SENSOR_NM = np.arange(350.0, 1001.0, 10.0)
 # behind its cut filter do more or less; the first channel of each is also a tracker of its own, as
 # "mono" all of them are.
 SENSORS = {
-    "narrow": {"r": bump(610, 45, SENSOR_NM), "g": bump(535, 45, SENSOR_NM), "b": bump(460, 40, SENSOR_NM)},
-    "wide": {"r": bump(625, 70, SENSOR_NM), "g": bump(540, 75, SENSOR_NM), "b": bump(470, 65, SENSOR_NM)},
+    "narrow": {
+        "r": bump(610, 45, SENSOR_NM),
+        "g": bump(535, 45, SENSOR_NM),
+        "b": bump(460, 40, SENSOR_NM),
+    },
+    "wide": {
+        "r": bump(625, 70, SENSOR_NM),
+        "g": bump(540, 75, SENSOR_NM),
+        "b": bump(470, 65, SENSOR_NM),
+    },
     "infrared": {
         "r": bump(620, 50, SENSOR_NM) + 0.05 * (SENSOR_NM > 750),
         "g": bump(540, 50, SENSOR_NM) + 0.02 * (SENSOR_NM > 750),
@@ -50,9 +58,16 @@ def saved(path, values):
 def bench(folder, panel, sensor, **render):
     """A bench of a panel and a sensor, and the sensor's curves (channels, n) on the grid."""
     written(folder / "panel.csv", PANELS[panel])
-    names = {"quantum_efficiency": None} if isinstance(sensor, dict) else {"quantum_efficiency": "own.csv"}
+    names = (
+        {"quantum_efficiency": None}
+        if isinstance(sensor, dict)
+        else {"quantum_efficiency": "own.csv"}
+    )
     if isinstance(sensor, dict):
-        curves = [0.9 * saved(folder / f"{name}.csv", 0.9 * values) / 0.9 for name, values in sensor.items()]
+        curves = [
+            0.9 * saved(folder / f"{name}.csv", 0.9 * values) / 0.9
+            for name, values in sensor.items()
+        ]
         names |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in sensor}
     else:
         curves = [saved(folder / "own.csv", 0.9 * sensor)]
@@ -124,16 +139,21 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
         off = np.abs(shown / wanted - 1)
         assert inside.mean() > 0.5 and np.percentile(off[inside], 95) < RATE
         clearly = (mixed < -1e-4).any(axis=1)
-        found = opened.colours.in_gamut(opened.colours.off(opened.colours.wanted(stars), stars.primaries))
+        found = opened.colours.in_gamut(
+            opened.colours.off(opened.colours.wanted(stars), stars.primaries)
+        )
         assert found[(mixed > 1e-4).all(axis=1)].all() and not found[clearly].any()
         if clearly.any():  # no other mixture without negative light is nearer in electrons
             rng = np.random.default_rng(36)
             residual = np.square(shown - wanted).sum(axis=1)[clearly]
             # of a thousand stars: one that is not at its best is found by half of them
             for _ in range(40):
-                other = np.maximum(stars.primaries[clearly] * rng.normal(1, 0.05, (clearly.sum(), 3)), 0)
+                other = np.maximum(
+                    stars.primaries[clearly] * rng.normal(1, 0.05, (clearly.sum(), 3)), 0
+                )
                 assert (
-                    np.square((other / matrix.sum(axis=0)) @ matrix.T - wanted[clearly]).sum(axis=1) >= residual - 1e-12
+                    np.square((other / matrix.sum(axis=0)) @ matrix.T - wanted[clearly]).sum(axis=1)
+                    >= residual - 1e-12
                 ).all()
         # One frame, by its codes.
         drive, rows = drives(opened.frame(ORION_Q), opened)
@@ -143,7 +163,9 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
         assert len(errors) > 10 and np.percentile(errors, 95) < P95 and np.median(errors) < MEDIAN
         told = np.stack([rows[f"electrons_shown_{name}_per_s"] for name in "rgb"], axis=1)
         np.testing.assert_allclose(by_codes, told, rtol=P95, atol=1e-3 * asked.max())
-        same = rows["temperature_shown_k"][rows["in_gamut"]] / rows["temperature_k"][rows["in_gamut"]]
+        same = (
+            rows["temperature_shown_k"][rows["in_gamut"]] / rows["temperature_k"][rows["in_gamut"]]
+        )
         np.testing.assert_allclose(same, 1, rtol=1e-4)
 
 
@@ -166,7 +188,9 @@ def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, 
         white = of_primaries.sum(axis=1) / of_primaries.sum()
         np.testing.assert_allclose(drive @ white, rows["electrons_per_s"], rtol=P95)
         inside = np.abs(reach - means[1]) < 1e-6
-        print(f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean wavelengths")
+        print(
+            f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean wavelengths"
+        )
 
 
 @pytest.mark.gpu
@@ -175,23 +199,40 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
     %.
     """
     nm, at, side = np.linspace(420.0, 700.0, 6), np.arange(-8, 9) / 2, 1023
-    places = [(x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm]
-    lateral = [(1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y))) for x, y, one, _ in places]
+    places = [
+        (x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm
+    ]
+    lateral = [
+        (1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y)))
+        for x, y, one, _ in places
+    ]
     dot = np.exp(-(at**2 + at[:, None] ** 2) / 0.5)
-    write_glass(tmp_path / "glass.fits", glass_of(Stack(np.array([dot] * len(places)), np.array(places), np.array(lateral), 2)))
+    write_glass(
+        tmp_path / "glass.fits",
+        glass_of(Stack(np.array([dot] * len(places)), np.array(places), np.array(lateral), 2)),
+    )
     sensor = np.where((SENSOR_NM > 420) & (SENSOR_NM < 700), MONO["visible"], 0.0)
     without, curves = bench(tmp_path, "lcd", sensor)
     path = tmp_path / "bench.toml"
     path.write_text(path.read_text() + '\n[tracker.optics]\npsf = "glass.fits"\n')
     with without, load(path) as opened:
         stars, shares = opened.stars, opened.stars.primaries
-        assert opened.colours.in_gamut(opened.colours.off(opened.colours.wanted(stars), shares)).mean() > 0.9
+        assert (
+            opened.colours.in_gamut(opened.colours.off(opened.colours.wanted(stars), shares)).mean()
+            > 0.9
+        )
     _, of_primaries = photons_of_panel("lcd", curves)
     _, of_stars = photons_of_stars(stars.temperature_k, curves)
     primaries, sky = (one @ moved(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars))
-    spread, off, plain = (np.std(one) for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky))
+    spread, off, plain = (
+        np.std(one)
+        for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky)
+    )
     assert off < LATERAL * spread < plain
-    means = of_primaries @ GRID_NM / of_primaries.sum(axis=1), of_stars @ GRID_NM / of_stars.sum(axis=1)
+    means = (
+        of_primaries @ GRID_NM / of_primaries.sum(axis=1),
+        of_stars @ GRID_NM / of_stars.sum(axis=1),
+    )
     # nm: the rest of the freedom stays near the star's colour
     assert np.abs(shares @ means[0] - means[1]).max() < 60
 

@@ -20,9 +20,13 @@ def test_constellations_are_those_of_astropy():
     ra_deg, dec_deg = rng.uniform(0, 360, PLACES), np.degrees(np.arcsin(rng.uniform(-1, 1, PLACES)))
     named = get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))
     expected = [name.strip() for name in named.tolist()]
-    found = [constellation_of(direction_of(ra, dec)) for ra, dec in zip(ra_deg, dec_deg, strict=True)]
+    found = [
+        constellation_of(direction_of(ra, dec)) for ra, dec in zip(ra_deg, dec_deg, strict=True)
+    ]
     others = [k for k in range(PLACES) if found[k] != expected[k]]
     assert len(others) < PLACES // 100
     for k in others:
-        across = [(ra_deg[k] + a / np.cos(np.radians(dec_deg[k])), dec_deg[k] + b) for a, b in STEPS]
+        across = [
+            (ra_deg[k] + a / np.cos(np.radians(dec_deg[k])), dec_deg[k] + b) for a, b in STEPS
+        ]
         assert expected[k] in {constellation_of(direction_of(*place)) for place in across}

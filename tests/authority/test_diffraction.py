@@ -70,7 +70,9 @@ def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
         coefficients[noll - 1] = nm * 1e-9
     system = poppy.OpticalSystem(pupil_diameter=0.03, npix=1024, oversample=1)
     system.add_pupil(poppy.CircularAperture(radius=0.015))
-    system.add_pupil(poppy.SecondaryObscuration(secondary_radius=0.0045, n_supports=4, support_width=0.0006))
+    system.add_pupil(
+        poppy.SecondaryObscuration(secondary_radius=0.0045, n_supports=4, support_width=0.0006)
+    )
     system.add_pupil(poppy.ZernikeWFE(radius=0.015, coefficients=coefficients))
     step_arcsec = np.degrees(5e-6 / 8 / 0.06) * 3600
     system.add_detector(pixelscale=step_arcsec, fov_pixels=65)
@@ -80,7 +82,10 @@ def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
 
 @pytest.mark.parametrize(
     ("kind", "spread"),
-    [("W020", lambda x, y: (2 * x, 2 * y)), ("W040", lambda x, y: (4 * x * (x**2 + y**2), 4 * y * (x**2 + y**2)))],
+    [
+        ("W020", lambda x, y: (2 * x, 2 * y)),
+        ("W040", lambda x, y: (4 * x * (x**2 + y**2), 4 * y * (x**2 + y**2))),
+    ],
 )
 def test_large_aberrations_have_the_second_moments_of_rays(kind, spread):
     """Rays land at -R/a dW/dx. Diffraction adds a tail whose variance grows with the stamp,
@@ -102,7 +107,9 @@ def test_coma_leads_to_the_axis_and_turns_with_the_field():
     """W131 leads: rays go against its slope, towards the axis; their mean is at -R/a dW/dx, 2 F
     W131 / 2 along the field.
     """
-    stack = diffracted(Pupil(**(BASE | {"points": 3, "half_px": 8, "terms": (Term(kind="W131", nm=600.0),)})), 8)
+    stack = diffracted(
+        Pupil(**(BASE | {"points": 3, "half_px": 8, "terms": (Term(kind="W131", nm=600.0),)})), 8
+    )
     at_px = (np.arange(129) - 64) / 8
     for light, (x, y, *_) in zip(stack.images, stack.at, strict=True):
         off = np.array([x, y]) - 255.5
@@ -128,7 +135,9 @@ def in_pixels(light: np.ndarray, per_px: int) -> np.ndarray:
     """
     kernel = np.ones(per_px + 1) / per_px
     kernel[[0, -1]] /= 2
-    spread = np.apply_along_axis(np.convolve, 1, np.apply_along_axis(np.convolve, 0, light, kernel, "same"), kernel, "same")
+    spread = np.apply_along_axis(
+        np.convolve, 1, np.apply_along_axis(np.convolve, 0, light, kernel, "same"), kernel, "same"
+    )
     middle = len(light) // 2
     return spread[middle % per_px :: per_px, middle % per_px :: per_px]
 
@@ -137,19 +146,42 @@ def moments(light: np.ndarray) -> np.ndarray:
     at = np.arange(len(light)) - len(light) // 2
     near = np.hypot(at[None], at[:, None]) <= RADIUS_PX
     light = np.where(near, light, 0.0)
-    flux, x, y = light.sum(), light.sum(axis=0) @ at / light.sum(), light.sum(axis=1) @ at / light.sum()
-    return np.array([flux, x, y, light.sum(axis=0) @ (at - x) ** 2 / flux, light.sum(axis=1) @ (at - y) ** 2 / flux])
+    flux, x, y = (
+        light.sum(),
+        light.sum(axis=0) @ at / light.sum(),
+        light.sum(axis=1) @ at / light.sum(),
+    )
+    return np.array(
+        [
+            flux,
+            x,
+            y,
+            light.sum(axis=0) @ (at - x) ** 2 / flux,
+            light.sum(axis=1) @ (at - y) ** 2 / flux,
+        ]
+    )
 
 
 def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(rng):
     """At places that are not the file's, by 13 wavelengths where the file has 5: flux 1e-3,
     centroid 0.003 px, widths 1 %.
     """
-    terms = (Term(kind="W131", nm=300.0), Term(kind="W222", nm=150.0), Term(kind="W220", nm=120.0), Term(kind="W040", nm=80.0))
+    terms = (
+        Term(kind="W131", nm=300.0),
+        Term(kind="W222", nm=150.0),
+        Term(kind="W220", nm=120.0),
+        Term(kind="W040", nm=80.0),
+    )
     # axial colour; decentred
     terms += (Term(kind="W020", nm=0.0, per_nm=0.8), Term(kind="zernike", noll=7, nm=40.0))
     nodes_nm, fine_nm = (450.0, 525.0, 600.0, 675.0, 750.0), np.linspace(450, 750, 13)
-    keys = BASE | {"points": 5, "wavelengths_nm": nodes_nm, "half_px": 6, "terms": terms, "focuses_um": (0.0, 8.0)}
+    keys = BASE | {
+        "points": 5,
+        "wavelengths_nm": nodes_nm,
+        "half_px": 6,
+        "terms": terms,
+        "focuses_um": (0.0, 8.0),
+    }
     keys |= {"pixel_pitch_um": 3.0}
     pupil = Pupil(**keys)
     glass, field = glass_of(diffracted(pupil, 8), 3e-4), PupilField(pupil)
@@ -157,9 +189,13 @@ def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(
     for number, (temperature_k, place) in enumerate(zip(TEMPERATURES_K, places, strict=True)):
         for focus_um in (0.0, 8.0)[number % 2 :][:1]:
             psf = glass_psf(glass, focus_um, np.full(5, 0.2))
-            light = blackbody_exitance_w_m2_m(fine_nm, np.array([temperature_k])[:, None])[0] * fine_nm
+            light = (
+                blackbody_exitance_w_m2_m(fine_nm, np.array([temperature_k])[:, None])[0] * fine_nm
+            )
             light /= light.sum()
-            found = psf.of_stars(*place[:, None], light @ NodeSpline(np.array(nodes_nm))(fine_nm), np.ones(1))[0]
+            found = psf.of_stars(
+                *place[:, None], light @ NodeSpline(np.array(nodes_nm))(fine_nm), np.ones(1)
+            )[0]
             wanted = 0.0
             for share, nm in zip(light, fine_nm, strict=True):
                 image, outside = psf_of(pupil, field(place - 255.5, nm, focus_um), nm, 24)

@@ -31,7 +31,14 @@ ARCSEC2 = 1 / 206_264.806**2
 # places.
 FLUX = 0.005
 # f_nu and f_lambda of V = 0 are tied at one wavelength, 545 nm.
-UNITS = ["mag/arcsec2", "mag/deg2", "W/(m2 um sr)", "erg/(s cm2 AA arcsec2)", "MJy/sr", "ph/(s m2 nm sr)"]
+UNITS = [
+    "mag/arcsec2",
+    "mag/deg2",
+    "W/(m2 um sr)",
+    "erg/(s cm2 AA arcsec2)",
+    "MJy/sr",
+    "ph/(s m2 nm sr)",
+]
 
 
 def light_of_disc() -> float:
@@ -39,7 +46,13 @@ def light_of_disc() -> float:
     return 10 ** (-0.4 * V_MAG_ARCSEC2) / ARCSEC2 * 2 * np.pi * (1 - np.cos(np.radians(RADIUS_DEG)))
 
 
-def write_disc(path: Path, unit: str = "mag/arcsec2", axes=("RA---TAN", "DEC--TAN"), centre=(RA_DEG, DEC_DEG), px_deg=0.02):
+def write_disc(
+    path: Path,
+    unit: str = "mag/arcsec2",
+    axes=("RA---TAN", "DEC--TAN"),
+    centre=(RA_DEG, DEC_DEG),
+    px_deg=0.02,
+):
     """A disc about `centre`, in a WCS image 5 deg wide, or wide enough for an image of the whole
     sky.
     """
@@ -65,13 +78,17 @@ def write_disc(path: Path, unit: str = "mag/arcsec2", axes=("RA---TAN", "DEC--TA
 
 def bench_in(folder: Path, keys: str = 'map = "map.fits"'):
     """A bench with few stars and a map."""
-    (folder / "bench.toml").write_text(f"{SMALL_BENCH}[sky]\nfaintest_v_mag = 0.0\n[sky.diffuse]\n{keys}\n")
+    (folder / "bench.toml").write_text(
+        f"{SMALL_BENCH}[sky]\nfaintest_v_mag = 0.0\n[sky.diffuse]\n{keys}\n"
+    )
     return read_bench_file(folder / "bench.toml")
 
 
 def drawn_over_known(file, ra=RA_DEG, dec=DEC_DEG, roll=33.0) -> tuple[float, np.ndarray]:
     """Electrons that the tracker's image has over those of the disc, and the image."""
-    v0_e_per_s = star_rates(file.config, file.folder)(*(np.array([part]) for part in (0.0, 0.65, np.nan)))[0]
+    v0_e_per_s = star_rates(file.config, file.folder)(
+        *(np.array([part]) for part in (0.0, 0.65, np.nan))
+    )[0]
     with Simulator(file) as tracker:
         view = tracker.view(from_radec_roll_deg(ra, dec, roll), np.zeros(3))
         image = tracker.expose(view, None).mean_e / tracker.config.tracker.exposure_s
@@ -91,7 +108,9 @@ def test_a_disc_lies_where_its_coordinates_are(tmp_path):
     assert share == pytest.approx(1, rel=FLUX)
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     with Simulator(file) as tracker:
-        seen = to_matrix(from_radec_roll_deg(RA_DEG + 2, DEC_DEG - 1, 70.0)) @ direction_of(RA_DEG, DEC_DEG)
+        seen = to_matrix(from_radec_roll_deg(RA_DEG + 2, DEC_DEG - 1, 70.0)) @ direction_of(
+            RA_DEG, DEC_DEG
+        )
         (x_px,), (y_px,) = tracker.camera.project((tracker.camera.cam_to_image @ seen)[None])
         # A round disc's light is symmetric about its centre to second order in its radius, 2 deg:
         # 0.06 % of 3 deg's 300 px.
@@ -111,9 +130,14 @@ def test_a_disc_smaller_than_a_pixel_has_its_flux_wherever_it_lies(tmp_path, rng
     header = wcs.to_header()
     header["BUNIT"] = "mag/arcsec2"
     fits.PrimaryHDU(image, header).writeto(tmp_path / "map.fits")
-    known = np.isfinite(image).sum() * np.radians(0.0005) ** 2 * 10 ** (-0.4 * V_MAG_ARCSEC2) / ARCSEC2
+    known = (
+        np.isfinite(image).sum() * np.radians(0.0005) ** 2 * 10 ** (-0.4 * V_MAG_ARCSEC2) / ARCSEC2
+    )
     file = bench_in(tmp_path)
-    found = [drawn_over_known(file, RA_DEG + da, DEC_DEG + dd, da)[0] for da, dd in rng.uniform(-3, 3, (3, 2))]
+    found = [
+        drawn_over_known(file, RA_DEG + da, DEC_DEG + dd, da)[0]
+        for da, dd in rng.uniform(-3, 3, (3, 2))
+    ]
     assert np.array(found) * light_of_disc() == pytest.approx(known, rel=0.025)
 
 
@@ -122,20 +146,29 @@ def test_other_projections_and_frames_have_the_same_light(tmp_path):
     pixels have a coarser edge.
     """
     place = SkyCoord(RA_DEG, DEC_DEG, unit="deg").galactic
-    write_disc(tmp_path / "map.fits", axes=("GLON-SIN", "GLAT-SIN"), centre=(place.l.deg, place.b.deg))
+    write_disc(
+        tmp_path / "map.fits", axes=("GLON-SIN", "GLAT-SIN"), centre=(place.l.deg, place.b.deg)
+    )
     assert drawn_over_known(bench_in(tmp_path))[0] == pytest.approx(1, rel=FLUX)
 
 
 def write_even_sky(path: Path) -> None:
     """The whole sky of one brightness, 1 degree to a pixel."""
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crval, wcs.wcs.crpix = ("RA---CAR", "DEC--CAR"), [-1, 1], [180, 0], [180.5, 91]
+    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crval, wcs.wcs.crpix = (
+        ("RA---CAR", "DEC--CAR"),
+        [-1, 1],
+        [180, 0],
+        [180.5, 91],
+    )
     header = wcs.to_header()
     header["BUNIT"] = "mag/arcsec2"
     fits.PrimaryHDU(np.full((181, 360), V_MAG_ARCSEC2, dtype=np.float32), header).writeto(path)
 
 
-@pytest.mark.parametrize("place", [(0.0, 0.0), (45.0, 0.0), (45.0, 35.264), (10.0, 89.0), (179.5, -45.0)])
+@pytest.mark.parametrize(
+    "place", [(0.0, 0.0), (45.0, 0.0), (45.0, 35.264), (10.0, 89.0), (179.5, -45.0)]
+)
 def test_a_sky_of_one_brightness_has_no_seams(tmp_path, place):
     """At a face's middle, on its edge, on the cube's corner, at a pole, and where the image's
     own edge lies.
@@ -145,7 +178,9 @@ def test_a_sky_of_one_brightness_has_no_seams(tmp_path, place):
     share, image = drawn_over_known(file, *place)
     with Simulator(file) as tracker:
         y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-        sr = tracker.camera.pixel_sr(x.ravel().astype(float), y.ravel().astype(float)).reshape(image.shape)
+        sr = tracker.camera.pixel_sr(x.ravel().astype(float), y.ravel().astype(float)).reshape(
+            image.shape
+        )
     even = image / sr * sr.sum() / image.sum()
     assert np.abs(even - 1).max() < FLUX
     known = light_of_disc() / (2 * np.pi * (1 - np.cos(np.radians(RADIUS_DEG)))) * sr.sum()
@@ -161,8 +196,18 @@ def test_a_healpix_map_has_its_flux(tmp_path):
     centre = SkyCoord(RA_DEG, DEC_DEG, unit="deg").galactic
     off = grid.healpix_to_skycoord(np.arange(grid.npix)).separation(centre).deg
     light = np.where(off < RADIUS_DEG, 1.0, 0.0)
-    table = fits.BinTableHDU.from_columns([fits.Column("LIGHT", "1024E", "W/(m2 um sr)", array=light.reshape(-1, 1024))])
-    table.header.update({"PIXTYPE": "HEALPIX", "ORDERING": "NESTED", "NSIDE": 256, "COORDSYS": "G", "INDXSCHM": "IMPLICIT"})
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column("LIGHT", "1024E", "W/(m2 um sr)", array=light.reshape(-1, 1024))]
+    )
+    table.header.update(
+        {
+            "PIXTYPE": "HEALPIX",
+            "ORDERING": "NESTED",
+            "NSIDE": 256,
+            "COORDSYS": "G",
+            "INDXSCHM": "IMPLICIT",
+        }
+    )
     table.writeto(tmp_path / "map.fits")
     file = bench_in(tmp_path)
     known = light.sum() * 4 * np.pi / grid.npix * 1e6 / 3.631e-2
@@ -190,7 +235,14 @@ def test_the_monitor_draws_what_passes_its_first_step_and_says_where_nothing_doe
         assert first[0] is not turned[0]
         assert isinstance(first[0], LightMap)
         lit = bench.frame(q).levels > 0  # a disc of 36 px, and 2 px of the PSF's wings around it
-        assert 0.95 < lit.sum() * bench.camera.scales_px_rad()[0] ** -2 / np.radians(RADIUS_DEG) ** 2 / np.pi < 1.15
+        assert (
+            0.95
+            < lit.sum()
+            * bench.camera.scales_px_rad()[0] ** -2
+            / np.radians(RADIUS_DEG) ** 2
+            / np.pi
+            < 1.15
+        )
     write_faint = (tmp_path / "map.fits").read_bytes().replace(b"'mag/arcsec2'", b"'mag/deg2'   ")
     (tmp_path / "map.fits").write_bytes(write_faint)
     with open_bench(bench_in(tmp_path)) as bench:
@@ -210,7 +262,11 @@ def test_a_map_leaves_the_screen_over_any_edge(tmp_path):
         cell_deg = np.degrees(16 / min(bench.camera.scales_px_rad()))
         for roll in (0.0, 90.0, 180.0, 270.0):
             drawn = [
-                bool(bench.light(bench.view(from_radec_roll_deg(RA_DEG, DEC_DEG + off, roll))).extended)
+                bool(
+                    bench.light(
+                        bench.view(from_radec_roll_deg(RA_DEG, DEC_DEG + off, roll))
+                    ).extended
+                )
                 for off in np.arange(4.0, 14.0, cell_deg / 3)
             ]
             assert drawn[0] and not drawn[-1]
@@ -223,7 +279,10 @@ def test_a_map_leaves_the_screen_over_any_edge(tmp_path):
         ({"BUNIT": None}, "no unit; write BUNIT"),
         ({"BUNIT": "K"}, "unit 'K', which is no surface brightness"),
         ({"BUNIT": "Jy"}, "unit 'Jy', which is no surface brightness"),
-        ({"CTYPE1": "X", "CTYPE2": "Y"}, "without a place on the sky; give a FITS image with a WCS"),
+        (
+            {"CTYPE1": "X", "CTYPE2": "Y"},
+            "without a place on the sky; give a FITS image with a WCS",
+        ),
     ],
 )
 def test_a_map_that_says_too_little_is_refused_in_one_line(tmp_path, change, said):
@@ -258,7 +317,11 @@ def test_the_map_of_a_catalogue_has_each_objects_magnitude_and_axes(tmp_path):
         "NGC0129;OCl;00:29:58.19;+60:12:40.2;5.40;;;7.33;6.50;\n"
     )
     tool = Path(__file__).parents[2] / "tools" / "make_deep_sky.py"
-    subprocess.run([sys.executable, tool, tmp_path / "NGC.csv", "-o", tmp_path / "map.fits"], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, tool, tmp_path / "NGC.csv", "-o", tmp_path / "map.fits"],
+        check=True,
+        capture_output=True,
+    )
     andromeda, nebula = read_diffuse_map(tmp_path / "map.fits")
     for face, v_mag in ((andromeda, 3.44), (nebula, 4.0)):
         at = (np.arange(len(face.image)) - (len(face.image) - 1) / 2) / face.px_per_tangent
@@ -274,4 +337,6 @@ def test_the_map_of_a_catalogue_has_each_objects_magnitude_and_axes(tmp_path):
             along = np.linalg.eigh(np.cov(places, aweights=light[light > 0]))[1][:, 1]
             assert np.degrees(np.arctan(along[1] / along[0])) == pytest.approx(35, abs=0.5)
         else:
-            assert drawn_over_known(bench_in(tmp_path))[0] * light_of_disc() == pytest.approx(10 ** (-0.4 * 4.0), rel=FLUX)
+            assert drawn_over_known(bench_in(tmp_path))[0] * light_of_disc() == pytest.approx(
+                10 ** (-0.4 * 4.0), rel=FLUX
+            )

@@ -38,8 +38,22 @@ IERS_MAS = 3.0
 DIURNAL_ARCSEC = 0.33
 # the farthest that the pole of rotation is from the Earth's third axis
 POLE_RAD = np.radians(0.6 / 3600)
-PLACES_DEG = [(0.0, 0.0), (48.1, 11.6), (-33.9, 151.2), (89.999, 12.0), (-89.999, -170.0), (90.0, 0.0), (-90.0, 180.0)]
-DATES = ["1975-03-01T12:34:56", "1999-12-31T23:59:59", "2016-12-31T23:30:00", "2024-02-29T06:00:00.25", "2026-11-22T10:00:00"]
+PLACES_DEG = [
+    (0.0, 0.0),
+    (48.1, 11.6),
+    (-33.9, 151.2),
+    (89.999, 12.0),
+    (-89.999, -170.0),
+    (90.0, 0.0),
+    (-90.0, 180.0),
+]
+DATES = [
+    "1975-03-01T12:34:56",
+    "1999-12-31T23:59:59",
+    "2016-12-31T23:30:00",
+    "2024-02-29T06:00:00.25",
+    "2026-11-22T10:00:00",
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,7 +71,11 @@ def at(text: str) -> np.ndarray:
 def angle_mas(matrix: np.ndarray) -> float:
     """The angle of a rotation matrix that is nearly 1."""
     return float(
-        np.linalg.norm([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2 / MAS
+        np.linalg.norm(
+            [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+        )
+        / 2
+        / MAS
     )
 
 
@@ -67,7 +85,10 @@ def test_the_earths_axes_are_astropys(date):
     time = Time(date, scale="utc")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        columns = [ITRS(CartesianRepresentation(*axis), obstime=time).transform_to(GCRS(obstime=time)) for axis in np.eye(3)]
+        columns = [
+            ITRS(CartesianRepresentation(*axis), obstime=time).transform_to(GCRS(obstime=time))
+            for axis in np.eye(3)
+        ]
     itrs_to_gcrs = np.array([column.cartesian.xyz.value for column in columns]).T
     assert angle_mas(ours @ itrs_to_gcrs) < ASTROPY_MAS
 
@@ -96,12 +117,23 @@ def test_a_star_stands_where_astropys_horizon_has_it(date, place):
     site = EarthLocation.from_geodetic(longitude_deg, latitude_deg, 100.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        seen = star.transform_to(AltAz(obstime=star.obstime, location=site)).represent_as("unitspherical").to_cartesian()
+        seen = (
+            star.transform_to(AltAz(obstime=star.obstime, location=site))
+            .represent_as("unitspherical")
+            .to_cartesian()
+        )
     north, east, up = seen.xyz.value
-    ned = Rotation.from_quat(q_icrs_to_ned(at(date), latitude_deg, longitude_deg)[0], scalar_first=True)
-    enu = Rotation.from_quat(q_icrs_to_enu(at(date), latitude_deg, longitude_deg)[0], scalar_first=True)
+    ned = Rotation.from_quat(
+        q_icrs_to_ned(at(date), latitude_deg, longitude_deg)[0], scalar_first=True
+    )
+    enu = Rotation.from_quat(
+        q_icrs_to_enu(at(date), latitude_deg, longitude_deg)[0], scalar_first=True
+    )
     direction = star.cartesian.xyz.value
-    for ours, theirs in ((ned.apply(direction), (north, east, -up)), (enu.apply(direction), (east, north, up))):
+    for ours, theirs in (
+        (ned.apply(direction), (north, east, -up)),
+        (enu.apply(direction), (east, north, up)),
+    ):
         assert np.linalg.norm(ours - theirs) < np.radians(DIURNAL_ARCSEC / 3600)
 
 
@@ -110,26 +142,39 @@ def test_a_level_frame_turns_by_the_earths_rate(latitude_deg):
     """v' = -omega x v."""
     begin, end = q_icrs_to_ned(at("2026-11-22T10:00:00") + np.array([0, 10**9]), latitude_deg, 11.0)
     turned = -to_rotation_vector(multiply(end, conjugate(begin)))
-    assert turned == pytest.approx(earth_rate_ned_rad_s(latitude_deg), abs=EARTH_RATE_RAD_S * POLE_RAD)
+    assert turned == pytest.approx(
+        earth_rate_ned_rad_s(latitude_deg), abs=EARTH_RATE_RAD_S * POLE_RAD
+    )
 
 
 def test_a_leap_second_does_not_turn_the_earth_back():
     """UTC repeats no second here: 2017 begins two seconds of the Earth after 23:59:59 of 2016."""
-    q = q_icrs_to_itrs(np.concatenate([at("2016-12-31T23:59:58"), at("2016-12-31T23:59:59"), at("2017-01-01T00:00:00")]))
-    first, over = (np.linalg.norm(to_rotation_vector(multiply(b, conjugate(a)))) for a, b in pairwise(q))
+    q = q_icrs_to_itrs(
+        np.concatenate(
+            [at("2016-12-31T23:59:58"), at("2016-12-31T23:59:59"), at("2017-01-01T00:00:00")]
+        )
+    )
+    first, over = (
+        np.linalg.norm(to_rotation_vector(multiply(b, conjugate(a)))) for a, b in pairwise(q)
+    )
     assert first == pytest.approx(EARTH_RATE_RAD_S, rel=1e-6)
     assert over == pytest.approx(2 * EARTH_RATE_RAD_S, rel=1e-6)
 
 
 def test_beyond_the_table_the_user_is_told_by_how_much():
-    assert beyond_table(int(at("1980-01-01T00:00:00")[0]), int(at("2026-01-01T00:00:00")[0])) is None
+    assert (
+        beyond_table(int(at("1980-01-01T00:00:00")[0]), int(at("2026-01-01T00:00:00")[0])) is None
+    )
     line = beyond_table(int(at("2026-01-01T00:00:00")[0]), int(at("2060-01-01T00:00:00")[0]))
     assert line is not None
     assert "beyond it UT1 is guessed" in line
     assert np.isfinite(q_icrs_to_itrs(at("2060-01-01T00:00:00"))).all()
 
 
-@pytest.mark.parametrize("text", ["", "yesterday", "2026-13-01T00:00:00", "2026-11-22", "2026-11-22T25:00:00", "9" * 4000])
+@pytest.mark.parametrize(
+    "text",
+    ["", "yesterday", "2026-13-01T00:00:00", "2026-11-22", "2026-11-22T25:00:00", "9" * 4000],
+)
 def test_a_text_that_is_no_utc_is_refused(text):
     with pytest.raises(InputError, match="write a UTC such as"):
         utc_ns_of(text, "--epoch-utc")

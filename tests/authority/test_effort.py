@@ -75,7 +75,9 @@ def seen_by_tracker(stamps, phases, pixel_px, blur_px):
     views, places = [], []
     for phase in phases:
         middles = (np.arange(-reach, reach + 1) + phase[:, None]) * pixel_px
-        low, high = (ndtr((middles[:, :, None] + way * pixel_px / 2 - points) / blur_px) for way in (-1, 1))
+        low, high = (
+            ndtr((middles[:, :, None] + way * pixel_px / 2 - points) / blur_px) for way in (-1, 1)
+        )
         views.append((high - low).reshape(*middles.shape, side, SUB).mean(axis=3))
         places.append(middles)
     columns, rows = views
@@ -98,14 +100,25 @@ def centroids(stamps, phases, pixel_px, blur_px, sigma_px, boxes):
         part = seen * (np.abs(y) <= half)[:, :, None] * (np.abs(x) <= half)[:, None, :]
         total = part.sum(axis=(1, 2))
         found[f"box{2 * half + 1}"] = np.stack(
-            [(part.sum(axis=1) * x_at).sum(axis=1) / total, (part.sum(axis=2) * y_at).sum(axis=1) / total]
+            [
+                (part.sum(axis=1) * x_at).sum(axis=1) / total,
+                (part.sum(axis=2) * y_at).sum(axis=1) / total,
+            ]
         )
     place = found["box3"].copy()
     for _ in range(60):
-        x, y = (np.exp(-((where - p[:, None]) ** 2) / (2 * sigma_px**2)) for where, p in zip((x_at, y_at), place, strict=True))
+        x, y = (
+            np.exp(-((where - p[:, None]) ** 2) / (2 * sigma_px**2))
+            for where, p in zip((x_at, y_at), place, strict=True)
+        )
         part = seen * y[:, :, None] * x[:, None, :]
         total = part.sum(axis=(1, 2))
-        means = np.stack([(part.sum(axis=1) * x_at).sum(axis=1) / total, (part.sum(axis=2) * y_at).sum(axis=1) / total])
+        means = np.stack(
+            [
+                (part.sum(axis=1) * x_at).sum(axis=1) / total,
+                (part.sum(axis=2) * y_at).sum(axis=1) / total,
+            ]
+        )
         place += 1.5 * (means - place)
     found["window"] = place
     return found, boxes
@@ -120,7 +133,9 @@ def worst_errors(bench, calibration, sigma, rng):
     rates = rates[rates * bench.psf.peak_share <= white]
     seen = bench.renderer.target.seen
     sigma_px = math.sqrt(sigma**2 + 1 / 6 + seen.blur_px**2)
-    columns, rows = np.meshgrid(np.arange(20, SIZE_PX[0] - 20, STEP_PX), np.arange(20, SIZE_PX[1] - 20, STEP_PX))
+    columns, rows = np.meshgrid(
+        np.arange(20, SIZE_PX[0] - 20, STEP_PX), np.arange(20, SIZE_PX[1] - 20, STEP_PX)
+    )
     columns, rows = columns.ravel(), rows.ravel()
     near = np.arange(-HALF_PX, HALF_PX + 1)
     flux_mag, off_px = 0.0, {}
@@ -146,7 +161,9 @@ def worst_errors(bench, calibration, sigma, rng):
     return flux_mag, off_px
 
 
-@pytest.mark.parametrize(("bits", "faintest", "mag", "px", "calibration", "effort", "sigma", "pitch_um"), BENCHES)
+@pytest.mark.parametrize(
+    ("bits", "faintest", "mag", "px", "calibration", "effort", "sigma", "pitch_um"), BENCHES
+)
 def test_the_claimed_error_is_the_worst_and_no_more(
     bits, faintest, mag, px, calibration, effort, sigma, pitch_um, tmp_path, rng
 ):
@@ -155,7 +172,12 @@ def test_the_claimed_error_is_the_worst_and_no_more(
         "tracker": {"pixel_pitch_um": pitch_um},
         "sky": {"faintest_v_mag": faintest},
         "monitor": {"bits": bits, "calibration": calibration},
-        "render": {"tolerance_mag": mag, "tolerance_px": px, "effort": effort, "sprite_sigma_px": [sigma, sigma]},
+        "render": {
+            "tolerance_mag": mag,
+            "tolerance_px": px,
+            "effort": effort,
+            "sprite_sigma_px": [sigma, sigma],
+        },
     }
     path.write_text(bench_text(FRAME, changed))
     with load(path) as bench:

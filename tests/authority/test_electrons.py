@@ -11,7 +11,14 @@ from scipy.constants import c, h, k, sigma
 from scipy.integrate import quad_vec
 
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k, tabulate
+from hilstar.sky.electrons import (
+    Optics,
+    Photometry,
+    ags_electrons_per_s,
+    dgs_electrons_per_s,
+    star_temperatures_k,
+    tabulate,
+)
 from hilstar.sky.spectrum import TEMPERATURE_SCALES, constant_curve, load_curve
 from tests.authority.integrals import integral, read, v_mean
 
@@ -27,7 +34,9 @@ def planck(wavelength_nm: float, temperature_k: float | np.ndarray) -> float | n
     return 2 * np.pi * h * c**2 / m**5 / np.expm1(h * c / (m * k * temperature_k))
 
 
-def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: str = "energy") -> float:
+def independent_rate(
+    temperature_k: float, zero_point: str = "vega", weighting: str = "energy"
+) -> float:
     """Electrons per second of a V = 0 black body through 30 mm, CCD47-20 and N-BK7, by adaptive
     quadrature.
     """
@@ -42,7 +51,14 @@ def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: 
     knots = np.unique(np.concatenate([qe_nm, glass_nm[glass_nm <= 1050]]))
 
     def detected(w: float) -> float:
-        return planck(w, temperature_k) * w * 1e-9 / (h * c) * np.interp(w, qe_nm, qe) * np.interp(w, glass_nm, glass)
+        return (
+            planck(w, temperature_k)
+            * w
+            * 1e-9
+            / (h * c)
+            * np.interp(w, qe_nm, qe)
+            * np.interp(w, glass_nm, glass)
+        )
 
     return float(np.pi / 4 * 0.030**2 * scale * integral(detected, knots) * 1e-9)
 
@@ -58,14 +74,21 @@ def independent_rates(temperature_k: np.ndarray) -> np.ndarray:
 
     def together(weight, knots_nm: np.ndarray) -> np.ndarray:
         pieces = (
-            quad_vec(lambda w: planck(w, temperature_k) / unit * weight(w), a, b, epsabs=0, epsrel=1e-10)[0]
+            quad_vec(
+                lambda w: planck(w, temperature_k) / unit * weight(w), a, b, epsabs=0, epsrel=1e-10
+            )[0]
             for a, b in pairwise(knots_nm)
         )
         return sum(pieces, np.zeros(len(temperature_k)))
 
-    mean = together(lambda w: np.interp(w, v_nm, v), v_nm) / integral(lambda w: np.interp(w, v_nm, v), v_nm)
+    mean = together(lambda w: np.interp(w, v_nm, v), v_nm) / integral(
+        lambda w: np.interp(w, v_nm, v), v_nm
+    )
     knots = np.unique(np.concatenate([qe_nm, glass_nm[glass_nm <= 1050]]))
-    detected = together(lambda w: w * 1e-9 / (h * c) * np.interp(w, qe_nm, qe) * np.interp(w, glass_nm, glass), knots)
+    detected = together(
+        lambda w: w * 1e-9 / (h * c) * np.interp(w, qe_nm, qe) * np.interp(w, glass_nm, glass),
+        knots,
+    )
     return np.pi / 4 * 0.030**2 * 3.631e-2 / mean * detected * 1e-9
 
 
@@ -80,7 +103,9 @@ def optics() -> Optics:
 def test_the_integral_is_the_adaptive_one(optics, zero_point, weighting, temperature_k):
     ours = dgs_electrons_per_s(temperature_k, optics, Photometry(zero_point, weighting))
     # 2.518021e-8 and sigma are given with seven digits.
-    assert float(ours) == pytest.approx(independent_rate(temperature_k, zero_point, weighting), rel=QUAD + 1e-8)
+    assert float(ours) == pytest.approx(
+        independent_rate(temperature_k, zero_point, weighting), rel=QUAD + 1e-8
+    )
 
 
 @pytest.mark.parametrize("scale", sorted(TEMPERATURE_SCALES))
@@ -90,7 +115,10 @@ def test_the_table_is_the_integral_for_every_star_of_the_catalogue(optics, scale
     temperature_k = star_temperatures_k(colours, scale)
     table = tabulate("dgs", optics, Photometry())
     tabulated = table.electrons_per_s(np.zeros(len(colours)), temperature_k)
-    assert np.abs(tabulated / dgs_electrons_per_s(temperature_k, optics, Photometry()) - 1).max() < TABLE_LIMIT
+    assert (
+        np.abs(tabulated / dgs_electrons_per_s(temperature_k, optics, Photometry()) - 1).max()
+        < TABLE_LIMIT
+    )
     assert np.abs(tabulated / independent_rates(temperature_k) - 1).max() < TABLE_LIMIT
 
 
@@ -116,12 +144,17 @@ def test_the_photon_weighting_costs_what_the_effective_wavelengths_say(optics):
     """
     cost = []
     for temperature_k in (3000.0, 9602.0):
-        rates = [float(dgs_electrons_per_s(temperature_k, optics, Photometry("vega", w))) for w in ("energy", "photon")]
+        rates = [
+            float(dgs_electrons_per_s(temperature_k, optics, Photometry("vega", w)))
+            for w in ("energy", "photon")
+        ]
         cost.append(rates[1] / rates[0])
     knots, response = read("johnson-v")
     fine = np.linspace(470, 700, 23_001)
     r = np.interp(fine, knots, response)
-    effective = [np.sum(fine * planck(fine, t) * r) / np.sum(planck(fine, t) * r) for t in (3000.0, 9602.0)]
+    effective = [
+        np.sum(fine * planck(fine, t) * r) / np.sum(planck(fine, t) * r) for t in (3000.0, 9602.0)
+    ]
     assert cost[0] / cost[1] == pytest.approx(effective[1] / effective[0], rel=1e-6)
     assert cost[0] / cost[1] == pytest.approx(0.976, abs=0.001)
 
@@ -139,7 +172,12 @@ def test_the_average_model_is_the_product_of_its_averages(optics):
     qe_nm, qe = read("ccd47-20")
     glass_nm, glass = read("n-bk7-10mm")
     w = np.linspace(300, 1050, 75_001)
-    f0 = 3.631e-2 / v_mean(lambda x: planck(x, 9602.0), "energy") * np.trapezoid(planck(w, 9602.0), w) * 1e-9
+    f0 = (
+        3.631e-2
+        / v_mean(lambda x: planck(x, 9602.0), "energy")
+        * np.trapezoid(planck(w, 9602.0), w)
+        * 1e-9
+    )
     means = [np.trapezoid(np.interp(w, x, y), w) / 750 for x, y in ((qe_nm, qe), (glass_nm, glass))]
     by_hand = np.pi / 4 * 0.030**2 * f0 * 675e-9 / (h * c) * means[0] * means[1]
     assert ags_electrons_per_s(optics, Photometry()) == pytest.approx(by_hand, rel=1e-6)
@@ -151,13 +189,17 @@ def test_the_average_model_is_the_product_of_its_averages(optics):
 def test_aperture_and_constant_curves_scale_the_rate():
     small = Optics(10.0, constant_curve(0.5), load_curve("n-bk7-10mm", "t"))
     large = Optics(30.0, constant_curve(1.0), load_curve("n-bk7-10mm", "t"))
-    ratio = dgs_electrons_per_s(5000.0, large, Photometry()) / dgs_electrons_per_s(5000.0, small, Photometry())
+    ratio = dgs_electrons_per_s(5000.0, large, Photometry()) / dgs_electrons_per_s(
+        5000.0, small, Photometry()
+    )
     assert float(ratio) == pytest.approx(18, rel=1e-12)
 
 
 def test_n_bk7_transmits_what_the_design_s_table_says():
     curve = load_curve("n-bk7-10mm", "t", Path())
-    assert curve(np.array([350.0, 400, 500, 700])) == pytest.approx([0.884, 0.913, 0.916, 0.919], abs=6e-4)
+    assert curve(np.array([350.0, 400, 500, 700])) == pytest.approx(
+        [0.884, 0.913, 0.916, 0.919], abs=6e-4
+    )
 
 
 def test_the_two_adaptive_integrals_agree():

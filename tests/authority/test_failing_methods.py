@@ -17,7 +17,13 @@ from hilstar.instruments.study import stability
 from hilstar.instruments.study.stability import recorded
 from hilstar.optics.camera import Camera
 from hilstar.sky.electrons import tabulate
-from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETECTOR_AND_ATTITUDE, field, sky
+from tests.authority.failing_methods import (
+    CATALOGUE_AND_GEOMETRY,
+    CURVES,
+    DETECTOR_AND_ATTITUDE,
+    field,
+    sky,
+)
 
 CASES = (*CATALOGUE_AND_GEOMETRY, *DETECTOR_AND_ATTITUDE)
 # A failing method's figure is no matter of rounding; hilstar's own is, and is held by its
@@ -28,7 +34,11 @@ FAULT_SHARE = 0.01
 @pytest.fixture(scope="module")
 def tables():
     """The cases that ship, by name."""
-    return {case.case: case for name in ("catalogue_and_geometry", "detector_and_attitude") for case in recorded(name)}
+    return {
+        case.case: case
+        for name in ("catalogue_and_geometry", "detector_and_attitude")
+        for case in recorded(name)
+    }
 
 
 @pytest.mark.parametrize("measure", CASES, ids=lambda measure: measure.__name__)
@@ -55,7 +65,9 @@ def test_the_curves_that_ship_are_those_measured(name):
     path = Path(stability.__file__).with_name(f"{name}.csv")
     columns = CURVES[name]()
     shipped = np.loadtxt(path, delimiter=",", skiprows=1).T
-    assert path.read_text().splitlines()[0] == ",".join(f'"{each}"' if "," in each else each for each in columns)
+    assert path.read_text().splitlines()[0] == ",".join(
+        f'"{each}"' if "," in each else each for each in columns
+    )
     for before, now in zip(shipped, columns.values(), strict=True):
         assert before == pytest.approx(now, rel=FAULT_SHARE, abs=field.ANGLE_ARCSEC)
 
@@ -64,7 +76,10 @@ class WeakCamera(Camera):
     """One depth for every star."""
 
     def project(self, image_vectors):
-        x, y = (image_vectors[:, axis] * self.focal_length_px + self.principal_point_px[axis] for axis in (0, 1))
+        x, y = (
+            image_vectors[:, axis] * self.focal_length_px + self.principal_point_px[axis]
+            for axis in (0, 1)
+        )
         return x, y
 
 
@@ -104,7 +119,9 @@ WRONG_ROADS = (
 )
 
 
-@pytest.mark.parametrize(("visit", "name", "method"), WRONG_ROADS, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("visit", "name", "method"), WRONG_ROADS, ids=lambda value: getattr(value, "__name__", "")
+)
 def test_a_verdict_is_wrong_where_hilstar_goes_the_failing_way(visit, name, method, monkeypatch):
     monkeypatch.setitem(visit.__globals__, name, method)
     place = visit()

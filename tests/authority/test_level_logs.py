@@ -42,12 +42,23 @@ def _nothing_is_downloaded():
 
 def icrs_to_enu(seconds: float, kind: str = "enu") -> Rotation:
     at = Time(DATE, scale="utc") + TimeDelta(seconds, format="sec")
-    axes = [GCRS(CartesianRepresentation(*axis), obstime=at).transform_to(ITRS(obstime=at)) for axis in np.eye(3)]
+    axes = [
+        GCRS(CartesianRepresentation(*axis), obstime=at).transform_to(ITRS(obstime=at))
+        for axis in np.eye(3)
+    ]
     to_earth = np.stack([axis.cartesian.xyz.value for axis in axes], axis=1)
     latitude, longitude = np.radians(PLACE_DEG)
     east = [-np.sin(longitude), np.cos(longitude), 0.0]
-    north = [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
-    up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    north = [
+        -np.sin(latitude) * np.cos(longitude),
+        -np.sin(latitude) * np.sin(longitude),
+        np.cos(latitude),
+    ]
+    up = [
+        np.cos(latitude) * np.cos(longitude),
+        np.cos(latitude) * np.sin(longitude),
+        np.sin(latitude),
+    ]
     rows = [east, north, up] if kind == "enu" else [north, east, np.negative(up)]
     return Rotation.from_matrix(np.array(rows) @ to_earth)
 
@@ -69,12 +80,16 @@ def log(request, tmp_path):
     path = tmp_path / f"body.{request.param}"
     rows = [f"{k},{','.join(map(str, ORION))}" for k in range(2)]
     objects = [json.dumps({"t_ns": k * 10**9, "q": ORION}) for k in range(2)]
-    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows] if request.param == "csv" else objects) + "\n")
+    path.write_text(
+        "\n".join(["t_s,qw,qx,qy,qz", *rows] if request.param == "csv" else objects) + "\n"
+    )
     return path
 
 
 def test_a_log_of_the_body_looks_where_scipy_says(log):
-    camera = Rotation.from_quat(MOUNTING, scalar_first=True) * Rotation.from_quat(ORION, scalar_first=True)
+    camera = Rotation.from_quat(MOUNTING, scalar_first=True) * Rotation.from_quat(
+        ORION, scalar_first=True
+    )
     ra_deg, dec_deg = pointing(log, "--mounting", ",".join(map(str, MOUNTING)))
     assert (ra_deg, dec_deg) == pytest.approx(boresight_deg(camera), abs=SHOWN_DEG)
     assert (ra_deg, dec_deg) == pytest.approx((354.0570, 0.0), abs=SHOWN_DEG)
@@ -89,21 +104,35 @@ def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(log):
 
 @pytest.mark.parametrize("kind", ["enu", "ned"])
 @pytest.mark.parametrize("direction", ["icrs_to_cam", "cam_to_icrs"])
-def test_attitudes_and_rates_of_a_body_in_a_level_frame_become_the_cameras_in_the_stars(tmp_path, kind, direction):
+def test_attitudes_and_rates_of_a_body_in_a_level_frame_become_the_cameras_in_the_stars(
+    tmp_path, kind, direction
+):
     """A body that turns at a constant rate with respect to the level frame; rates are in the body's
     components.
     """
     rate, mounting = np.array([0.01, -0.02, 0.03]), Rotation.from_quat(MOUNTING, scalar_first=True)
     rows, camera = [], []
     for k in range(3):
-        level_to_body = Rotation.from_rotvec(-rate * 60 * k) * Rotation.from_quat(ORION, scalar_first=True)
+        level_to_body = Rotation.from_rotvec(-rate * 60 * k) * Rotation.from_quat(
+            ORION, scalar_first=True
+        )
         sent = level_to_body if direction == "icrs_to_cam" else level_to_body.inv()
-        rows.append(",".join(map(repr, [60.0 * k, *sent.as_quat(scalar_first=True).tolist(), *rate.tolist()])))
+        rows.append(
+            ",".join(
+                map(repr, [60.0 * k, *sent.as_quat(scalar_first=True).tolist(), *rate.tolist()])
+            )
+        )
         camera.append(mounting * level_to_body * icrs_to_enu(60.0 * k, kind))
     path = tmp_path / "level.csv"
     path.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]))
     convention = Convention(direction=direction, frame="body")
-    stated = Stated(Mounting(MOUNTING), reference=kind, place=(*PLACE_DEG, 400.0), epoch_utc=DATE, convention=convention)
+    stated = Stated(
+        Mounting(MOUNTING),
+        reference=kind,
+        place=(*PLACE_DEG, 400.0),
+        epoch_utc=DATE,
+        convention=convention,
+    )
     for k, sample in enumerate(open_log(path, stated).samples):
         found = Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True)
         assert (found * camera[k].inv()).magnitude() < EARTH_RAD

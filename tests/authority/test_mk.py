@@ -10,9 +10,22 @@ from hilstar.instruments.study.settings import held_out_by_type, held_out_errors
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import bench_stars
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import VEGA_V0_W_M2_M, Photometry, band_mean, library_electrons_per_s, load_library, tabulate_pickles
+from hilstar.sky.electrons import (
+    VEGA_V0_W_M2_M,
+    Photometry,
+    band_mean,
+    library_electrons_per_s,
+    load_library,
+    tabulate_pickles,
+)
 from hilstar.sky.facts import facts_of
-from hilstar.sky.spectral_types import bare_and_dusty, fit_types, read_types, star_types, tabulate_types
+from hilstar.sky.spectral_types import (
+    bare_and_dusty,
+    fit_types,
+    read_types,
+    star_types,
+    tabulate_types,
+)
 from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
 from hilstar.sky.synthetic import ZERO_W_M2_M
 from tests.authority.test_pickles import BARE, REDDEST_VI_MAG, SENSORS
@@ -38,7 +51,9 @@ def test_a_star_held_out_is_predicted_by_its_type(name):
     rates = library_electrons_per_s(bare_and_dusty(), SENSORS[name], Photometry())
     library, (bare, dusty) = load_library(), np.abs(held_out_by_type(rates)).reshape(2, -1)
     late = library.vi_mag >= REDDEST_VI_MAG
-    giant = late & np.array([spectral_type.endswith("III") for spectral_type in library.spectral_type])
+    giant = late & np.array(
+        [spectral_type.endswith("III") for spectral_type in library.spectral_type]
+    )
     by_colour = np.abs(held_out_errors(rates[: len(bare)]))
     for kept, limit in ((giant, LATE_GIANT_LIMIT), (late, LATE_GIANT_LIMIT), (~late, OTHERS_LIMIT)):
         assert np.percentile(bare[kept], 95) < min(limit, np.percentile(by_colour[kept], 95))
@@ -57,7 +72,9 @@ def test_a_held_out_star_is_not_in_its_own_table():
     rates = np.exp(bare_and_dusty().vi_mag)
     changed = rates.copy()
     changed[[40, 40 + len(rates) // 2]] *= 10
-    assert held_out_by_type(changed)[40] == pytest.approx((held_out_by_type(rates)[40] + 1) / 10 - 1)
+    assert held_out_by_type(changed)[40] == pytest.approx(
+        (held_out_by_type(rates)[40] + 1) / 10 - 1
+    )
 
 
 def test_dust_reddens_as_published():
@@ -67,7 +84,10 @@ def test_dust_reddens_as_published():
     library = bare_and_dusty()
     b, v = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("bessell-b", "johnson-v"))
     bv = magnitude(band_mean(library, b) / band_mean(library, v))
-    excess, vi = np.diff(bv.reshape(2, -1), axis=0)[0], np.diff(library.vi_mag.reshape(2, -1), axis=0)[0]
+    excess, vi = (
+        np.diff(bv.reshape(2, -1), axis=0)[0],
+        np.diff(library.vi_mag.reshape(2, -1), axis=0)[0],
+    )
     a0 = library.spectral_type.index("A0V")
     assert excess[a0] == pytest.approx(0.5, abs=0.02)
     assert 1.2 < (vi / excess).min() < (vi / excess)[a0] < 1.45
@@ -83,10 +103,17 @@ def test_the_b_v_that_the_choice_did_not_use(bright):
     catalog, facts, kind = bright
     b, v = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("bessell-b", "johnson-v"))
     library = bare_and_dusty()
-    table = fit_types(band_mean(library, b) / band_mean(library, v) / (ZERO_W_M2_M["b"] / VEGA_V0_W_M2_M))
+    table = fit_types(
+        band_mean(library, b) / band_mean(library, v) / (ZERO_W_M2_M["b"] / VEGA_V0_W_M2_M)
+    )
     zero = np.zeros(len(catalog))
-    off = np.abs(magnitude(table.electrons_per_s(zero, zero, catalog.vi_mag, kind)) - catalog.bv_mag)
-    by_colour = np.abs(magnitude(table.by_colour.electrons_per_s(zero, zero + 0.3, catalog.vi_mag)) - catalog.bv_mag)
+    off = np.abs(
+        magnitude(table.electrons_per_s(zero, zero, catalog.vi_mag, kind)) - catalog.bv_mag
+    )
+    by_colour = np.abs(
+        magnitude(table.by_colour.electrons_per_s(zero, zero + 0.3, catalog.vi_mag))
+        - catalog.bv_mag
+    )
     measured = np.isin(facts["vi_source"], MEASURED_VI)
     for (first, end), limit in HELD_OUT_BV_MAG.items():
         kept = measured & (kind[:, 0] >= first) & (kind[:, 0] < end)
@@ -111,7 +138,12 @@ def test_the_v_i_of_m_giants_is_that_of_their_type(bright):
 def test_absolute_magnitude_tells_giants_from_dwarfs(bright, monkeypatch):
     catalog, facts, _ = bright
     known = read_types(facts["spectral_type"])
-    blind = {**facts, "spectral_type": np.array([t.split(b"I")[0].split(b"V")[0] for t in facts["spectral_type"].tolist()])}
+    blind = {
+        **facts,
+        "spectral_type": np.array(
+            [t.split(b"I")[0].split(b"V")[0] for t in facts["spectral_type"].tolist()]
+        ),
+    }
     monkeypatch.setattr("hilstar.sky.spectral_types.facts_of", lambda hip: blind)
     told = star_types(catalog)[:, 1]
     for first, end, share in ((40, 50, 0.95), (50, 60, 0.985), (60, 70, 0.99)):
@@ -128,30 +160,53 @@ def test_absolute_magnitude_tells_giants_from_dwarfs(bright, monkeypatch):
     ],
 )  # fmt: skip
 def test_types_are_read(text, subclass, luminosity):
-    assert read_types(np.array([text.encode()]))[0] == pytest.approx([subclass, luminosity], nan_ok=True)
+    assert read_types(np.array([text.encode()]))[0] == pytest.approx(
+        [subclass, luminosity], nan_ok=True
+    )
 
 
 def test_without_type_or_v_i_the_rate_is_by_colour():
-    table, pickles = (tabulate(SENSORS["ccd47-20"], Photometry()) for tabulate in (tabulate_types, tabulate_pickles))
+    table, pickles = (
+        tabulate(SENSORS["ccd47-20"], Photometry())
+        for tabulate in (tabulate_types, tabulate_pickles)
+    )
     zero, bv, vi = np.zeros(3), np.array([0.6, 0.6, 1.5]), np.array([0.7, np.nan, 3.0])
     kind = np.array([[np.nan, 5.0], [42.0, 5.0], [65.0, 3.0]])
-    by_type, by_colour = table.electrons_per_s(zero, bv, vi, kind), pickles.electrons_per_s(zero, bv, vi)
+    by_type, by_colour = (
+        table.electrons_per_s(zero, bv, vi, kind),
+        pickles.electrons_per_s(zero, bv, vi),
+    )
     assert by_type[:2].tolist() == by_colour[:2].tolist()
     assert by_type[2] != by_colour[2]
     assert table.electrons_per_s(zero, bv, vi).tolist() == by_colour.tolist()
     # A V-I that no star has counts as the reddest's behind dust, and no rate is beyond theirs.
-    reddest = table.electrons_per_s(np.zeros(2), np.full(2, 1.4), np.array([9.03, 5.2]), np.full((2, 2), (68.0, 3.0)))
+    reddest = table.electrons_per_s(
+        np.zeros(2), np.full(2, 1.4), np.array([9.03, 5.2]), np.full((2, 2), (68.0, 3.0))
+    )
     assert reddest[0] == reddest[1]
 
 
 def test_a_bench_follows_its_key_and_counts_whom_it_could_not(tmp_path):
     path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"spectrum": "mk", "faintest_v_mag": 6.0}}))
+    path.write_text(
+        bench_text(
+            {
+                "collimator": {"focal_length_mm": 350},
+                "sky": {"spectrum": "mk", "faintest_v_mag": 6.0},
+            }
+        )
+    )
     file = read_bench_file(path)
     stars = bench_stars(file.config, file.folder)
     plain = bench_stars(replace_spectrum(file.config), file.folder)
     assert stars.hip.tolist() == plain.hip.tolist()
-    ratio = dict(zip(stars.hip.tolist(), (stars.electrons_per_s / plain.electrons_per_s).tolist(), strict=True))
+    ratio = dict(
+        zip(
+            stars.hip.tolist(),
+            (stars.electrons_per_s / plain.electrons_per_s).tolist(),
+            strict=True,
+        )
+    )
     assert ratio[24436] == pytest.approx(1.0, abs=0.1)  # Rigel
     assert max(abs(value - 1) for value in ratio.values()) > 0.1
     assert any("have no MK type of O to M" in note for note in stars.catalog.notes)

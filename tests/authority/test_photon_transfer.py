@@ -57,9 +57,14 @@ CCD = DetectorSettings(
 )
 
 
-def frames_dn(detector: Detector, level_e: float, exposure_s: float, rng: np.random.Generator) -> FloatArray:
+def frames_dn(
+    detector: Detector, level_e: float, exposure_s: float, rng: np.random.Generator
+) -> FloatArray:
     """FRAMES exposures, shape (FRAMES, height, width)."""
-    return np.array([detector.expose(np.full(SHAPE, level_e), exposure_s, rng) for _ in range(FRAMES)], dtype=np.float64)
+    return np.array(
+        [detector.expose(np.full(SHAPE, level_e), exposure_s, rng) for _ in range(FRAMES)],
+        dtype=np.float64,
+    )
 
 
 def temporal_variance(frames: FloatArray) -> float:
@@ -98,13 +103,16 @@ def dark_frames(settings: DetectorSettings, exposure_s: float, seed: int) -> dic
     return {
         "dark_e_per_s": float(dark.mean() - bias.mean()) * e_per_s,
         "dsnu_e_per_s": math.sqrt(spatial_variance(dark)) * e_per_s,
-        "dark_shot_noise_e": math.sqrt(temporal_variance(dark) - temporal_variance(bias)) * settings.gain_e_per_dn,
+        "dark_shot_noise_e": math.sqrt(temporal_variance(dark) - temporal_variance(bias))
+        * settings.gain_e_per_dn,
     }
 
 
 @pytest.mark.parametrize("gain_e_per_dn", [1.5, 6.0])
 def test_photon_transfer_finds_gain_read_noise_and_prnu(gain_e_per_dn):
-    settings = DetectorSettings(gain_e_per_dn=gain_e_per_dn, bits=16, offset_dn=200.0, read_noise_e=6.0, prnu=0.03)
+    settings = DetectorSettings(
+        gain_e_per_dn=gain_e_per_dn, bits=16, offset_dn=200.0, read_noise_e=6.0, prnu=0.03
+    )
     found = photon_transfer(settings, seed=1)
     assert found["gain_e_per_dn"] == pytest.approx(gain_e_per_dn, rel=GAIN_TOLERANCE)
     assert found["read_noise_e"] == pytest.approx(6.0, rel=READ_NOISE_TOLERANCE)
@@ -121,7 +129,9 @@ def test_dark_frames_find_dark_current_and_dsnu():
 
 def test_dsnu_grows_with_exposure_as_a_rate_does():
     # With the source's sqrt(I t) the rate would fall by sqrt 20 from the first to the second.
-    short, long = (dark_frames(CCD, exposure_s, seed=3)["dsnu_e_per_s"] for exposure_s in (1.0, 20.0))
+    short, long = (
+        dark_frames(CCD, exposure_s, seed=3)["dsnu_e_per_s"] for exposure_s in (1.0, 20.0)
+    )
     assert short == pytest.approx(long, rel=DSNU_TOLERANCE)
 
 
@@ -130,7 +140,9 @@ def test_prnu_is_proportional_to_the_signal():
     bias_dn = CCD.offset_dn
     for level_e in (5000.0, 30_000.0):
         flats = frames_dn(detector, level_e, 0.0, rng)
-        assert math.sqrt(spatial_variance(flats)) / (flats.mean() - bias_dn) == pytest.approx(0.03, rel=PRNU_TOLERANCE)
+        assert math.sqrt(spatial_variance(flats)) / (flats.mean() - bias_dn) == pytest.approx(
+            0.03, rel=PRNU_TOLERANCE
+        )
 
 
 def test_the_adc_of_the_thesis_hides_its_read_noise():
@@ -147,7 +159,9 @@ def test_the_adc_of_the_thesis_hides_its_read_noise():
 @pytest.mark.parametrize("mean_e", [0.3, 4.0, 25.0, 400.0])
 def test_electron_counts_follow_poissons_law(mean_e):
     detector = Detector(DetectorSettings(gain_e_per_dn=1.0, dark_e_per_s=mean_e / 2), SIZE_PX)
-    counts = np.bincount(detector.expose(np.full(SHAPE, mean_e / 2), 1.0, np.random.default_rng(6)).ravel())
+    counts = np.bincount(
+        detector.expose(np.full(SHAPE, mean_e / 2), 1.0, np.random.default_rng(6)).ravel()
+    )
     probability = stats.poisson.pmf(np.arange(len(counts)), mean_e)
     # Chi squared needs some 5 counts a bin: the tails are pooled into one.
     whole = probability * PIXELS >= 5
@@ -175,4 +189,6 @@ if __name__ == "__main__":
     for figures in (photon_transfer(CCD, seed=1), dark_frames(CCD, 20.0, seed=2)):
         for name, value in figures.items():
             truth = math.sqrt(203.0 * 20.0) if name == "dark_shot_noise_e" else getattr(CCD, name)
-            print(f"{name:20} {value:10.5g}   true {truth:10.5g}   {100 * (value / truth - 1):+.2f} %")
+            print(
+                f"{name:20} {value:10.5g}   true {truth:10.5g}   {100 * (value / truth - 1):+.2f} %"
+            )

@@ -95,7 +95,9 @@ def leave_one_out(optics, without_vi=False):
         table = fit_table(library.bv_mag[others], library.vi_mag[others], rate[others])
         one = slice(i, i + 1)
         predicted = table.electrons_per_s(
-            np.zeros(1), library.bv_mag[one], np.full(1, np.nan) if without_vi else library.vi_mag[one]
+            np.zeros(1),
+            library.bv_mag[one],
+            np.full(1, np.nan) if without_vi else library.vi_mag[one],
         )
         errors[i] = abs(predicted[0] / rate[i] - 1)
     return errors
@@ -116,7 +118,9 @@ def test_a_bare_sensor_misses_the_aim_by_no_more_than_stated():
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_without_vi_most_stars_are_as_wrong_as_stated(name):
-    errors = leave_one_out(SENSORS[name], without_vi=True)[load_library().vi_mag < MAX_BV_FIT_VI_MAG]
+    errors = leave_one_out(SENSORS[name], without_vi=True)[
+        load_library().vi_mag < MAX_BV_FIT_VI_MAG
+    ]
     assert np.median(errors) <= BV_MEDIAN_LIMIT
     assert np.percentile(errors, 95) <= BV_P95_LIMIT
 
@@ -135,7 +139,9 @@ def test_the_black_body_loses_at_every_colour_and_scale(name, scale, red):
     library = load_library()
     chosen = (library.vi_mag >= REDDEST_VI_MAG) == red
     truth = library_electrons_per_s(library, SENSORS[name], Photometry())
-    black = dgs_electrons_per_s(TEMPERATURE_SCALES[scale](library.bv_mag), SENSORS[name], Photometry())
+    black = dgs_electrons_per_s(
+        TEMPERATURE_SCALES[scale](library.bv_mag), SENSORS[name], Photometry()
+    )
     black_errors = np.abs(black / truth - 1)[chosen]
     errors = leave_one_out(SENSORS[name])[chosen]
     for share in (50, 95, 100):
@@ -157,8 +163,12 @@ def test_the_packed_spectra_integrate_as_the_originals():
     library = load_library()
     for name, rates in zip(("ccd47-20", "kai-4021"), exact, strict=True):
         optics = Optics(30.0, load_curve(name, name), constant_curve(1.0))
-        assert library_electrons_per_s(library, optics, Photometry()) == pytest.approx(rates, rel=ROUNDING_LIMIT)
-    assert band_mean(library, load_curve("johnson-v", "v")) == pytest.approx(np.ones(106), rel=ROUNDING_LIMIT)
+        assert library_electrons_per_s(library, optics, Photometry()) == pytest.approx(
+            rates, rel=ROUNDING_LIMIT
+        )
+    assert band_mean(library, load_curve("johnson-v", "v")) == pytest.approx(
+        np.ones(106), rel=ROUNDING_LIMIT
+    )
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -177,7 +187,9 @@ def test_every_hipparcos_star_gets_a_rate_within_the_library(name):
 def test_a_cool_star_gives_more_electrons_the_redder_it_is(name):
     # Only cool ones: through the ultraviolet a hotter star of the same V gives more.
     vi_mag = np.linspace(1.0, 9.03, 1000)
-    rates = tabulate_pickles(SENSORS[name], Photometry()).electrons_per_s(0 * vi_mag, 0 * vi_mag + 1.5, vi_mag)
+    rates = tabulate_pickles(SENSORS[name], Photometry()).electrons_per_s(
+        0 * vi_mag, 0 * vi_mag + 1.5, vi_mag
+    )
     steps = np.diff(rates)
     assert (steps[vi_mag[1:] < load_library().vi_mag.max()] > 0).all()
     assert (steps[vi_mag[:-1] > load_library().vi_mag.max()] == 0).all()
@@ -193,14 +205,21 @@ def test_six_stars_that_are_shown_are_redder_than_every_spectrum():
 def test_the_catalogue_s_two_colours_give_two_rates(name, p95):
     catalog = load_catalog()
     kept = (catalog.v_mag <= SHOWN_V_MAG) & (catalog.vi_mag < REDDEST_VI_MAG)
-    v_mag, bv_mag, vi_mag = (column[kept] for column in (catalog.v_mag, catalog.bv_mag, catalog.vi_mag))
+    v_mag, bv_mag, vi_mag = (
+        column[kept] for column in (catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
+    )
     table = tabulate_pickles(SENSORS[name], Photometry())
-    by_vi, by_bv = (table.electrons_per_s(v_mag, bv_mag, colour) for colour in (vi_mag, np.full_like(vi_mag, np.nan)))
-    assert np.percentile(np.abs(by_vi / by_bv - 1), 95) == pytest.approx(p95, abs=TWO_COLOURS_TOLERANCE)
+    by_vi, by_bv = (
+        table.electrons_per_s(v_mag, bv_mag, colour)
+        for colour in (vi_mag, np.full_like(vi_mag, np.nan))
+    )
+    assert np.percentile(np.abs(by_vi / by_bv - 1), 95) == pytest.approx(
+        p95, abs=TWO_COLOURS_TOLERANCE
+    )
     if name == "ccd47-20":
-        assert np.percentile(np.abs(table.electrons_per_s(v_mag, bv_mag, vi_mag + 0.05) / by_vi - 1), 95) == pytest.approx(
-            0.030, abs=TWO_COLOURS_TOLERANCE
-        )
+        assert np.percentile(
+            np.abs(table.electrons_per_s(v_mag, bv_mag, vi_mag + 0.05) / by_vi - 1), 95
+        ) == pytest.approx(0.030, abs=TWO_COLOURS_TOLERANCE)
 
 
 def test_most_of_hipparcos_s_vi_is_the_usual_one_of_its_bv():
@@ -208,7 +227,9 @@ def test_most_of_hipparcos_s_vi_is_the_usual_one_of_its_bv():
     kept = (catalog.v_mag <= SHOWN_V_MAG) & np.isfinite(catalog.bv_mag)
     bv_mag, vi_mag = catalog.bv_mag[kept], catalog.vi_mag[kept]
     alike = np.array_split(np.argsort(bv_mag), 200)
-    usual = np.interp(bv_mag, [np.median(bv_mag[k]) for k in alike], [np.median(vi_mag[k]) for k in alike])
+    usual = np.interp(
+        bv_mag, [np.median(bv_mag[k]) for k in alike], [np.median(vi_mag[k]) for k in alike]
+    )
     off_mag = np.abs(vi_mag - usual)[vi_mag < REDDEST_VI_MAG]
     assert np.percentile(off_mag, 67) < 0.006
     assert (off_mag > 0.2).sum() == 887

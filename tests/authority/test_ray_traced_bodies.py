@@ -73,7 +73,14 @@ def test_a_globe_has_the_phase_integral_of_its_law_and_the_area_of_its_crescent(
 def near_earth(height_km: float = 400.0) -> Body:
     """The Earth below, with air."""
     return Body(
-        np.array([0, 0, 6378.137 + height_km]), 6378.137, 6356.752, NORTH, np.array([1.0, 0, 0]), lambert, 1.0, (8.0, 0.1)
+        np.array([0, 0, 6378.137 + height_km]),
+        6378.137,
+        6356.752,
+        NORTH,
+        np.array([1.0, 0, 0]),
+        lambert,
+        1.0,
+        (8.0, 0.1),
     )
 
 
@@ -86,7 +93,9 @@ def test_rays_touch_the_limb_and_nothing_beyond_it():
     assert traced(airless, touching + 1e-9 * outward)[1].all()
     # the angle whose sine is the radius by the distance, between those of its axes
     angle = np.arctan2(np.hypot(*touching[:, :2].T), touching[:, 2])
-    assert np.arcsin(6356.752 / 6778.137) < angle.min() < angle.max() < np.arcsin(6378.137 / 6778.137)
+    assert (
+        np.arcsin(6356.752 / 6778.137) < angle.min() < angle.max() < np.arcsin(6378.137 / 6778.137)
+    )
 
 
 def test_the_air_along_a_ray_is_its_integral_and_that_of_the_closed_form():
@@ -96,7 +105,9 @@ def test_the_air_along_a_ray_is_its_integral_and_that_of_the_closed_form():
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     height, _, tau = columns(earth, rays)
     assert tau == pytest.approx(direct_columns(earth, rays), rel=COLUMN)
-    assert tau == pytest.approx(0.1 * np.sqrt(2 * np.pi * 6378.137 / 8.0) * np.exp(-height / 8.0), rel=2 * CLOSED_COLUMN)
+    assert tau == pytest.approx(
+        0.1 * np.sqrt(2 * np.pi * 6378.137 / 8.0) * np.exp(-height / 8.0), rel=2 * CLOSED_COLUMN
+    )
 
 
 def test_an_edge_is_found_where_the_disc_ends_and_a_blur_keeps_place_and_flux(rng):
@@ -116,4 +127,6 @@ def test_solid_angles_are_those_of_a_pinhole():
     def wide(a, b):
         return np.stack([a / 2000.0, b / 2000.0, np.ones_like(a)], axis=1)
 
-    assert solid_angles(wide, x, y) == pytest.approx((1 + (x / 2000) ** 2 + (y / 2000) ** 2) ** -1.5 / 2000**2, rel=1e-8)
+    assert solid_angles(wide, x, y) == pytest.approx(
+        (1 + (x / 2000) ** 2 + (y / 2000) ** 2) ** -1.5 / 2000**2, rel=1e-8
+    )

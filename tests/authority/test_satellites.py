@@ -40,7 +40,9 @@ def date(scale: Timescale, utc: int) -> Time:
 
 def in_skyfield(text: str, scale: Timescale) -> list[EarthSatellite]:
     lines = text.splitlines()
-    return [EarthSatellite(lines[k + 1], lines[k + 2], lines[k], scale) for k in range(0, len(lines), 3)]
+    return [
+        EarthSatellite(lines[k + 1], lines[k + 2], lines[k], scale) for k in range(0, len(lines), 3)
+    ]
 
 
 @pytest.mark.parametrize("observer", ["station", "geocentre"])

@@ -39,7 +39,9 @@ README = (ROOT / "examples" / "bench.toml").read_text()
 FINE = bench_text({"monitor": {"pixel_pitch_um": 10.0}, "tracker": {"psf_sigma_px": [1.2, 1.2]}})
 
 
-def along_an_axis(ratio: float, lens_px: float, *, of_the_sky: bool) -> tuple[np.ndarray, np.ndarray]:
+def along_an_axis(
+    ratio: float, lens_px: float, *, of_the_sky: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Places on the detector, px, and the density of a star's light there before the tracker's
     pixel.
     """
@@ -91,7 +93,9 @@ def test_a_star_is_as_wide_as_the_integral_over_its_pixels_says(tmp_path, text):
     # A tracker's pixel adds the variance of a square of side 1.
     with_pixel = math.sqrt((sigma**2 + 1 / 12) / (sky_sigma**2 + 1 / 12))
     assert found.sigma_ratio == pytest.approx(with_pixel, rel=GRID_ERROR)
-    assert found.peak_loss_mag == pytest.approx(-2.5 * math.log10(peak / sky_peak), abs=2.5 * POINTS_ERROR)
+    assert found.peak_loss_mag == pytest.approx(
+        -2.5 * math.log10(peak / sky_peak), abs=2.5 * POINTS_ERROR
+    )
     assert found.shared_px == pytest.approx(shared, rel=5 * POINTS_ERROR)
     assert found.sky_shared_px == pytest.approx(sky_shared, rel=5 * POINTS_ERROR)
 

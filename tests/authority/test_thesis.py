@@ -19,14 +19,26 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, v_band_mean_w_m2_m
 from hilstar.sky.facts import facts_of
-from hilstar.sky.spectrum import DATA_DIR, Curve, blackbody_exitance_w_m2_m, load_curve, read_curve_csv
+from hilstar.sky.spectrum import (
+    DATA_DIR,
+    Curve,
+    blackbody_exitance_w_m2_m,
+    load_curve,
+    read_curve_csv,
+)
 from hilstar.sky.synthetic import curve_mean, vega, vega_electrons_per_s
 from hilstar.tracker.settings import DetectorSettings
 
 PRINTED = 0.006  # half of the last digit of a figure with two decimals, and rounding
 # Table 2.3: medians of stars to V = 9, mas and mas/yr; there to Hp = 9, which is 0.1 mag off, and
 # moves them by 0.02.
-TABLE_2_3 = {"ra_mas": 0.77, "dec_mas": 0.64, "parallax_mas": 0.97, "pm_ra_mas_yr": 0.88, "pm_dec_mas_yr": 0.74}
+TABLE_2_3 = {
+    "ra_mas": 0.77,
+    "dec_mas": 0.64,
+    "parallax_mas": 0.97,
+    "pm_ra_mas_yr": 0.88,
+    "pm_dec_mas_yr": 0.74,
+}
 BRIGHT_V_MAG, MEDIAN_LIMIT = 9.0, 0.025
 
 
@@ -39,40 +51,60 @@ def test_the_catalogue_s_origins_and_errors_are_tables_2_2_and_2_3():
     assert facts["sigma_bv_mag"].mean() == pytest.approx(0.0281, abs=5e-5)
     bright = catalog.v_mag < BRIGHT_V_MAG
     for name, printed in TABLE_2_3.items():
-        assert np.median(facts[f"sigma_{name}"][bright]) == pytest.approx(printed, abs=MEDIAN_LIMIT), name
+        assert np.median(facts[f"sigma_{name}"][bright]) == pytest.approx(
+            printed, abs=MEDIAN_LIMIT
+        ), name
     assert int((catalog.bv_mag < -0.3).sum()) == 25
     assert ((catalog.bv_mag >= 0) & (catalog.bv_mag <= 2)).mean() == pytest.approx(0.938, abs=5e-4)
-    assert ((catalog.bv_mag >= -0.3) & (catalog.bv_mag <= 2)).mean() == pytest.approx(0.997, abs=5e-4)
+    assert ((catalog.bv_mag >= -0.3) & (catalog.bv_mag <= 2)).mean() == pytest.approx(
+        0.997, abs=5e-4
+    )
 
 
 def test_proper_motion_added_to_right_ascension_is_off_by_up_to_18_arcsec():
     catalog = load_catalog()
     off_mas = 8.75 * np.abs(catalog.pm_ra_cosdec_mas_yr) * (1 - np.cos(np.radians(catalog.dec_deg)))
-    assert np.median(off_mas) == pytest.approx(16, abs=0.5) and off_mas.max() == pytest.approx(18_000, abs=500)
+    assert np.median(off_mas) == pytest.approx(16, abs=0.5) and off_mas.max() == pytest.approx(
+        18_000, abs=500
+    )
 
 
 def test_vega_is_no_black_body_of_9602_k():
     light, johnson_v = vega(), read_curve_csv(DATA_DIR / "johnson-v.csv")
     nm = np.array([350.0, 400.0, 900.0])
     body = blackbody_exitance_w_m2_m(nm, 9602.0) / v_band_mean_w_m2_m(9602.0, "energy")
-    np.testing.assert_allclose(light(nm) / curve_mean(light, johnson_v) / body, [0.46, 1.38, 0.76], atol=PRINTED)
+    np.testing.assert_allclose(
+        light(nm) / curve_mean(light, johnson_v) / body, [0.46, 1.38, 0.76], atol=PRINTED
+    )
     optics = Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "transmission"))
-    photon, usual = (dgs_electrons_per_s(3000.0, optics, Photometry("vega", how)) for how in ("photon", "energy"))
+    photon, usual = (
+        dgs_electrons_per_s(3000.0, optics, Photometry("vega", how)) for how in ("photon", "energy")
+    )
     assert 1 - photon / usual == pytest.approx(0.016, abs=5e-4)
-    more = dgs_electrons_per_s(9602.0, optics, Photometry()) * flux_ratio(0.03) / vega_electrons_per_s(optics, Photometry())
+    more = (
+        dgs_electrons_per_s(9602.0, optics, Photometry())
+        * flux_ratio(0.03)
+        / vega_electrons_per_s(optics, Photometry())
+    )
     assert more == pytest.approx(1.076, abs=5e-4)
 
 
 def test_a_background_pixel_of_orion_has_the_noise_of_table_4_1_with_its_dimensions_mended():
-    detector = DetectorSettings(gain_e_per_dn=24, read_noise_e=2, dark_e_per_s=203, dsnu_e_per_s=60, prnu=0.03)
+    detector = DetectorSettings(
+        gain_e_per_dn=24, read_noise_e=2, dark_e_per_s=203, dsnu_e_per_s=60, prnu=0.03
+    )
     sky_e, seconds = 1170.7, 3.5
     noise = detector.noise(sky_e, seconds)
-    assert math.sqrt(noise.prnu_e2) == pytest.approx(35, abs=0.5) and math.sqrt(noise.dsnu_e2) == pytest.approx(210)
+    assert math.sqrt(noise.prnu_e2) == pytest.approx(35, abs=0.5) and math.sqrt(
+        noise.dsnu_e2
+    ) == pytest.approx(210)
     assert math.sqrt(noise.total_e2) == pytest.approx(217, abs=0.5)
     assert math.sqrt(noise.quantisation_e2) == pytest.approx(6.9, abs=0.05)
     assert detector.adc_noise_e == pytest.approx(4.93, abs=PRINTED)
     thesis_prnu_e2, thesis_dsnu_e2 = sky_e * 0.03, 60 * seconds
-    assert (math.sqrt(thesis_prnu_e2), math.sqrt(thesis_dsnu_e2)) == pytest.approx((5.9, 14.5), abs=0.05)
+    assert (math.sqrt(thesis_prnu_e2), math.sqrt(thesis_dsnu_e2)) == pytest.approx(
+        (5.9, 14.5), abs=0.05
+    )
     total_e2 = sky_e + thesis_prnu_e2 + 203 * seconds + thesis_dsnu_e2 + detector.adc_noise_e**2 + 4
     assert math.sqrt(total_e2) == pytest.approx(46, abs=0.5)
 
@@ -97,11 +129,17 @@ def test_orion_s_circle_of_eq_4_6_reaches_beyond_its_corner():
 def test_two_of_the_ratios_of_figure_5_22_depend_on_the_range_of_wavelengths_alone():
     glass, hot_k = load_curve("n-bk7-10mm", "transmission"), np.array([3000.0, 9000.0, 50_000.0])
     kai = load_curve("kai-4021", "qe")
-    wide = Curve(np.concatenate([[300.0], kai.wavelength_nm, [1050.0]]), np.concatenate([[0.2], kai.value, [0.0]]))
+    wide = Curve(
+        np.concatenate([[300.0], kai.wavelength_nm, [1050.0]]),
+        np.concatenate([[0.2], kai.value, [0.0]]),
+    )
     ccd, ours, longer = (
-        rapp_ratios(hot_k, Optics(30.0, curve, glass), "energy") for curve in (load_curve("ccd47-20", "qe"), kai, wide)
+        rapp_ratios(hot_k, Optics(30.0, curve, glass), "energy")
+        for curve in (load_curve("ccd47-20", "qe"), kai, wide)
     )
     np.testing.assert_allclose(longer[:2], ccd[:2], rtol=1e-9)
     assert (ours[0, 2], ccd[0, 2]) == pytest.approx((1.02, 1.56), abs=PRINTED)
     assert 100 * (ours[2, 1:] - 1) == pytest.approx([5.5, 14.8], abs=0.05)
-    assert 100 * (ccd[2, 1:] - 1) == pytest.approx([-15.3, -2.9], abs=0.05) and ccd[2, 0] == pytest.approx(1.88, abs=PRINTED)
+    assert 100 * (ccd[2, 1:] - 1) == pytest.approx([-15.3, -2.9], abs=0.05) and ccd[
+        2, 0
+    ] == pytest.approx(1.88, abs=PRINTED)

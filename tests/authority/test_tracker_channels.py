@@ -47,18 +47,31 @@ def sensor(request, tmp_path_factory):
     for name, value in zip("rgb", SENSORS[request.param], strict=True):
         rows = "".join(f"{nm:g},{v:.6f}\n" for nm, v in zip(NM, value, strict=True))
         (folder / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
-    rows = "".join(f"{nm:g},{v:.6f}\n" for nm, v in zip(NM, np.sum(SENSORS[request.param], axis=0) / 3, strict=True))
+    rows = "".join(
+        f"{nm:g},{v:.6f}\n"
+        for nm, v in zip(NM, np.sum(SENSORS[request.param], axis=0) / 3, strict=True)
+    )
     (folder / "mono.csv").write_text(f"wavelength_nm,value\n{rows}")
-    return folder, [np.interp(FINE_NM, NM, value.round(6), left=0, right=0) for value in SENSORS[request.param]]
+    return folder, [
+        np.interp(FINE_NM, NM, value.round(6), left=0, right=0) for value in SENSORS[request.param]
+    ]
 
 
 def written(folder, mono, *changes):
-    keys = {"quantum_efficiency": "mono.csv"} if mono else {"quantum_efficiency": None, "quantum_efficiency_r": "r.csv"}
+    keys = (
+        {"quantum_efficiency": "mono.csv"}
+        if mono
+        else {"quantum_efficiency": None, "quantum_efficiency_r": "r.csv"}
+    )
     keys |= {} if mono else {"quantum_efficiency_g": "g.csv", "quantum_efficiency_b": "b.csv"}
-    detector = {"gain_e_per_dn": 1.0, "full_well_e": 1e9, "bits": 16} | ({} if mono else {"bayer": "grbg"})
+    detector = {"gain_e_per_dn": 1.0, "full_well_e": 1e9, "bits": 16} | (
+        {} if mono else {"bayer": "grbg"}
+    )
     sky = {"faintest_v_mag": 4.0, "spectrum": "blackbody"}
     path = folder / f"{'mono' if mono else 'bayer'}.toml"
-    path.write_text(bench_text({"tracker": keys, "tracker.detector": detector, "sky": sky}, *changes))
+    path.write_text(
+        bench_text({"tracker": keys, "tracker.detector": detector, "sky": sky}, *changes)
+    )
     return path
 
 
@@ -67,7 +80,9 @@ def electrons(temperature_k, efficiency):
     1998), by trapezia of 0.25 nm.
     """
     power = FINE_NM**-5 / np.expm1(0.0143877688 / (FINE_NM * 1e-9 * temperature_k))
-    glass, v = (np.interp(FINE_NM, *read(name), left=0, right=0) for name in ("n-bk7-10mm", "johnson-v"))
+    glass, v = (
+        np.interp(FINE_NM, *read(name), left=0, right=0) for name in ("n-bk7-10mm", "johnson-v")
+    )
     w_m2_m = 3.631e-2 * power / (trapezoid(power * v, FINE_NM) / trapezoid(v, FINE_NM))
     photons = np.pi / 4 * 0.03**2 * w_m2_m * glass * FINE_NM * 1e-9 / 1.98644586e-25
     return trapezoid(photons * efficiency, FINE_NM * 1e-9)
@@ -80,7 +95,13 @@ def test_each_channels_electrons_of_every_star(sensor, mono):
     some = np.linspace(0, len(stars) - 1, 60).astype(int)
     found = stars.electrons_per_s[some, None] * (1 if mono else stars.colours[some])
     efficiencies = [sum(channels) / 3] if mono else channels
-    wanted = [[electrons(stars.temperature_k[k], one) * 10 ** (-0.4 * stars.v_mag[k]) for one in efficiencies] for k in some]
+    wanted = [
+        [
+            electrons(stars.temperature_k[k], one) * 10 ** (-0.4 * stars.v_mag[k])
+            for one in efficiencies
+        ]
+        for k in some
+    ]
     np.testing.assert_allclose(found, wanted, rtol=QUADRATURE)
 
 
@@ -88,15 +109,24 @@ def test_each_channels_electrons_of_every_star(sensor, mono):
 def test_the_mosaics_mean_image_has_a_quarter_of_red_and_blue_and_half_of_green(sensor):
     """A star of sigma 1.6 px: every second pixel has its quarter of the light to 3e-6."""
     folder, channels = sensor
-    with Simulator(read_bench_file(written(folder, False, {"tracker": {"psf_sigma_px": [1.6, 1.6]}}))) as simulator:
+    with Simulator(
+        read_bench_file(written(folder, False, {"tracker": {"psf_sigma_px": [1.6, 1.6]}}))
+    ) as simulator:
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     star = exposure.truth[0]
     x, y = round(star["x_px"]), round(star["y_px"])
     square, y0, x0 = exposure.mean_e[y - 12 : y + 13, x - 12 : x + 13], y - 12, x - 12
     rows, columns = np.indices(square.shape)
-    colour = np.array(["grbg"[2 * ((r + y0) % 2) + (c + x0) % 2] for r, c in zip(rows.ravel(), columns.ravel(), strict=True)])
+    colour = np.array(
+        [
+            "grbg"[2 * ((r + y0) % 2) + (c + x0) % 2]
+            for r, c in zip(rows.ravel(), columns.ravel(), strict=True)
+        ]
+    )
     found = [square.ravel()[colour == name].sum() / 0.1 for name in "rgb"]
-    wanted = [electrons(star["temperature_k"], one) * 10 ** (-0.4 * star["v_mag"]) for one in channels]
+    wanted = [
+        electrons(star["temperature_k"], one) * 10 ** (-0.4 * star["v_mag"]) for one in channels
+    ]
     np.testing.assert_allclose(found, np.array(wanted) * [0.25, 0.5, 0.25], rtol=QUADRATURE)
 
 
@@ -110,7 +140,11 @@ def test_the_budgets_near_infrared_is_the_librarys_own(sensor):
     found = {(row["channel"], row["from_nm"]): row["by_class"] for row in rows}
     assert {nm for _, nm in found} == {700.0, 680.0} and len(found) == 8
     with np.load(DATA_DIR / "pickles.npz") as packed:
-        nm, flux, kinds = packed["wavelength_nm"].astype(float), packed["flux"].astype(float), packed["spectral_type"]
+        nm, flux, kinds = (
+            packed["wavelength_nm"].astype(float),
+            packed["flux"].astype(float),
+            packed["spectral_type"],
+        )
     glass = np.interp(FINE_NM, *read("n-bk7-10mm"), left=0, right=0)
     for name, efficiency in (("all", sum(channels)), ("quantum_efficiency_r", channels[0])):
         for one in "OBAFGKM":

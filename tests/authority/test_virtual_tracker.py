@@ -33,12 +33,20 @@ def planck_photons(wavelength_nm: float, temperature_k: float) -> float:
     return 2 * np.pi * c / m**4 / np.expm1(h * c / (m * k * temperature_k))
 
 
-def quad_rate(v_mag: float, temperature_k: float, aperture_mm: float, qe, transmission: float) -> float:
+def quad_rate(
+    v_mag: float, temperature_k: float, aperture_mm: float, qe, transmission: float
+) -> float:
     """Electrons per second through a QE table (wavelengths, values) and a constant transmission."""
     wavelength_nm, value = qe
     mean = v_mean(lambda w: planck_photons(w, temperature_k) * h * c / (w * 1e-9), "energy")
     detected = sum(
-        quad(lambda w: planck_photons(w, temperature_k) * np.interp(w, wavelength_nm, value), a, b, epsrel=1e-11, epsabs=0)[0]
+        quad(
+            lambda w: planck_photons(w, temperature_k) * np.interp(w, wavelength_nm, value),
+            a,
+            b,
+            epsrel=1e-11,
+            epsabs=0,
+        )[0]
         for a, b in itertools.pairwise(wavelength_nm)
     )
     scale = 10 ** (-0.4 * v_mag) * 3.631e-2 / mean
@@ -55,9 +63,15 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
         rows = "".join(f"{w:g},{v:g}\n" for w, v in zip(knots, values, strict=True))
         (tmp_path / "qe.csv").write_text("wavelength_nm,value\n" + rows)
         aperture, transmission = rng.uniform(5, 100), round(float(rng.uniform(0.3, 1)), 3)
-        text = SMALL_BENCH.replace('"ccd47-20"', '"qe.csv"').replace('"n-bk7-10mm"', str(transmission))
-        text = text.replace("aperture_mm = 30", f"aperture_mm = {aperture!r}").replace("[1024, 1024]", "[700, 700]")
-        (tmp_path / "bench.toml").write_text(text + '[sky]\nspectrum = "blackbody"\nfaintest_v_mag = 8.0\n')
+        text = SMALL_BENCH.replace('"ccd47-20"', '"qe.csv"').replace(
+            '"n-bk7-10mm"', str(transmission)
+        )
+        text = text.replace("aperture_mm = 30", f"aperture_mm = {aperture!r}").replace(
+            "[1024, 1024]", "[700, 700]"
+        )
+        (tmp_path / "bench.toml").write_text(
+            text + '[sky]\nspectrum = "blackbody"\nfaintest_v_mag = 8.0\n'
+        )
         with Simulator(read_bench_file(tmp_path / "bench.toml")) as simulator:
             q = from_radec_roll_deg(*rng.uniform([0, -80, 0], [360, 80, 360]))
             star = simulator.expose(simulator.view(q, np.zeros(3)), None).truth
@@ -89,7 +103,10 @@ def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
         expected = np.pi / 4 * 0.03**2 * 10 ** (-0.4 * 0.03) * 3.631e-2 / mean * detected * 1e-9
         assert star["electrons_per_s"] == pytest.approx(expected, rel=LIMIT)
         x, y = round(star["x_px"]), round(star["y_px"])
-        light_e = exposure.mean_e[y - 8 : y + 9, x - 8 : x + 9] - simulator.background_e[y - 8 : y + 9, x - 8 : x + 9]
+        light_e = (
+            exposure.mean_e[y - 8 : y + 9, x - 8 : x + 9]
+            - simulator.background_e[y - 8 : y + 9, x - 8 : x + 9]
+        )
         # the footprint's cut and float32
         assert light_e.sum() == pytest.approx(expected * 5.0, rel=3e-6)
 
@@ -99,10 +116,18 @@ def test_the_gpu_and_the_oracle_agree_to_float32(rate_deg_s):
     with Simulator(read_bench_file(ROOT / "configs" / "thesis-orion.toml")) as simulator:
         view = simulator.view(from_radec_roll_deg(84.057, -1.2, 0.0), np.radians(rate_deg_s))
         tracker = simulator.config.tracker
-        sprites = smeared_sprites(simulator.stars, view.motion, simulator.camera, simulator.canvas.psf)
-        oracle_e = linear_image(sprites, tracker.resolution_px, simulator.canvas.psf) * tracker.exposure_s
+        sprites = smeared_sprites(
+            simulator.stars, view.motion, simulator.camera, simulator.canvas.psf
+        )
+        oracle_e = (
+            linear_image(sprites, tracker.resolution_px, simulator.canvas.psf) * tracker.exposure_s
+        )
         gpu_e = simulator.expose(view, None).mean_e - simulator.background_e
-        assert np.abs(gpu_e - oracle_e).max() / (simulator.stars.electrons_per_s.max() * tracker.exposure_s) < FLOAT32
+        assert (
+            np.abs(gpu_e - oracle_e).max()
+            / (simulator.stars.electrons_per_s.max() * tracker.exposure_s)
+            < FLOAT32
+        )
         assert gpu_e.sum() == pytest.approx(oracle_e.sum(), rel=1e-6)
 
 
@@ -110,17 +135,28 @@ def test_zodiacal_light_is_that_of_the_design():
     """A perfect detector from 330 to 1100 nm collects 96.9 photons/s/m2/arcsec2 at V = 22.1
     (design, section 3).
     """
-    perfect = Optics(2e3 / np.sqrt(np.pi), Curve(np.array([330.0, 1100.0]), np.ones(2)), Curve(np.empty(0), np.ones(1)))
+    perfect = Optics(
+        2e3 / np.sqrt(np.pi),
+        Curve(np.array([330.0, 1100.0]), np.ones(2)),
+        Curve(np.empty(0), np.ones(1)),
+    )
     assert perfect.area_m2 == pytest.approx(1.0)
     # The figure has three digits.
-    assert zodiacal_electrons_per_s_arcsec2(22.1, perfect, Photometry()) == pytest.approx(96.9, abs=0.05)
+    assert zodiacal_electrons_per_s_arcsec2(22.1, perfect, Photometry()) == pytest.approx(
+        96.9, abs=0.05
+    )
     # The WFC3 handbook's tabulated spectrum gives 101.6: within the 5 % that the docstring states.
-    assert zodiacal_electrons_per_s_arcsec2(22.1, perfect, Photometry()) == pytest.approx(101.6, rel=0.05)
+    assert zodiacal_electrons_per_s_arcsec2(22.1, perfect, Photometry()) == pytest.approx(
+        101.6, rel=0.05
+    )
 
 
 def test_the_background_is_its_level_and_its_gradient(tmp_path):
     path = tmp_path / "bench.toml"
-    path.write_text(SMALL_BENCH + "[background]\nelectrons_per_px = 100\ngradient_electrons_across = [50, -20]\n")
+    path.write_text(
+        SMALL_BENCH
+        + "[background]\nelectrons_per_px = 100\ngradient_electrons_across = [50, -20]\n"
+    )
     with Simulator(read_bench_file(path)) as simulator:
         level = simulator.background_e
     assert level.mean() == pytest.approx(100)

@@ -20,17 +20,42 @@ from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.cameras import tracker_camera
-from hilstar.sky.electrons import VEGA_V0_W_M2_M, Optics, Photometry, zodiacal_electrons_per_s_arcsec2
+from hilstar.sky.electrons import (
+    VEGA_V0_W_M2_M,
+    Optics,
+    Photometry,
+    zodiacal_electrons_per_s_arcsec2,
+)
 from hilstar.sky.spectrum import Curve, load_curve
-from hilstar.sky.zodiacal import FAR_SLOPES, NEAR_SLOPES, Sunward, ZodiacalLight, relative_spectrum, sunward, tabled_light
+from hilstar.sky.zodiacal import (
+    FAR_SLOPES,
+    NEAR_SLOPES,
+    Sunward,
+    ZodiacalLight,
+    relative_spectrum,
+    sunward,
+    tabled_light,
+)
 from tests.authority.integrals import integral, read, v_mean
 from tests.support.benches import SMALL_BENCH
 
 WHEN = "2026-03-01T06:00:00"
-BENCH = SMALL_BENCH + f'[sky]\nepoch_utc = "{WHEN}Z"\nfaintest_v_mag = 1.0\n[background]\nzodiacal = "leinert1998"\n'
+BENCH = (
+    SMALL_BENCH
+    + f'[sky]\nepoch_utc = "{WHEN}Z"\nfaintest_v_mag = 1.0\n[background]\nzodiacal = "leinert1998"\n'
+)
 LON_DEG, LAT_DEG = np.r_[0:50:5, 60:195:15], np.r_[0:35:5, 45:91:15]
 # Typed in from the paper's table 17: |longitude from the Sun|, |latitude|, 1e-8 W m-2 sr-1 um-1.
-PAPER = [(15, 0, 11500), (30, 0, 2480), (45, 15, 442), (60, 30, 183), (90, 0, 259), (90, 45, 104), (135, 60, 77), (180, 0, 230)]
+PAPER = [
+    (15, 0, 11500),
+    (30, 0, 2480),
+    (45, 15, 442),
+    (60, 30, 183),
+    (90, 0, 259),
+    (90, 45, 104),
+    (135, 60, 77),
+    (180, 0, 230),
+]
 # The Sun by Astropy is apparent, and true of date against mean: 21 and 17 arcsec; the table falls
 # by at most 16 % in a degree.
 SUN_PLACE = 0.002
@@ -42,19 +67,25 @@ def vectors_of(dlon_deg, lat_deg) -> np.ndarray:
         time = Time(WHEN)
         frame = GeocentricMeanEcliptic(equinox="J2000", obstime=time)
         sun = get_sun(time).transform_to(frame)
-        seen = SkyCoord(sun.lon + np.asarray(dlon_deg) * u.deg, np.asarray(lat_deg) * u.deg, frame=frame)
+        seen = SkyCoord(
+            sun.lon + np.asarray(dlon_deg) * u.deg, np.asarray(lat_deg) * u.deg, frame=frame
+        )
         return np.atleast_2d(seen.transform_to(GCRS(obstime=time)).cartesian.xyz.value.T)
 
 
 def table() -> np.ndarray:
     """Table 17 as the package keeps it, NaN where it is blank."""
-    return tabled_light(Sunward(*(grid.ravel() for grid in np.meshgrid(LON_DEG, LAT_DEG, indexing="ij"))))
+    return tabled_light(
+        Sunward(*(grid.ravel() for grid in np.meshgrid(LON_DEG, LAT_DEG, indexing="ij")))
+    )
 
 
 def test_fifty_directions_by_astropy_have_the_tables_brightness(rng):
     radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table())
     for dlon, lat, value in PAPER:
-        assert radiance[LON_DEG.tolist().index(dlon), LAT_DEG.tolist().index(lat)] == pytest.approx(value)
+        assert radiance[LON_DEG.tolist().index(dlon), LAT_DEG.tolist().index(lat)] == pytest.approx(
+            value
+        )
     chosen = rng.choice(np.argwhere(tabled & (LAT_DEG < 90)), 50, replace=False)
     signs = rng.choice([-1, 1], (2, 50))
     vectors = vectors_of(LON_DEG[chosen[:, 0]] * signs[0], LAT_DEG[chosen[:, 1]] * signs[1])
@@ -96,11 +127,14 @@ def test_its_spectrum_is_table_19s_and_redder_near_the_sun():
     at = np.array([400.0, 500.0, 900.0])
     ratio = relative_spectrum(at, NEAR_SLOPES) / relative_spectrum(at, FAR_SLOPES)
     assert ratio == pytest.approx(
-        [(1 - 1.2 * 0.09691) / (1 - 0.9 * 0.09691), 1, (1 + 0.8 * 0.25527) / (1 + 0.6 * 0.25527)], abs=1e-5
+        [(1 - 1.2 * 0.09691) / (1 - 0.9 * 0.09691), 1, (1 + 0.8 * 0.25527) / (1 + 0.6 * 0.25527)],
+        abs=1e-5,
     )
     # Equation 22 for sunlight and table 19 differ by 8 % in a silicon tracker: the paper's own two
     # statements.
-    light = ZodiacalLight.through(Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "glass")))
+    light = ZodiacalLight.through(
+        Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "glass"))
+    )
     assert light.near_e_per_s_sr / light.far_e_per_s_sr == pytest.approx(1.017, abs=0.001)
 
 
@@ -108,11 +142,17 @@ def test_its_electrons_are_those_of_sunlight_of_its_v_magnitude():
     """One code for both: table 19 has 0.3 % more photons from 330 to 1100 nm than sunlight of
     the same V.
     """
-    perfect = Optics(2e3 / np.sqrt(np.pi), Curve(np.array([330.0, 1100.0]), np.ones(2)), Curve(np.empty(0), np.ones(1)))
+    perfect = Optics(
+        2e3 / np.sqrt(np.pi),
+        Curve(np.array([330.0, 1100.0]), np.ones(2)),
+        Curve(np.empty(0), np.ones(1)),
+    )
     mean = v_mean(lambda nm: float(relative_spectrum(np.array([nm]))[0]), "energy")
     v_mag = -2.5 * np.log10(100 * 1e-2 * mean / VEGA_V0_W_M2_M / 206_264.806**2)
     found = 100 * ZodiacalLight.through(perfect).far_e_per_s_sr / 206_264.806**2
-    assert found == pytest.approx(zodiacal_electrons_per_s_arcsec2(v_mag, perfect, Photometry()), rel=0.005)
+    assert found == pytest.approx(
+        zodiacal_electrons_per_s_arcsec2(v_mag, perfect, Photometry()), rel=0.005
+    )
 
 
 @pytest.fixture
@@ -126,7 +166,11 @@ def simulator(tmp_path):
 def look(simulator, dlon_deg: float, lat_deg: float):
     """The tracker's view in a direction about the Sun."""
     x, y, z = vectors_of(dlon_deg, lat_deg)[0]
-    return simulator.view(from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 20.0), np.zeros(3), 0)
+    return simulator.view(
+        from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 20.0),
+        np.zeros(3),
+        0,
+    )
 
 
 def test_a_frame_has_the_light_of_each_of_its_directions(simulator):
@@ -140,7 +184,9 @@ def test_a_frame_has_the_light_of_each_of_its_directions(simulator):
     knots = np.unique(np.concatenate([qe_nm, glass[0][glass[0] <= 1050], [500.0]]))
 
     def detected(nm: float) -> float:
-        photons = float(relative_spectrum(np.array([nm]))[0]) * nm * 1e-9 / (6.62607015e-34 * 299_792_458)
+        photons = (
+            float(relative_spectrum(np.array([nm]))[0]) * nm * 1e-9 / (6.62607015e-34 * 299_792_458)
+        )
         return photons * np.interp(nm, qe_nm, qe) * np.interp(nm, *glass) * 1e-9
 
     per_sr = 259e-2 * np.pi / 4 * (tracker.aperture_mm * 1e-3) ** 2 * integral(detected, knots)
@@ -155,13 +201,16 @@ def test_a_frame_has_the_light_of_each_of_its_directions(simulator):
 
 def test_a_field_near_the_sun_is_refused_and_a_run_goes_on_with_a_warning(simulator, caplog):
     with pytest.raises(
-        InputError, match=r"\[background\] zodiacal: the field comes within \d\.\d deg of the Sun.*; look farther"
+        InputError,
+        match=r"\[background\] zodiacal: the field comes within \d\.\d deg of the Sun.*; look farther",
     ):
         simulator.expose(look(simulator, 3.0, 2.0), None)
     with Simulator(simulator.file, refuse=False) as running, caplog.at_level(logging.WARNING):
         first = running.expose(look(running, 3.0, 2.0), None).mean_e
         running.expose(look(running, 3.1, 2.0), None)
-        assert [record.message for record in caplog.records if "nearest tabled light" in record.message][1:] == []
+        assert [
+            record.message for record in caplog.records if "nearest tabled light" in record.message
+        ][1:] == []
         running.expose(look(running, 90.0, 2.0), None)
         running.expose(look(running, 3.0, 2.0), None)
     assert len(caplog.records) == 2
@@ -173,7 +222,11 @@ def test_a_field_near_the_sun_is_refused_and_a_run_goes_on_with_a_warning(simula
     ("before", "after", "said"),
     [
         (f'epoch_utc = "{WHEN}Z"\n', "", "needs a date; write [sky] epoch_utc"),
-        ("[background]\n", "[background]\nelectrons_per_px = 3\n", "electrons_per_px and zodiacal; write one"),
+        (
+            "[background]\n",
+            "[background]\nelectrons_per_px = 3\n",
+            "electrons_per_px and zodiacal; write one",
+        ),
     ],
 )
 def test_a_bench_file_that_cannot_have_it_is_refused(tmp_path, before, after, said):
@@ -234,11 +287,18 @@ def test_zodiacal_light_of_one_level_has_each_pixels_own_solid_angle(tmp_path):
     (tmp_path / "bench.toml").write_text(WIDE_BENCH)
     file = read_bench_file(tmp_path / "bench.toml")
     config = file.config
-    background_e = TrackerBackground(config, file.folder, tracker_camera(config.tracker, file.folder)).steady_e
+    background_e = TrackerBackground(
+        config, file.folder, tracker_camera(config.tracker, file.folder)
+    ).steady_e
     photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
-    rate = zodiacal_electrons_per_s_arcsec2(22.1, bench_optics(config.tracker, file.folder), photometry)
+    rate = zodiacal_electrons_per_s_arcsec2(
+        22.1, bench_optics(config.tracker, file.folder), photometry
+    )
     arcsec2_per_sr = np.degrees(1) ** 2 * 3600**2
     for x_px, y_px in ((0, 0), (1023, 1023), (511, 511), (200, 900), (1023, 512)):
         expected_e = rate * arcsec2_per_sr * astropy_pixel_sr(x_px, y_px) * 3.5
-        assert background_e[y_px, x_px] == pytest.approx(expected_e, rel=LATTICE_SHARE), (x_px, y_px)
+        assert background_e[y_px, x_px] == pytest.approx(expected_e, rel=LATTICE_SHARE), (
+            x_px,
+            y_px,
+        )
     assert background_e[0, 0] / background_e[511, 511] == pytest.approx(0.8688, abs=0.0005)

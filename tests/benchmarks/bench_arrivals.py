@@ -57,7 +57,9 @@ def bench_text(attitude: str) -> str:
     text = (ROOT / "configs" / "demo.toml").read_text()
     before, _, after = text.partition("[attitude]")
     text = before + "[render]" + after.partition("[render]")[2]
-    text = text.replace("focal_length_mm = 350", "focal_length_mm = 250").replace("faintest_v_mag = 7.5", "faintest_v_mag = 14")
+    text = text.replace("focal_length_mm = 350", "focal_length_mm = 250").replace(
+        "faintest_v_mag = 7.5", "faintest_v_mag = 14"
+    )
     return f'{text}\n[attitude]\nclock = "shared"\n{attitude}\n'
 
 
@@ -106,15 +108,22 @@ def send(road: str, seconds: float) -> None:
         sys.stdin.read()  # the roads stay open while there is somebody to read them
 
 
-def _opened(road: str, stack: ExitStack) -> tuple[list[Callable[[bytes, Any], object]], dict[str, str]]:
+def _opened(
+    road: str, stack: ExitStack
+) -> tuple[list[Callable[[bytes, Any], object]], dict[str, str]]:
     if road == "zmq":
         publisher = stack.enter_context(stack.enter_context(zmq.Context()).socket(zmq.PUB))
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         endpoint = f"tcp://127.0.0.1:{port}"
-        return [lambda data, _: publisher.send(data)], {"attitude": f'endpoint = "{endpoint}"', "floor": endpoint}
+        return [lambda data, _: publisher.send(data)], {
+            "attitude": f'endpoint = "{endpoint}"',
+            "floor": endpoint,
+        }
     if road == "udp":
         made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        puts = [lambda data, where, k=k: made.sendto(data, ("127.0.0.1", where[k])) for k in range(2)]
+        puts = [
+            lambda data, where, k=k: made.sendto(data, ("127.0.0.1", where[k])) for k in range(2)
+        ]
         return puts, {"attitude": 'source = "udp"\nbind = "127.0.0.1:0"', "floor": "udp"}
     (host, slave), (floor, floor_slave) = os.openpty(), os.openpty()
     for each in (slave, floor_slave):
@@ -147,7 +156,11 @@ def floor(road: str, where: str) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
             made.bind(("127.0.0.1", 0))
             print(made.getsockname()[1], flush=True)
-            _loop(lambda ms: bool(select.select([made], [], [], ms / 1000)[0]), lambda: made.recv(100), found)
+            _loop(
+                lambda ms: bool(select.select([made], [], [], ms / 1000)[0]),
+                lambda: made.recv(100),
+                found,
+            )
     else:
         from cobs import cobs
 
@@ -161,12 +174,17 @@ def floor(road: str, where: str) -> None:
                 data += os.read(file, 100)
             return data.split(b"\0")[-2]
 
-        _loop(lambda ms: bool(select.select([file], [], [], ms / 1000)[0]), whole, found, cobs.decode)
+        _loop(
+            lambda ms: bool(select.select([file], [], [], ms / 1000)[0]), whole, found, cobs.decode
+        )
     print(json.dumps(found), flush=True)
 
 
 def _loop(
-    ready: Callable[[int], bool], get: Callable[[], bytes], found: list[int], meaning: Callable[[bytes], bytes] = bytes
+    ready: Callable[[int], bool],
+    get: Callable[[], bytes],
+    found: list[int],
+    meaning: Callable[[bytes], bytes] = bytes,
 ) -> None:
     patience_ms = 60_000
     while ready(patience_ms):
@@ -183,7 +201,9 @@ class Noting(LedgerSwitch):
         super().__init__()
         self.late_ns: list[int] = []
 
-    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: object) -> None:
+    def packet(
+        self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: object
+    ) -> None:
         if sample is not None and refusal is None:
             self.late_ns.append(host_ns - sample.t_ns)
 
@@ -192,11 +212,17 @@ def show(bench_file: str, way: str, seconds: float) -> None:
     """Draw for so long; print where packets are awaited, then the latencies and what the frames
     did.
     """
-    with load(bench_file) as bench, open_link(bench.config, Path(bench_file).parent, apart=way == "process") as link:
+    with (
+        load(bench_file) as bench,
+        open_link(bench.config, Path(bench_file).parent, apart=way == "process") as link,
+    ):
         print(link.endpoint, flush=True)
         noting = Noting()
         summary = serve(
-            bench, link, Limit(slots=round(seconds * bench.config.monitor.refresh_hz)), outlet=Outlet(ledger=noting)
+            bench,
+            link,
+            Limit(slots=round(seconds * bench.config.monitor.refresh_hz)),
+            outlet=Outlet(ledger=noting),
         )
     told = {"fps": summary.fps, "missed": summary.missed_frames, "stars": summary.stars_drawn.mean}
     print(json.dumps(told | {"late_ns": noting.late_ns}), flush=True)
@@ -205,16 +231,23 @@ def show(bench_file: str, way: str, seconds: float) -> None:
 @contextmanager
 def process(*arguments: str, before: tuple[str, ...] = ()) -> Iterator[subprocess.Popen[str]]:
     command = [*before, sys.executable, "-m", "tests.benchmarks.bench_arrivals", *arguments]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as made:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as made:
         try:
             yield made
         finally:
             made.kill()
 
 
-def run(road: str, way: str, seconds: float, before: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def run(
+    road: str, way: str, seconds: float, before: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Latencies of hilstar and of the bare loop, ms, and what the frames did."""
-    with tempfile.TemporaryDirectory() as folder, process("send", road, str(seconds + WARM_UP_S)) as sender:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        process("send", road, str(seconds + WARM_UP_S)) as sender,
+    ):
         told = json.loads(sender.stdout.readline())
         file = Path(folder) / "bench.toml"
         file.write_text(bench_text(told["attitude"]))
@@ -222,7 +255,11 @@ def run(road: str, way: str, seconds: float, before: tuple[str, ...]) -> tuple[n
             process("floor", road, told["floor"]) as bare,
             process("show", str(file), way, str(seconds + 2 * WARM_UP_S), before=before) as shown,
         ):
-            where = [int(shown.stdout.readline().strip().rpartition(":")[2].partition("@")[0] or 0) if road == "udp" else 0]
+            where = [
+                int(shown.stdout.readline().strip().rpartition(":")[2].partition("@")[0] or 0)
+                if road == "udp"
+                else 0
+            ]
             if road != "udp":
                 shown.stdout.readline()
             where.append(int(bare.stdout.readline()))
@@ -232,7 +269,11 @@ def run(road: str, way: str, seconds: float, before: tuple[str, ...]) -> tuple[n
             summary = json.loads(shown.stdout.readline())
             from_bare = json.loads(bare.stdout.readline())
     skipped = round(WARM_UP_S * RATE_HZ)
-    return np.array(summary.pop("late_ns")[skipped:]) / 1e6, np.array(from_bare[skipped:]) / 1e6, summary
+    return (
+        np.array(summary.pop("late_ns")[skipped:]) / 1e6,
+        np.array(from_bare[skipped:]) / 1e6,
+        summary,
+    )
 
 
 def percentiles(found_ms: list[np.ndarray]) -> str:
@@ -262,7 +303,10 @@ def table(seconds: float, busy: int, roads: tuple[str, ...], before: tuple[str, 
             for way, latencies in found.items():
                 if latencies:
                     print(f"{road:7} {names[way]:22} {percentiles(latencies)}")
-            fps, stars = np.mean([each["fps"] for each in frames]), np.mean([each["stars"] for each in frames])
+            fps, stars = (
+                np.mean([each["fps"] for each in frames]),
+                np.mean([each["stars"] for each in frames]),
+            )
             print(f"{'':7} {stars:.0f} stars, {fps:.1f} frames a second", flush=True)
     finally:
         for each in spinning:

@@ -74,7 +74,10 @@ def siege(page: PageAddress) -> Iterator[None]:
 
     def attack(k: int) -> None:
         while not stop.is_set():
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", page.port), timeout=1.0) as one:
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", page.port), timeout=1.0) as one,
+            ):
                 if k % 2:
                     one.sendall(b"GET / HTTP/1.1\r\nHost: evil\r\n" + b"x" * 2000)
                 one.settimeout(1.0)
@@ -115,11 +118,24 @@ def measure(screen: Screen, folder: Path, seconds: float) -> tuple[list[FrameRec
     """The frames of a run, and its turns."""
     port = free_port()
     (folder / "bench.toml").write_text(BENCH + attitude_table(port, "bind = true"))
-    command = [sys.executable, "-m", "hilstar", "serve", str(folder / "bench.toml"), "--windowed", "--force", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "hilstar",
+        "serve",
+        str(folder / "bench.toml"),
+        "--windowed",
+        "--force",
+        "--json",
+    ]
     command += ["--ledger", str(folder / "run.mcap"), "--console", "127.0.0.1:0"]
     turns: list[Turn] = []
     with subprocess.Popen(
-        command, env=screen.env | {"LP_NUM_THREADS": "0"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        env=screen.env | {"LP_NUM_THREADS": "0"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         served = Served(process, port)
         page = page_of(served)
@@ -147,8 +163,12 @@ def main() -> None:
         frames, turns = measure(screen, Path(name), seconds)
     swaps_ns = np.array([frame.swap_ns for frame in frames])
     missed = np.array([frame.missed_before for frame in frames])
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} at the end; turns of {TURN_S:g} s")
-    print(f"{'':18}{'frames':>8}{'missed':>8}{'SD of the interval, ms':>26}{'run, % of a core':>20}{'page, % of a core':>20}")
+    print(
+        f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} at the end; turns of {TURN_S:g} s"
+    )
+    print(
+        f"{'':18}{'frames':>8}{'missed':>8}{'SD of the interval, ms':>26}{'run, % of a core':>20}{'page, % of a core':>20}"
+    )
     for kind in KINDS:
         intervals_ms, lost, count = [], 0, 0
         mine = [turn for turn in turns if turn.kind == kind]
@@ -158,8 +178,14 @@ def main() -> None:
             steps = np.diff(swaps_ns[within]) * MS
             intervals_ms.append(steps[missed[within][1:] == 0])
         lasted_s = sum(turn.end_ns - turn.begin_ns for turn in mine) * 1e-9
-        shares = (100 * sum(took) / lasted_s for took in ([turn.run_s for turn in mine], [turn.page_s for turn in mine]))
-        print(f"{kind:18}{count:8}{lost:8}{np.concatenate(intervals_ms).std():26.3f}" + "".join(f"{s:20.1f}" for s in shares))
+        shares = (
+            100 * sum(took) / lasted_s
+            for took in ([turn.run_s for turn in mine], [turn.page_s for turn in mine])
+        )
+        print(
+            f"{kind:18}{count:8}{lost:8}{np.concatenate(intervals_ms).std():26.3f}"
+            + "".join(f"{s:20.1f}" for s in shares)
+        )
 
 
 if __name__ == "__main__":

@@ -29,16 +29,24 @@ def main() -> None:
         drawn = bench.draw(np.array(ORION_Q))
         levels = drawn.levels
         feed = FramePublisher(memory := SharedMemory.make(levels.nbytes))
-        feed.follow(SimpleNamespace(loop=SimpleNamespace(tally=RunTally()), packets=PacketCounts(), tally=RunTally()))
+        feed.follow(
+            SimpleNamespace(
+                loop=SimpleNamespace(tally=RunTally()), packets=PacketCounts(), tally=RunTally()
+            )
+        )
         attitude = Attitude(np.array(ORION_Q), 5_000_000, False)
         base_ns = time.monotonic_ns()
-        shown = [Shown(k, 0, attitude, drawn, swap_ns=base_ns + k * PERIOD_NS) for k in range(FRAMES)]
+        shown = [
+            Shown(k, 0, attitude, drawn, swap_ns=base_ns + k * PERIOD_NS) for k in range(FRAMES)
+        ]
         took_us = []
         for frame in shown:
             begin_ns = time.perf_counter_ns()
             feed.see(frame)
             took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
-        print(f"numbers of a frame: {np.median(took_us):.1f} us median, {np.percentile(took_us, 99):.1f} us p99")
+        print(
+            f"numbers of a frame: {np.median(took_us):.1f} us median, {np.percentile(took_us, 99):.1f} us p99"
+        )
         memory.want = PictureRequest(1, 2**62)
         took_us = []
         for k in range(PICTURES):
@@ -47,7 +55,9 @@ def main() -> None:
             feed.see(later)
             took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
         size = "x".join(map(str, levels.shape[::-1]))
-        print(f"with a picture of {size}: {np.median(took_us):.0f} us median, {np.percentile(took_us, 99):.0f} us p99")
+        print(
+            f"with a picture of {size}: {np.median(took_us):.0f} us median, {np.percentile(took_us, 99):.0f} us p99"
+        )
         took_us = []
         for k in range(50):
             fresh = bench.draw(np.array(ORION_Q), k)

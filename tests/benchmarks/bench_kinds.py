@@ -35,7 +35,8 @@ GLASS = "planar-1897.fits"
 KINDS: dict[str, Tables] = {
     "grey": {},
     "three primaries, mono": PANEL,
-    "three primaries, Bayer": PANEL | {"tracker": {f"quantum_efficiency_{c}": f"{c}.csv" for c in DYES_NM}},
+    "three primaries, Bayer": PANEL
+    | {"tracker": {f"quantum_efficiency_{c}": f"{c}.csv" for c in DYES_NM}},
     "glass": {"tracker.optics": {"psf": GLASS}, "render": {"psf": "tracker"}},
 }
 
@@ -52,8 +53,12 @@ def write_bench(folder: Path, kind: str, quantisation: str, width: int, faintest
     }
     text = bench_text(tables, KINDS[kind])
     if "Bayer" in kind:
-        text = "\n".join(line for line in text.splitlines() if not line.startswith("quantum_efficiency ="))
-    path = folder / f"{kind}-{quantisation}-{width}-{faintest}.toml".replace(" ", "_").replace(",", "")
+        text = "\n".join(
+            line for line in text.splitlines() if not line.startswith("quantum_efficiency =")
+        )
+    path = folder / f"{kind}-{quantisation}-{width}-{faintest}.toml".replace(" ", "_").replace(
+        ",", ""
+    )
     path.write_text(text)
     return path
 
@@ -72,13 +77,19 @@ def main() -> None:
         for file in (GLASS, "primaries-lcd.csv"):
             shutil.copy(ROOT / "configs" / file, folder)
         for dye, nm in DYES_NM.items():
-            lines = (f"{at},{0.55 * np.exp(-0.5 * ((at - nm) / 40) ** 2):.5f}" for at in range(380, 721, 10))
+            lines = (
+                f"{at},{0.55 * np.exp(-0.5 * ((at - nm) / 40) ** 2):.5f}"
+                for at in range(380, 721, 10)
+            )
             (folder / f"{dye}.csv").write_text("wavelength_nm,value\n" + "\n".join(lines) + "\n")
         for width in options.widths:
             for faintest in FAINTEST_V_MAG:
                 for quantisation in QUANTISATIONS:
                     with ExitStack() as opened:
-                        files = (write_bench(folder, kind, quantisation, width, faintest) for kind in KINDS)
+                        files = (
+                            write_bench(folder, kind, quantisation, width, faintest)
+                            for kind in KINDS
+                        )
                         benches = [opened.enter_context(hilstar.load(file)) for file in files]
                         times_ms = np.empty((len(attitudes), len(benches)))
                         for k, q in enumerate(attitudes):
@@ -86,13 +97,29 @@ def main() -> None:
                                 begin = time.perf_counter()
                                 _ = bench.draw(q).levels
                                 times_ms[k, number] = (time.perf_counter() - begin) * 1e3
-                        counts = (sprites for q in attitudes if (sprites := benches[0].sprites(q)) is not None)
-                        stars, gpu = int(np.median([len(one) for one in counts])), benches[0].renderer.gl_renderer
+                        counts = (
+                            sprites
+                            for q in attitudes
+                            if (sprites := benches[0].sprites(q)) is not None
+                        )
+                        stars, gpu = (
+                            int(np.median([len(one) for one in counts])),
+                            benches[0].renderer.gl_renderer,
+                        )
                     medians = np.median(times_ms[3:], axis=0).tolist()
                     for kind, median in zip(KINDS, medians, strict=True):
                         times = f"{median / medians[0]:.3g}"
                         rows.append(
-                            (gpu, str(width), str(SIZES[width]), str(stars), quantisation, kind, f"{median:.4g}", times)
+                            (
+                                gpu,
+                                str(width),
+                                str(SIZES[width]),
+                                str(stars),
+                                quantisation,
+                                kind,
+                                f"{median:.4g}",
+                                times,
+                            )
                         )
                         print(*rows[-1], sep="  ", flush=True)
     if options.output is not None:

@@ -37,14 +37,20 @@ def with_lens(bench: Bench) -> Bench:
     return replace(bench, camera=bounded(replace(bench.camera, lens=lens), MARGIN_PX))
 
 
-def times_ms(bench: Bench, q: FloatArray, number: int, rate: FloatArray | None) -> tuple[float, float, int]:
+def times_ms(
+    bench: Bench, q: FloatArray, number: int, rate: FloatArray | None
+) -> tuple[float, float, int]:
     """The time of a frame's sprites, of the whole frame, and the number of the sprites."""
     begin = time.perf_counter()
     sprites = bench.light(bench.view(q, rate))
     made = time.perf_counter()
     drawn = bench.draw_sprites(sprites, number)
     _ = drawn.levels
-    return (made - begin) * 1e3, (time.perf_counter() - begin) * 1e3, 0 if sprites is None else len(sprites)
+    return (
+        (made - begin) * 1e3,
+        (time.perf_counter() - begin) * 1e3,
+        0 if sprites is None else len(sprites),
+    )
 
 
 def main() -> None:
@@ -57,11 +63,16 @@ def main() -> None:
         TemporaryDirectory() as folder,
         open_bench(own_bench_file(Path(folder) / "bench.toml", REFERENCE_PX, motion="on")) as bench,
     ):
-        pinhole = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
+        pinhole = bench.with_stars(
+            scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars
+        )
         benches = {"pinhole": pinhole, "lens": with_lens(pinhole)}
         rates = [np.radians(speed) * AXIS if speed else None for speed in SPEEDS_DEG_S]
         found = np.array(
-            [[[times_ms(b, q, n, rate) for b in benches.values()] for rate in rates] for n in range(options.rounds + 5)]
+            [
+                [[times_ms(b, q, n, rate) for b in benches.values()] for rate in rates]
+                for n in range(options.rounds + 5)
+            ]
         )
     for speed, (ideal, bent) in zip(SPEEDS_DEG_S, np.median(found[5:], axis=0), strict=True):
         print(

@@ -26,7 +26,9 @@ RATE_HZ = 200
 FAULTS = ("--lose", "10%", "--corrupt", "5%", "--reorder")
 
 
-def latencies_ms(put: Callable[[bytes], object], get: Callable[[], bytes], seconds: float) -> np.ndarray:
+def latencies_ms(
+    put: Callable[[bytes], object], get: Callable[[], bytes], seconds: float
+) -> np.ndarray:
     """64 bytes that carry the time at which they left, from one thread to another."""
     count = round(seconds * RATE_HZ)
     found = []
@@ -65,14 +67,39 @@ def served(attitude: str, to: str, seconds: float, options: tuple[str, ...]) -> 
     """What `send` and `serve` say after so many seconds of a spin."""
     with tempfile.TemporaryDirectory() as folder:
         bench = Path(folder) / "bench.toml"
-        bench.write_text((ROOT / "configs" / "demo.toml").read_text().split("[attitude]")[0] + f"[attitude]\n{attitude}\n")
-        command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", "--duration", str(seconds + 4)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        bench.write_text(
+            (ROOT / "configs" / "demo.toml").read_text().split("[attitude]")[0]
+            + f"[attitude]\n{attitude}\n"
+        )
+        command = [
+            sys.executable,
+            "-m",
+            "hilstar",
+            "serve",
+            str(bench),
+            "--headless",
+            "--json",
+            "--duration",
+            str(seconds + 4),
+        ]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
             assert process.stderr is not None
             process.stderr.readline()
             time.sleep(0.5)
             sent = run_hilstar(
-                "send", "--spin", "z,1", "--rate", str(RATE_HZ), "--duration", str(seconds), "--json", "--to", to, *options
+                "send",
+                "--spin",
+                "z,1",
+                "--rate",
+                str(RATE_HZ),
+                "--duration",
+                str(seconds),
+                "--json",
+                "--to",
+                to,
+                *options,
             )
             return json.loads(sent.stdout), json.loads(process.communicate(timeout=60)[0])
 
@@ -97,11 +124,19 @@ def main() -> None:
     for options in ((), FAULTS):
         endpoint = "tcp://127.0.0.1:5599"
         bare = bare_zmq(bare_seconds)
-        tell("ZeroMQ " + " ".join(options), *served(f'endpoint = "{endpoint}"', endpoint, seconds, options), bare)
+        tell(
+            "ZeroMQ " + " ".join(options),
+            *served(f'endpoint = "{endpoint}"', endpoint, seconds, options),
+            bare,
+        )
         bare = bare_pty(bare_seconds)
         with tempfile.TemporaryDirectory() as folder, Cable(Path(folder)) as cable:
             line = f'source = "serial"\nport = "{cable.host}"\nbaud = 921600'
-            tell("pty " + " ".join(options), *served(line, f"serial:{cable.sender}@921600", seconds, options), bare)
+            tell(
+                "pty " + " ".join(options),
+                *served(line, f"serial:{cable.sender}@921600", seconds, options),
+                bare,
+            )
 
 
 if __name__ == "__main__":

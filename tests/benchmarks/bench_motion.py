@@ -32,7 +32,9 @@ def main() -> None:
         TemporaryDirectory() as folder,
         open_bench(own_bench_file(Path(folder) / "bench.toml", REFERENCE_PX, motion="on")) as bench,
     ):
-        bench = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
+        bench = bench.with_stars(
+            scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars
+        )
         times_ms: dict[float, list[float]] = {rate: [] for rate in RATES_RAD_S}
         told: dict[float, str] = {}
         for number in range(options.rounds):

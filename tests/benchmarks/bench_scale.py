@@ -39,7 +39,12 @@ HILSTAR = (sys.executable, "-m", "hilstar")
 FULL_HD = (1920, 1080)
 STARS = (100, 1000, 10_000, 50_000, 200_000, 400_000, 1_000_000)
 SIZES = ((640, 480), (1024, 1024), FULL_HD, (3840, 2160), (7680, 4320))
-PACKETS_HZ, HOURS, WORKERS, CASES = (10, 100, 1000, 10_000), (1 / 60, 0.1, 0.5, 2.0), (1, 2), (20, 420)
+PACKETS_HZ, HOURS, WORKERS, CASES = (
+    (10, 100, 1000, 10_000),
+    (1 / 60, 0.1, 0.5, 2.0),
+    (1, 2),
+    (20, 420),
+)
 SECONDS, ROUNDS = 8.0, 15
 FRAME_HZ, AXIS = 60, np.array([0.36, 0.48, 0.8])
 
@@ -111,7 +116,9 @@ def write_ledger(path: Path, seconds: float) -> None:
     on a clock that is stepped.
     """
     rng, count, now_ns = np.random.default_rng(1), round(seconds * FRAME_HZ), 10**12
-    clock = SimpleNamespace(monotonic=lambda: now_ns / 1e9, monotonic_ns=lambda: now_ns, time_ns=time.time_ns)
+    clock = SimpleNamespace(
+        monotonic=lambda: now_ns / 1e9, monotonic_ns=lambda: now_ns, time_ns=time.time_ns
+    )
     noise_ns = rng.integers(0, 10**5, (count, 2)).tolist()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -121,13 +128,34 @@ def write_ledger(path: Path, seconds: float) -> None:
     ):
         for k, (late_ns, age_ns) in enumerate(noise_ns):
             now_ns, turn = 10**12 + k * 10**9 // FRAME_HZ, 1e-4 * k
-            q, swap_ns, sent_ns = np.array([np.cos(turn), *np.sin(turn) * AXIS]), now_ns + late_ns, now_ns - 8_000_000 - age_ns
+            q, swap_ns, sent_ns = (
+                np.array([np.cos(turn), *np.sin(turn) * AXIS]),
+                now_ns + late_ns,
+                now_ns - 8_000_000 - age_ns,
+            )
             sample, at_ns = AttitudeSample(sent_ns, q, 2e-4 * FRAME_HZ * AXIS, k), sent_ns + 400_000
             ledger.packet(at_ns, encode(sample), sample, None)
-            times = {"t_ns": now_ns, "light_ns": now_ns, "draw_ns": now_ns - 5_000_000, "swap_ns": swap_ns}
-            known = {"attitude_sequence": k, "attitude_t_ns": sent_ns, "receive_ns": at_ns, "prediction_ns": now_ns - sent_ns}
+            times = {
+                "t_ns": now_ns,
+                "light_ns": now_ns,
+                "draw_ns": now_ns - 5_000_000,
+                "swap_ns": swap_ns,
+            }
+            known = {
+                "attitude_sequence": k,
+                "attitude_t_ns": sent_ns,
+                "receive_ns": at_ns,
+                "prediction_ns": now_ns - sent_ns,
+            }
             ledger.frame(
-                FrameRecord(frame=k, **times, **known, age_ns=now_ns - sent_ns, q=tuple(q.tolist()), stars_drawn=160 + k % 9)
+                FrameRecord(
+                    frame=k,
+                    **times,
+                    **known,
+                    age_ns=now_ns - sent_ns,
+                    q=tuple(q.tolist()),
+                    stars_drawn=160 + k % 9,
+                )
             )
             if k % (FRAME_HZ // 5) == 0:
                 ledger.turn()
@@ -138,12 +166,32 @@ def served(rate_hz: int) -> tuple[float, float]:
     """The packets a second that `serve` took, and the share of a core that it used, %."""
     with tempfile.TemporaryDirectory() as folder:
         bench = own_bench_file(Path(folder) / "bench.toml", (640, 480))
-        text = bench.path.read_text() + '\n[attitude]\nsource = "zmq"\nendpoint = "tcp://127.0.0.1:5598"\n'
+        text = (
+            bench.path.read_text()
+            + '\n[attitude]\nsource = "zmq"\nendpoint = "tcp://127.0.0.1:5598"\n'
+        )
         bench.path.write_text(text)
-        options = ("--rate", str(rate_hz), "--duration", str(SECONDS + 4), "--to", "tcp://127.0.0.1:5598")
-        sender = subprocess.Popen((*HILSTAR, "send", "--spin", "z,0.1", *options), stdout=subprocess.DEVNULL)
+        options = (
+            "--rate",
+            str(rate_hz),
+            "--duration",
+            str(SECONDS + 4),
+            "--to",
+            "tcp://127.0.0.1:5598",
+        )
+        sender = subprocess.Popen(
+            (*HILSTAR, "send", "--spin", "z,0.1", *options), stdout=subprocess.DEVNULL
+        )
         try:
-            told, seconds = spent(*HILSTAR, "serve", str(bench.path), "--headless", "--json", "--duration", str(SECONDS))
+            told, seconds = spent(
+                *HILSTAR,
+                "serve",
+                str(bench.path),
+                "--headless",
+                "--json",
+                "--duration",
+                str(SECONDS),
+            )
         finally:
             sender.terminate()
             sender.wait()
@@ -159,8 +207,18 @@ def case_ms(workers: int) -> float:
     for cases in CASES:
         with tempfile.TemporaryDirectory() as folder:
             plan = Path(folder) / "plan.toml"
-            plan.write_text(f'bench = "{ROOT / "configs" / "demo.toml"}"\ncases = {cases}\nseed = 1\n')
-            command = ("campaign", str(plan), "-o", str(Path(folder) / "out"), "--workers", str(workers), "--json")
+            plan.write_text(
+                f'bench = "{ROOT / "configs" / "demo.toml"}"\ncases = {cases}\nseed = 1\n'
+            )
+            command = (
+                "campaign",
+                str(plan),
+                "-o",
+                str(Path(folder) / "out"),
+                "--workers",
+                str(workers),
+                "--json",
+            )
             begin_s = time.monotonic()
             spent(*HILSTAR, *command)
             used.append(time.monotonic() - begin_s)
@@ -176,7 +234,10 @@ def measured() -> list[tuple[str, float, float, float]]:
         rows.append((axis, at, *values))
         print(*rows[-1], flush=True)
 
-    for axis, points in (("stars", [(*FULL_HD, n) for n in STARS]), ("pixels", [(*size, 1000) for size in SIZES])):
+    for axis, points in (
+        ("stars", [(*FULL_HD, n) for n in STARS]),
+        ("pixels", [(*size, 1000) for size in SIZES]),
+    ):
         for width, height, stars in points:
             told, _ = spent(*this, "frame", *map(str, (width, height, stars)))
             add(axis, stars if axis == "stars" else width * height, tuple(json.loads(told)))
@@ -188,7 +249,11 @@ def measured() -> list[tuple[str, float, float, float]]:
     for hours in HOURS:
         with tempfile.TemporaryDirectory() as folder:
             write_ledger(Path(folder) / "run.mcap", 3600 * hours)
-            add("hours", hours, tuple(json.loads(spent(*this, "report", str(Path(folder) / "run.mcap"))[0])))
+            add(
+                "hours",
+                hours,
+                tuple(json.loads(spent(*this, "report", str(Path(folder) / "run.mcap"))[0])),
+            )
     return rows
 
 
@@ -214,10 +279,22 @@ def main() -> None:
         case []:
             results = ROOT / "results"
             tracker, _ = tracker_rows(ROUNDS, 30.0)
-            table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in tracker]
+            table = [
+                (r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max)
+                for r in tracker
+            ]
             first = first_frame_ms()
             table.append((*FULL_HD, 0, "hilstar", "first_frame", first[2], first[0], first[-1]))
-            columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
+            columns = (
+                "width",
+                "height",
+                "stars",
+                "method",
+                "kind",
+                "median_ms",
+                "min_ms",
+                "max_ms",
+            )
             write_csv(results / "tracker.csv", columns, table)
             write_csv(results / "scale.csv", ("axis", "at", "time", "memory_mb"), measured())
 

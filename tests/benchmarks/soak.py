@@ -28,17 +28,34 @@ DAY_S = 86400.0
 
 def growth_mb_a_day(seconds: np.ndarray, megabytes: np.ndarray) -> tuple[float, float]:
     """The slope of memory over time, MB a day, and its standard error by the means of blocks."""
-    time_s, memory_mb = (np.array([part.mean() for part in np.array_split(each, BLOCKS)]) for each in (seconds, megabytes))
+    time_s, memory_mb = (
+        np.array([part.mean() for part in np.array_split(each, BLOCKS)])
+        for each in (seconds, megabytes)
+    )
     (slope, _), covariance = np.polyfit(time_s, memory_mb, 1, cov=True)
     return slope * DAY_S, float(np.sqrt(covariance[0, 0])) * DAY_S
 
 
-def main(seconds: float = 3600.0, bench: str = str(ROOT / "configs" / "monitor-10bit.toml")) -> None:
+def main(
+    seconds: float = 3600.0, bench: str = str(ROOT / "configs" / "monitor-10bit.toml")
+) -> None:
     """Run, and print the run's figures and its growth."""
     with tempfile.TemporaryDirectory() as folder:
         ledger = Path(folder) / "run.mcap"
-        sender = subprocess.Popen((*HILSTAR, "send", "--spin", "y,0.5", "--rate", "200", "--duration", str(seconds + 60)))
-        serve = (*HILSTAR, "serve", bench, "--headless", "--duration", str(seconds), "--ledger", str(ledger), "--json")
+        sender = subprocess.Popen(
+            (*HILSTAR, "send", "--spin", "y,0.5", "--rate", "200", "--duration", str(seconds + 60))
+        )
+        serve = (
+            *HILSTAR,
+            "serve",
+            bench,
+            "--headless",
+            "--duration",
+            str(seconds),
+            "--ledger",
+            str(ledger),
+            "--json",
+        )
         try:
             run = json.loads(subprocess.run(serve, stdout=subprocess.PIPE, check=True).stdout)
         finally:
@@ -48,13 +65,21 @@ def main(seconds: float = 3600.0, bench: str = str(ROOT / "configs" / "monitor-1
         memory_mb = np.array([record.resident_bytes for record in kept]) * 1e-6
         warm = time_s > time_s[0] + WARM_UP * seconds
         slope, error = growth_mb_a_day(time_s[warm], memory_mb[warm])
-        print({name: run[name] for name in ("frames", "missed_frames", "stale_frames") if name in run})
-        print(f"memory {memory_mb[warm].min():.1f} to {memory_mb[warm].max():.1f} MB; {slope:+.1f} +- {error:.1f} MB a day")
+        print(
+            {name: run[name] for name in ("frames", "missed_frames", "stale_frames") if name in run}
+        )
+        print(
+            f"memory {memory_mb[warm].min():.1f} to {memory_mb[warm].max():.1f} MB; {slope:+.1f} +- {error:.1f} MB a day"
+        )
         with ledger.open("rb") as file:
             summary = make_reader(file).get_summary()
-        index_bytes = sum(77 + 10 * len(chunk.message_index_offsets) for chunk in summary.chunk_indexes)
+        index_bytes = sum(
+            77 + 10 * len(chunk.message_index_offsets) for chunk in summary.chunk_indexes
+        )
         print(f"of it the ledger's index {index_bytes / 1e6 / seconds * DAY_S:.1f} MB a day")
-        print(f"ledger {ledger.stat().st_size / 1e6:.1f} MB, {ledger.stat().st_size / 1e9 / seconds * DAY_S:.2f} GB a day")
+        print(
+            f"ledger {ledger.stat().st_size / 1e6:.1f} MB, {ledger.stat().st_size / 1e9 / seconds * DAY_S:.2f} GB a day"
+        )
 
 
 if __name__ == "__main__":

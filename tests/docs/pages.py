@@ -71,7 +71,9 @@ def steps_of(text: str) -> list[Step]:
     steps = []
     for part in parts:
         command, _, printed = part.replace("\\\n", " ").partition("\n")
-        steps.append(Step(command.removesuffix("&").strip(), printed, command.rstrip().endswith("&")))
+        steps.append(
+            Step(command.removesuffix("&").strip(), printed, command.rstrip().endswith("&"))
+        )
     return steps
 
 
@@ -81,7 +83,9 @@ def differs(shown: str, printed: str, figures_vary: bool) -> str | None:
     A line `...` stands for any lines, `...` within a line for any text. Whole numbers and versions
     must be the same, others within RELATIVE_ERROR; with `figures_vary` any number will do.
     """
-    pattern = "".join(r"(?:.*\n)*?" if line == "..." else line_pattern(line) + "\n" for line in shown.splitlines())
+    pattern = "".join(
+        r"(?:.*\n)*?" if line == "..." else line_pattern(line) + "\n" for line in shown.splitlines()
+    )
     match = re.fullmatch(pattern, printed)
     if match is None:
         return "other lines"
@@ -89,7 +93,11 @@ def differs(shown: str, printed: str, figures_vary: bool) -> str | None:
         return None
     for wanted, got in zip(NUMBER.findall(shown), match.groups(), strict=True):
         exact = wanted.count(".") != 1
-        if (wanted != got) if exact else abs(float(wanted) - float(got)) > RELATIVE_ERROR * abs(float(wanted)):
+        if (
+            (wanted != got)
+            if exact
+            else abs(float(wanted) - float(got)) > RELATIVE_ERROR * abs(float(wanted))
+        ):
             return f"{got} where the page has {wanted}"
     return None
 
@@ -103,11 +111,15 @@ def line_pattern(line: str) -> str:
 def slugs_of(page: str) -> set[str]:
     """What a link to a heading of the page has after its `#`."""
     headings = re.findall(r"(?m)^#+ (.*)$", re.sub(r"(?ms)^```.*?^```$", "", page))
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings
+    }
 
 
 def links_of(page: str) -> list[str]:
     """Where the links and pictures of a page lead."""
     prose = re.sub(r"(?ms)^```.*?^```$", "", page)
     prose = re.sub(r"`[^`\n]*`", "", prose)
-    return re.findall(r"\[[^\]]*\]\(([^)\s]+)[^)]*\)", prose) + re.findall(r"<(?:img|a) [^>]*?(?:src|href)=\"([^\"]+)\"", prose)
+    return re.findall(r"\[[^\]]*\]\(([^)\s]+)[^)]*\)", prose) + re.findall(
+        r"<(?:img|a) [^>]*?(?:src|href)=\"([^\"]+)\"", prose
+    )

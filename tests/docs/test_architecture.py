@@ -16,7 +16,9 @@ MAX_FILES = {"One packet to a pixel": 14, "One magnitude to a code value": 23}
 def walk(heading: str) -> list[str]:
     """The files that a walk passes, each once, in order."""
     section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    return list(dict.fromkeys(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.(?:py|vert|frag))`", section)))
+    return list(
+        dict.fromkeys(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.(?:py|vert|frag))`", section))
+    )
 
 
 @pytest.mark.parametrize("heading", MAX_FILES)
@@ -24,7 +26,9 @@ def test_a_walk_passes_files_that_are_there_and_few(heading):
     files = walk(heading)
     assert len(files) > 5
     for name in files:
-        assert (ROOT / name).is_file() or (ROOT / "hilstar" / name).is_file(), f"architecture.md names {name}"
+        assert (ROOT / name).is_file() or (ROOT / "hilstar" / name).is_file(), (
+            f"architecture.md names {name}"
+        )
     assert len(files) <= MAX_FILES[heading]
 
 
@@ -34,9 +38,15 @@ def rooms(names: list[str]) -> set[str]:
 
 def test_the_floors_are_those_of_the_import_rules():
     """The rooms, from the top; single files may come and go."""
-    rules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    rules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
+        "contracts"
+    ]
     layers = next(rule["layers"] for rule in rules if rule.get("containers") == ["hilstar"])
     floors = [rooms(re.findall(r"\w+", layer)) for layer in layers]
     table = PAGE.split("\n## The rooms\n")[1].split("\n## ")[0]
-    rows = [rooms(re.findall(r"`(\w+)`", line.split("|")[1])) for line in table.splitlines() if line.startswith("| `")]
+    rows = [
+        rooms(re.findall(r"`(\w+)`", line.split("|")[1]))
+        for line in table.splitlines()
+        if line.startswith("| `")
+    ]
     assert [row for row in rows if row] == [floor for floor in floors if floor]

@@ -29,7 +29,12 @@ from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
 DOCS = sorted((ROOT / "docs").glob("*.md"))
-PAGES = [*DOCS, ROOT / "README.md", ROOT / "configs" / "README.md", ROOT / "configs" / "CALIBRATION.md"]
+PAGES = [
+    *DOCS,
+    ROOT / "README.md",
+    ROOT / "configs" / "README.md",
+    ROOT / "configs" / "CALIBRATION.md",
+]
 PAGES += [ROOT / "firmware_protocol" / "README.md", ROOT / "CONTRIBUTING.md"]
 EXAMPLES = {page: blocks for page in PAGES if (blocks := blocks_of(page.read_text()))}
 # no other shell's name: a console block is run
@@ -98,7 +103,11 @@ def read_toml(text: str, folder: Path) -> None:
     if text.startswith("bench = "):  # a campaign's plan
         parse_plan(folder / "plan.toml", text)
         return
-    missing = [part for part in re.split(r"\n(?=\[)", SMALL_BENCH) if part.strip("\n[").split("]")[0] not in given]
+    missing = [
+        part
+        for part in re.split(r"\n(?=\[)", SMALL_BENCH)
+        if part.strip("\n[").split("]")[0] not in given
+    ]
     path = folder / "tables.toml"
     path.write_text("\n".join([*missing, text]))
     read_config(path)
@@ -139,7 +148,12 @@ def other_program(words: list[str]) -> str:
     """What another program prints; `python` is this one."""
     command = [sys.executable, *words[1:]] if words[0] == "python" else words
     return subprocess.run(
-        command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S, env=plain_pytest(Path())
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=PATIENCE_S,
+        env=plain_pytest(Path()),
     ).stdout
 
 
@@ -158,13 +172,17 @@ def listens(port: int) -> bool:
     listener.
     """
     lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
-    return any(line.split()[1].endswith(f":{port:04X}") and line.split()[3] == LISTEN for line in lines)
+    return any(
+        line.split()[1].endswith(f":{port:04X}") and line.split()[3] == LISTEN for line in lines
+    )
 
 
 def test_what_is_not_run_says_why():
     for page, blocks in EXAMPLES.items():
         for block in blocks:
-            assert block.not_run is None or len(block.not_run) > 10, f"{page}:{block.line} gives no reason"
+            assert block.not_run is None or len(block.not_run) > 10, (
+                f"{page}:{block.line} gives no reason"
+            )
 
 
 @pytest.mark.parametrize("page", DOCS, ids=[page.name for page in DOCS])
@@ -174,7 +192,9 @@ def test_a_block_of_the_documentation_is_of_a_language_that_is_tested(page):
 
 
 def test_most_console_blocks_are_run():
-    blocks = [block for found in EXAMPLES.values() for block in found if block.language == "console"]
+    blocks = [
+        block for found in EXAMPLES.values() for block in found if block.language == "console"
+    ]
     assert len(blocks) > 15
     assert sum(block.not_run is None for block in blocks) > len(blocks) / 2
 

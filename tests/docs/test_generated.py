@@ -28,18 +28,24 @@ def test_a_generated_page_is_what_the_generator_makes(pages):
     """`python tools/make_pages.py` has nothing to change."""
     assert pages
     for name, make in pages.items():
-        assert (ROOT / "docs" / name).read_text() == make(), f"docs/{name} is old; run python tools/make_pages.py"
+        assert (ROOT / "docs" / name).read_text() == make(), (
+            f"docs/{name} is old; run python tools/make_pages.py"
+        )
 
 
 def test_the_tables_are_those_of_the_results(tables):
     """`python results/tables.py` has nothing to change, and each table is on some page."""
     texts = [path.read_text() for path in tables.pages()]
     for path, text in zip(tables.pages(), texts, strict=True):
-        assert tables.with_tables(text) == text, f"{path} has old tables; run python results/tables.py"
+        assert tables.with_tables(text) == text, (
+            f"{path} has old tables; run python results/tables.py"
+        )
     for name in tables.TABLES:
         assert any(f"<!-- table: {name} -->\n| " in text for text in texts)
     marks = sum(text.count("<!-- table: ") for text in texts)
-    filled = sum(text.count(f"<!-- table: {name} -->\n| ") for text in texts for name in tables.TABLES)
+    filled = sum(
+        text.count(f"<!-- table: {name} -->\n| ") for text in texts for name in tables.TABLES
+    )
     assert marks == filled
 
 
@@ -54,7 +60,10 @@ def test_the_image_of_the_examples_is_made_as_readme_s_first_command_says():
     readme = blocks("sh")[0]
     packages = re.search(r"apt-get install -y ([^;]+);", readme)
     text = (ROOT / "examples" / "Dockerfile").read_text()
-    assert packages is not None and f"apt-get install -y --no-install-recommends {packages[1]} " in text
+    assert (
+        packages is not None
+        and f"apt-get install -y --no-install-recommends {packages[1]} " in text
+    )
     assert 'CMD ["hilstar", "demo"]' in text and "hilstar demo" in readme
     workflow = (ROOT / "examples" / "ci-github.yml").read_text()
     assert packages[1] in workflow and "verify project/bench.toml --strict" in workflow

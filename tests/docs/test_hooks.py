@@ -14,11 +14,20 @@ from tools import docs_hooks
 @pytest.mark.parametrize(
     ("page", "built"),
     [
-        ("see [the wire](../firmware_protocol/README.md#keys) first", "see the wire (`firmware_protocol/README.md`) first"),
+        (
+            "see [the wire](../firmware_protocol/README.md#keys) first",
+            "see the wire (`firmware_protocol/README.md`) first",
+        ),
         ("see [CALIBRATION.md](../configs/CALIBRATION.md)", "see `configs/CALIBRATION.md`"),
-        ("the [`[uniformity]`](../configs/CALIBRATION.md#u) map", "the `[uniformity]` (`configs/CALIBRATION.md`) map"),
+        (
+            "the [`[uniformity]`](../configs/CALIBRATION.md#u) map",
+            "the `[uniformity]` (`configs/CALIBRATION.md`) map",
+        ),
         ("see [the light](the-light.md)", "see [the light](the-light.md)"),
-        ("see [changes](../CHANGELOG.md), [examples](../examples)", "see [changes](changes.md), [examples](examples.md)"),
+        (
+            "see [changes](../CHANGELOG.md), [examples](../examples)",
+            "see [changes](changes.md), [examples](examples.md)",
+        ),
     ],
 )
 def test_a_link_out_of_the_documentation_names_the_file(page, built):
@@ -29,12 +38,17 @@ def test_a_page_from_elsewhere_links_into_the_documentation():
     page = SimpleNamespace(file=SimpleNamespace(src_uri="examples.md"))
     text = "see [campaigns](../docs/campaign.md#cases) and [a header](../firmware_protocol/hilstar_protocol.h)"
     built = docs_hooks.on_page_markdown(text, page=page)
-    assert built == "see [campaigns](campaign.md#cases) and a header (`firmware_protocol/hilstar_protocol.h`)"
+    assert (
+        built
+        == "see [campaigns](campaign.md#cases) and a header (`firmware_protocol/hilstar_protocol.h`)"
+    )
 
 
 def test_every_page_stands_in_one_group_of_the_site():
     """As the contents of a book: no page without a group, none twice, and no group of one."""
-    lines = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0].splitlines()
+    lines = (
+        (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0].splitlines()
+    )
     groups = [line.strip(" -:") for line in lines if line.endswith(":")]
     assert groups == ["Start", "Theory", "Bench", "Sky", "Run", "Prove", "Reference"]
     named = [line.rpartition(" ")[2] for line in lines if line.endswith(".md")]

@@ -18,7 +18,9 @@ def installed(text: str) -> set[str]:
 def test_readme_contributing_and_ci_install_the_same():
     command = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
     readme = installed(command)
-    contributing, ci = (installed((ROOT / name).read_text()) for name in ("CONTRIBUTING.md", ".ci/run"))
+    contributing, ci = (
+        installed((ROOT / name).read_text()) for name in ("CONTRIBUTING.md", ".ci/run")
+    )
     assert readme == contributing
     assert readme <= ci
     assert {"chromium", "chromium-driver", "xvfb"} <= readme

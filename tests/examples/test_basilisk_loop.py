@@ -27,12 +27,16 @@ MIN_ANSWERS, MAX_AGE_MS = 76, 250.0
 def test_a_slew_settles_by_nothing_but_the_trackers_answers(tmp_path):
     command = [sys.executable, "basilisk_loop.py", "0.02", "9"]
     folder = copied(tmp_path)
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S + 60, check=False)
+    result = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S + 60, check=False
+    )
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     assert found["answers"] > 0
     if found["answers"] < MIN_ANSWERS or found["answer_age_ms"] > MAX_AGE_MS:
-        pytest.skip(f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old in the middle")
+        pytest.skip(
+            f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old in the middle"
+        )
     assert found["pointing_rms_arcsec"]["x"] < ACROSS_ARCSEC
     assert found["pointing_rms_arcsec"]["y"] < ACROSS_ARCSEC
     assert found["pointing_rms_arcsec"]["about_boresight"] < ABOUT_ARCSEC

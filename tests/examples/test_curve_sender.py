@@ -40,7 +40,9 @@ def test_with_its_key_it_is_heard_and_with_another_it_is_told(tmp_path, monkeypa
     assert serve[1:4] == ["serve", bench.name, "--headless"]
     with listening(bench, f"bound to {endpoint}", *serve[4:]) as process:
         command = [sys.executable, send[1], endpoint, send[3], "0.5"]
-        sent = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+        sent = subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=PATIENCE_S
+        )
         refused = stranger(monkeypatch, endpoint)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)

@@ -32,7 +32,11 @@ def rows() -> np.ndarray:
 
 def test_the_log_is_what_its_script_makes():
     made = subprocess.run(
-        [sys.executable, EXAMPLES / "make_slew.py"], capture_output=True, text=True, check=True, timeout=PATIENCE_S
+        [sys.executable, EXAMPLES / "make_slew.py"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE_S,
     )
     assert made.stdout == (EXAMPLES / "slew.csv").read_text()
 
@@ -44,7 +48,9 @@ def test_its_attitudes_turn_as_its_rates_say_from_rest_to_rest():
     turns = (attitudes[1:] * attitudes[:-1].inv()).as_rotvec()
     expected = -STEP_S * (log[1:, 5:] + log[:-1, 5:]) / 2  # v_cam' = -omega x v_cam
     assert np.abs(turns - expected).max() < STEP_ERROR_RAD + DIGITS_RAD
-    assert np.degrees((attitudes[-1] * attitudes[0].inv()).magnitude()) == pytest.approx(20, abs=1e-9)
+    assert np.degrees((attitudes[-1] * attitudes[0].inv()).magnitude()) == pytest.approx(
+        20, abs=1e-9
+    )
     speed_deg_s = np.degrees(np.linalg.norm(log[:, 5:], axis=1))
     assert speed_deg_s.max() == pytest.approx(2, abs=1e-9)
     assert speed_deg_s[0] == speed_deg_s[-1] == 0
@@ -63,7 +69,12 @@ def test_replay_and_the_virtual_tracker_follow_it(tmp_path, monkeypatch):
         frames = list(csv.DictReader(file))
     assert [float(frame["t_s"]) for frame in frames] == [2.0 * k for k in range(12)]
     for frame, sample in zip(frames, log[::20], strict=True):
-        assert np.allclose([float(frame[name]) for name in ("qw", "qx", "qy", "qz")], sample[1:5], rtol=0, atol=1e-11)
+        assert np.allclose(
+            [float(frame[name]) for name in ("qw", "qx", "qy", "qz")],
+            sample[1:5],
+            rtol=0,
+            atol=1e-11,
+        )
         assert int(frame["stars_drawn"]) > 50
         assert np.asarray(Image.open(f"slew-frames/frame_{int(frame['frame']):06}.png")).max() > 20
 

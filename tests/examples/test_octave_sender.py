@@ -28,11 +28,16 @@ def octave(program: str) -> subprocess.CompletedProcess[str]:
 
 
 def random_samples(rng: np.random.Generator) -> list[AttitudeSample]:
-    samples = [AttitudeSample(t_ns, np.array([0.5, 0.5, -0.5, 0.5]), None, 2**32 - 1) for t_ns in (0, -1, 2**63 - 1, -(2**63))]
+    samples = [
+        AttitudeSample(t_ns, np.array([0.5, 0.5, -0.5, 0.5]), None, 2**32 - 1)
+        for t_ns in (0, -1, 2**63 - 1, -(2**63))
+    ]
     for k in range(40):
         q = rng.normal(size=4)
         rate = None if k % 3 == 0 else rng.normal(size=3)
-        samples.append(AttitudeSample(int(rng.integers(2**62)), q / np.linalg.norm(q), rate, k, bool(k % 2)))
+        samples.append(
+            AttitudeSample(int(rng.integers(2**62)), q / np.linalg.norm(q), rate, k, bool(k % 2))
+        )
     return samples
 
 
@@ -41,7 +46,11 @@ def test_its_packets_are_those_of_python_bit_for_bit(rng):
     lines = []
     for sample in samples:
         q = " ".join(f"{c:.17g}" for c in sample.q_icrs_to_cam)
-        rate = "" if sample.rate_cam_rad_s is None else " ".join(f"{c:.17g}" for c in sample.rate_cam_rad_s)
+        rate = (
+            ""
+            if sample.rate_cam_rad_s is None
+            else " ".join(f"{c:.17g}" for c in sample.rate_cam_rad_s)
+        )
         # A literal is a double, and exact to 2^53 only.
         high, low = divmod(sample.t_ns, 2**31)
         t_ns = f"int64({high}) * int64({2**31}) + int64({low})"
@@ -53,7 +62,9 @@ def test_its_packets_are_those_of_python_bit_for_bit(rng):
 
 def test_its_answers_are_those_of_python_bit_for_bit():
     answer = AnswerPacket(7, 1 | 2 | 8, 42, (0.6, 0.0, 0.8, 0.0), (0.0, 0.25, -1.5), 12)
-    result = octave("printf('%02x', hilstar_answer(7, int64(42), [0.6 0 0.8 0], [0 0.25 -1.5], 10, 12));")
+    result = octave(
+        "printf('%02x', hilstar_answer(7, int64(42), [0.6 0 0.8 0], [0 0.25 -1.5], 10, 12));"
+    )
     assert result.stdout.strip() == encode(answer).hex(), result.stderr
 
 

@@ -21,7 +21,9 @@ def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     frame, test = commands("A regression test")
     assert run_hilstar_here(*frame[1:]).returncode == 0
-    fault = re.search(r"With `(focal_length_mm = .*?)`.* `(Not the same sky: .*?)`", section("A regression test"))
+    fault = re.search(
+        r"With `(focal_length_mm = .*?)`.* `(Not the same sky: .*?)`", section("A regression test")
+    )
     assert fault is not None
     wrong = folder / "wrong"
     wrong.mkdir()
@@ -35,6 +37,9 @@ def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
     command = [sys.executable, *test[1:], "wrong/test_sky.py", *options]
     result = run_started(command, env=plain_pytest(folder))
     assert result.returncode == pytest.ExitCode.TESTS_FAILED, result.stdout
-    outcomes = {name: outcome for outcome, name in re.findall(r"(?m)^(PASSED|FAILED) (\S+)::", result.stdout)}
+    outcomes = {
+        name: outcome
+        for outcome, name in re.findall(r"(?m)^(PASSED|FAILED) (\S+)::", result.stdout)
+    }
     assert outcomes == {"test_sky.py": "PASSED", "wrong/test_sky.py": "FAILED"}
     assert f"AssertionError: {fault[2]}" in result.stdout

@@ -36,9 +36,19 @@ def cable(tmp_path) -> Iterator[Cable]:
 @pytest.fixture(scope="module")
 def sender(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("serial") / "serial_sender"
-    command = ["gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", *STRICT, "-I", ROOT / "firmware_protocol"]
+    command = [
+        "gcc",
+        "-std=c99",
+        "-D_POSIX_C_SOURCE=200809L",
+        "-O2",
+        *STRICT,
+        "-I",
+        ROOT / "firmware_protocol",
+    ]
     command += [EXAMPLES / "serial_sender.c", "-lm", "-o", target]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert (result.returncode, result.stderr) == (0, "")
     return target
 
@@ -49,12 +59,18 @@ def told(output: str) -> dict[str, int]:
     return dict(zip(("sent", "requests", "statuses"), map(int, match.groups()), strict=True))
 
 
-def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(tmp_path, cable, sender):
+def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
+    tmp_path, cable, sender
+):
     bench_file = tmp_path / "serial.toml"
-    bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
+    bench_file.write_text(
+        f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n'
+    )
     command = [str(sender), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
         assert result.returncode == 0, result.stderr
         time.sleep(READ_S)
         summary = interrupted(process)
@@ -85,7 +101,10 @@ def listened(link: SerialLink, program: subprocess.Popen) -> list[tuple[int, obj
 def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, sender):
     rate_rad_s = math.radians(20.0)
     command = [str(sender), str(cable.sender), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
-    with SerialLink(str(cable.host), BAUD) as link, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+    with (
+        SerialLink(str(cable.host), BAUD) as link,
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program,
+    ):
         first = link.receive(5000)
         t1_ns = time.monotonic_ns()
         link.send(TimeRequest(5, t1_ns))
@@ -99,7 +118,9 @@ def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, s
     q0 = np.array([0.5, 0.5, -0.5, 0.5])
     for k, sample in enumerate(samples):
         assert abs(sample.t_ns - samples[0].t_ns - 5_000_000 * k) <= 1
-        expected = propagate(q0, np.array([0.0, 0.0, rate_rad_s]), (sample.t_ns - samples[0].t_ns) / 1e9)
+        expected = propagate(
+            q0, np.array([0.0, 0.0, rate_rad_s]), (sample.t_ns - samples[0].t_ns) / 1e9
+        )
         assert np.abs(sample.q_icrs_to_cam - expected).max() < 1e-14
         assert sample.rate_cam_rad_s is not None
         assert sample.rate_cam_rad_s.tolist() == [0.0, 0.0, float(np.float32(rate_rad_s))]
@@ -116,6 +137,12 @@ def test_the_sender_says_in_one_line_what_is_wrong(sender):
         (["/dev/null", "7", "1", "1", "1"], 2),
         (["/dev/null", "115200", "1", "1", "1"], 1),
     ):
-        result = subprocess.run([str(sender), *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        result = subprocess.run(
+            [str(sender), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
         assert result.returncode == code
         assert len(result.stderr.splitlines()) == 1

@@ -29,32 +29,47 @@ def built(folder: Path, line: int) -> Path:
     """The program that the README's line builds, as strictly as compilers are."""
     compiler, *rest = commands(HEADING)[line]
     command = [compiler, *STRICT, *rest[:-1], folder / rest[-1]]
-    result = subprocess.run(command, cwd=EXAMPLES, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        command, cwd=EXAMPLES, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert (result.returncode, result.stderr) == (0, "")
     return folder / rest[-1]
 
 
 def said_by(command: list) -> str:
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    ).stdout
 
 
 def test_the_c_tracker_s_line_is_decoded(tmp_path):
     line = tmp_path / "line.bin"
     line.touch()
     assert said_by([built(tmp_path, 0), line, "1000", "5"]) == "sent 5\n"
-    (tmp_path / "bench.toml").write_text(SMALL_BENCH + '\n[answers]\nsource = "serial"\nport = "/dev/ttyUSB0"\n')
-    found = json.loads(run_hilstar_here("answers", tmp_path / "bench.toml", "--from", line, "--json").stdout)
+    (tmp_path / "bench.toml").write_text(
+        SMALL_BENCH + '\n[answers]\nsource = "serial"\nport = "/dev/ttyUSB0"\n'
+    )
+    found = json.loads(
+        run_hilstar_here("answers", tmp_path / "bench.toml", "--from", line, "--json").stdout
+    )
     assert found["counts"] == {"answers": 5, "valid": 5}
-    assert [(tuple(row["q_icrs_to_cam"]), row["stars"], row["mode"]) for row in found["answers"]] == [(Q, 12, "tracking")] * 5
+    assert [
+        (tuple(row["q_icrs_to_cam"]), row["stars"], row["mode"]) for row in found["answers"]
+    ] == [(Q, 12, "tracking")] * 5
 
 
 def test_the_c_plus_plus_tracker_s_datagrams_are_answers(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind(("127.0.0.1", 0))
         end.settimeout(PATIENCE_S)
-        assert said_by([built(tmp_path, 1), "127.0.0.1", str(end.getsockname()[1]), "1000", "5"]) == "sent 5\n"
+        assert (
+            said_by([built(tmp_path, 1), "127.0.0.1", str(end.getsockname()[1]), "1000", "5"])
+            == "sent 5\n"
+        )
         found = [decode(end.recv(100)) for _ in range(5)]
-    assert [(each.sequence, each.q_icrs_to_cam, each.flags, each.stars) for each in found] == [(k, Q, 10, 12) for k in range(5)]
+    assert [(each.sequence, each.q_icrs_to_cam, each.flags, each.stars) for each in found] == [
+        (k, Q, 10, 12) for k in range(5)
+    ]
 
 
 def test_the_python_tracker_s_messages_are_answers():
@@ -63,7 +78,13 @@ def test_the_python_tracker_s_messages_are_answers():
         end.connect(f"tcp://127.0.0.1:{port}")
         end.subscribe(b"")
         end.setsockopt(zmq.RCVTIMEO, PATIENCE_S * 1000)
-        command = [sys.executable, EXAMPLES / "zmq_tracker.py", f"tcp://127.0.0.1:{port}", "50", "1000"]
+        command = [
+            sys.executable,
+            EXAMPLES / "zmq_tracker.py",
+            f"tcp://127.0.0.1:{port}",
+            "50",
+            "1000",
+        ]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             found = decode(end.recv())
             process.terminate()

@@ -29,7 +29,14 @@ def sender(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("udp") / "udp_sender"
     compiler, *rest = commands("A C++ sender over UDP")[0]
     command = [compiler, *STRICT, *rest[:-1], target]
-    result = subprocess.run(command, cwd=ROOT / "examples", capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        command,
+        cwd=ROOT / "examples",
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
     assert (result.returncode, result.stderr) == (0, "")
     return target
 
@@ -37,10 +44,14 @@ def sender(tmp_path_factory) -> Path:
 def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
     address, port = "::1", free_port()
     bench = tmp_path / "udp.toml"
-    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n')
+    bench.write_text(
+        f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n'
+    )
     with listening(bench, "bound to") as process:
         command = [sender, address, str(port), "100", "1", "5"]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+        )
         time.sleep(READ_S)
         summary = interrupted(process)
     match = re.fullmatch(r"sent 100, requests (\d+), statuses (\d+)\n", result.stdout)
@@ -66,13 +77,21 @@ def test_the_sender_turns_as_its_rate_says(sender):
     assert isinstance(first, AttitudeSample)
     assert [sample.sequence for sample in samples] == list(range(50))
     for sample in samples:
-        expected = propagate(np.array([0.5, 0.5, -0.5, 0.5]), rate, (sample.t_ns - first.t_ns) / 1e9)
+        expected = propagate(
+            np.array([0.5, 0.5, -0.5, 0.5]), rate, (sample.t_ns - first.t_ns) / 1e9
+        )
         assert np.abs(sample.q_icrs_to_cam - expected).max() < 1e-14
         assert sample.rate_cam_rad_s.tolist() == [0.0, 0.0, float(np.float32(rate[2]))]
 
 
 def test_the_sender_says_in_one_line_what_is_wrong(sender):
-    for arguments, code in (([], 2), (["127.0.0.1", "9", "1", "1", "x"], 2), (["127.0.0.1", "no port", "1", "1", "1"], 1)):
-        result = subprocess.run([sender, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    for arguments, code in (
+        ([], 2),
+        (["127.0.0.1", "9", "1", "1", "x"], 2),
+        (["127.0.0.1", "no port", "1", "1", "1"], 1),
+    ):
+        result = subprocess.run(
+            [sender, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
         assert result.returncode == code
         assert len(result.stderr.splitlines()) == 1

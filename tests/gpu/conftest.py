@@ -22,7 +22,9 @@ def on_llvmpipe() -> None:
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are rasterised and blended."""
-    monkeypatch.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
+    monkeypatch.setattr(
+        "hilstar.display.render.renderer.computes_in_software", lambda context: False
+    )
 
 
 @pytest.fixture

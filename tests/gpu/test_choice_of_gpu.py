@@ -40,7 +40,9 @@ def test_without_a_key_egl_s_first_draws():
 
 @pytest.mark.parametrize("wrong", ["99", '"voodoo"'])
 def test_a_gpu_that_is_not_there_is_refused_in_one_line_that_lists_those_that_are(tmp_path, wrong):
-    result = run_hilstar_here("frame", bench_with(tmp_path, wrong), "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
+    result = run_hilstar_here(
+        "frame", bench_with(tmp_path, wrong), "--radec", "84,-1,0", "-o", tmp_path / "out.fits"
+    )
     assert_refused(result, 3, "[render] gpu", gpus()[0].line())
     with pytest.raises(MachineError, match="no such GPU"):
         create_context(json.loads(wrong))

@@ -44,7 +44,9 @@ def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]
     # a campaign here has set it
     own = {name: value for name, value in os.environ.items() if name != "LP_NUM_THREADS"}
     env = own | {"OPENBLAS_NUM_THREADS": "1"} | environment
-    return json.loads(subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout)
+    return json.loads(
+        subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout
+    )
 
 
 @pytest.mark.usefixtures("on_llvmpipe")

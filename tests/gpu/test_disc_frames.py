@@ -53,7 +53,11 @@ FLUX_LIMIT, PIXEL_LIMIT = 0.01, 0.05
 def bench(tmp_path_factory) -> Iterator[Bench]:
     file = tmp_path_factory.mktemp("discs") / "bench.toml"
     bodies = {"moon": True, "sun": True, "planets": True}
-    tables = {"sky": {"epoch_utc": NIGHT, "faintest_v_mag": 7.0}, "sky.bodies": bodies, "render": {"quantisation": "round"}}
+    tables = {
+        "sky": {"epoch_utc": NIGHT, "faintest_v_mag": 7.0},
+        "sky.bodies": bodies,
+        "render": {"quantisation": "round"},
+    }
     file.write_text(bench_text(tables))
     with load(file) as opened:
         yield opened
@@ -74,7 +78,18 @@ def disc(radius_px: float, phase_deg: float, at_px=(45.0, 41.0), name="Moon") ->
     side /= np.linalg.norm(side)
     sun = -np.cos(np.radians(phase_deg)) * direction + np.sin(np.radians(phase_deg)) * side
     distance = 1 / np.sin(radius_px / CAMERA.focal_length_px)
-    one = Disc(name, direction, distance, 1.0, 1.0, np.array([0.0, 0.0, 1.0]), sun, "lunar-lambert", 1.0, 0.6)
+    one = Disc(
+        name,
+        direction,
+        distance,
+        1.0,
+        1.0,
+        np.array([0.0, 0.0, 1.0]),
+        sun,
+        "lunar-lambert",
+        1.0,
+        0.6,
+    )
     return one.of_rate(1e8)
 
 
@@ -88,7 +103,11 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
         moon = now.observe(kernel["moon"]).apparent()
         radius_deg = np.degrees(np.arcsin(1737.4 / moon.distance().km))
         catalog = bench.stars.catalog
-        near = np.flatnonzero((np.abs(catalog.dec_deg - 19.5) < 3) & (np.abs(catalog.ra_deg - 130) < 3) & (catalog.v_mag < 7))
+        near = np.flatnonzero(
+            (np.abs(catalog.dec_deg - 19.5) < 3)
+            & (np.abs(catalog.ra_deg - 130) < 3)
+            & (catalog.v_mag < 7)
+        )
         stars = Star(ra_hours=catalog.ra_deg[near] / 15, dec_degrees=catalog.dec_deg[near])
         off_deg = now.observe(stars).apparent().separation_from(moon).degrees
     assert set(catalog.hip[near[off_deg < 0.99 * radius_deg]].tolist()) == set(BEEHIVE)
@@ -105,7 +124,9 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
 
 
 def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(bench):
-    half_deg = np.degrees(np.arctan(bench.camera.resolution_px[1] / 2 / bench.camera.focal_length_px))
+    half_deg = np.degrees(
+        np.arctan(bench.camera.resolution_px[1] / 2 / bench.camera.focal_length_px)
+    )
     beside = bench.light(bench.view(aim(bench, "Moon", half_deg + 1.0)))
     assert beside.extended == () and beside.over_white == ()
     whole, half = (bench.frame(aim(bench, "Moon", off)) for off in (0.0, half_deg))
@@ -134,7 +155,9 @@ def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
     view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-        both = replace(none, extended=(*disc_lights(far, view, False), *disc_lights(near, view, True)))
+        both = replace(
+            none, extended=(*disc_lights(far, view, False), *disc_lights(near, view, True))
+        )
         gl.draw(both)
         got, wanted = gl.linear().astype(float), linear_image(both, SIZE, GaussianPsf(SIGMA))
         gl.draw(replace(none, extended=tuple(disc_lights(near, view, False))))
@@ -149,8 +172,14 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
     contact.
     """
     moon = disc(20.0, 170.0, (45.0, 41.0))
-    for sun, seen in ((disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1), (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2)):
-        layer = BodyLayer(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), Canvas(CAMERA, GaussianPsf(SIGMA)))
+    for sun, seen in (
+        (disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1),
+        (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2),
+    ):
+        layer = BodyLayer(
+            SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]),
+            Canvas(CAMERA, GaussianPsf(SIGMA)),
+        )
         assert len(layer.on_image(AT_START)) == seen
 
 
@@ -176,7 +205,11 @@ def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
 @pytest.mark.parametrize("late_s", [0.0, 1 / 60], ids=["at once", "row by row"])
 def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
     one = disc(radius_px, 60.0)
-    shear = Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5)) if late_s else None
+    shear = (
+        Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5))
+        if late_s
+        else None
+    )
     view = DiscView(replace(CAMERA, lens=lens), GaussianPsf(SIGMA), (Pose(np.eye(3)),), shear)
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         sprites = replace(
@@ -202,12 +235,20 @@ WHOLE, PART = (104.0, (47.0, 40.0)), (400.0, (310.0, 300.0))
 def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
     size = (226, 222)
     cam = Camera(size, 900.0, (112.5, 110.5), np.eye(3), LENS)
-    one = replace(disc(face[0], 50.0, face[1]), law=law, polar_km=0.93, pole=np.array([0.6, 0.8, 0.0]), lunar_share=0.4)
+    one = replace(
+        disc(face[0], 50.0, face[1]),
+        law=law,
+        polar_km=0.93,
+        pole=np.array([0.6, 0.8, 0.0]),
+        lunar_share=0.4,
+    )
     light = DiscLight(one, np.eye(3), cam, GaussianPsf((0.85, 1.1)))
     tiles = disc_tiles(light, light.region(size))
     assert tiles is not None and len(tiles.face) + len(tiles.edges) > 2
     with Renderer(Target(size, GaussianPsf((0.85, 1.1)))) as gl:
-        sprites = replace(sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px), extended=(light,))
+        sprites = replace(
+            sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px), extended=(light,)
+        )
         gl.draw(sprites)
         got = gl.linear()
     wanted = linear_image(sprites, size, GaussianPsf((0.85, 1.1)))
@@ -228,7 +269,12 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
         gl.draw(star, 3)
         plain = gl.levels().copy()
         for _ in range(2):
-            gl.draw(replace(star, extended=tuple(disc_lights(disc(radius_px, 40.0), view, covers=True))), 3)
+            gl.draw(
+                replace(
+                    star, extended=tuple(disc_lights(disc(radius_px, 40.0), view, covers=True))
+                ),
+                3,
+            )
             levels = gl.levels().copy()
             wanted = oracle(gl.linear(), panel)
             assert np.mean(levels[30:] != wanted[30:]) < 1e-3  # ties alone
@@ -240,14 +286,20 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
 def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
     uploaded = []
     upload = ExtendedLayer._upload
-    monkeypatch.setattr(ExtendedLayer, "_upload", lambda self, image, n: uploaded.append(image.shape) or upload(self, image, n))
+    monkeypatch.setattr(
+        ExtendedLayer,
+        "_upload",
+        lambda self, image, n: uploaded.append(image.shape) or upload(self, image, n),
+    )
     view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
     lasting = LightMap(np.ones(SIZE[::-1], dtype=np.float32))
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         for _ in range(3):
             discs = [
-                light for x in range(5) for light in disc_lights(disc(2.0, 40.0, (10.0 + 15 * x, 40.0)), view, covers=True)
+                light
+                for x in range(5)
+                for light in disc_lights(disc(2.0, 40.0, (10.0 + 15 * x, 40.0)), view, covers=True)
             ]
             gl.draw(replace(none, extended=(lasting, *discs)))
             assert gl.linear().sum() > 4e8
@@ -269,7 +321,9 @@ def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(
         bench.renderer.draw(layer.add(none, stars, View(q, turn, scan=scan)))
         light = bench.renderer.linear().astype(float)
         y, x = np.mgrid[: light.shape[0], : light.shape[1]]
-        middles.append((light.sum(), (light * x).sum() / light.sum(), (light * y).sum() / light.sum()))
+        middles.append(
+            (light.sum(), (light * x).sum() / light.sum(), (light * y).sum() / light.sum())
+        )
     still, *turned = middles
     for times, (total, x, y) in zip((1, 4), turned, strict=True):
         assert total == pytest.approx(still[0], rel=FLUX_LIMIT)
@@ -279,7 +333,10 @@ def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(
 
 
 def test_verify_takes_no_disc_and_no_star_beside_it_for_a_star(tmp_path):
-    bodies: dict = {"sky": {"epoch_utc": NIGHT, "faintest_v_mag": 6.0}, "sky.bodies": {"moon": True}}
+    bodies: dict = {
+        "sky": {"epoch_utc": NIGHT, "faintest_v_mag": 6.0},
+        "sky.bodies": {"moon": True},
+    }
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, bodies))
     with Twin(read_bench_file(tmp_path / "bench.toml")) as twin:
         comparison = Comparison(twin)

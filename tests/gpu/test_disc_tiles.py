@@ -36,7 +36,13 @@ def gl():
         assert renderer.gl_error() == "GL_NO_ERROR"
 
 
-def looking(distance_km: float, focal_px: float, from_limb_deg: float, phase_deg: float, lens: Lens | None = None) -> DiscLight:
+def looking(
+    distance_km: float,
+    focal_px: float,
+    from_limb_deg: float,
+    phase_deg: float,
+    lens: Lens | None = None,
+) -> DiscLight:
     aim = np.arcsin(EQUATOR_KM / distance_km) + np.radians(from_limb_deg)
     towards = np.array([0.3 * np.sin(aim), np.sqrt(1 - 0.09) * np.sin(aim), np.cos(aim)])
     side = np.array([0.5, -0.1, 1.0])
@@ -44,14 +50,27 @@ def looking(distance_km: float, focal_px: float, from_limb_deg: float, phase_deg
     side /= np.linalg.norm(side)
     sun = -np.cos(np.radians(phase_deg)) * towards + np.sin(np.radians(phase_deg)) * side
     disc = earth_disc(distance_km * towards, -KM_PER_AU * sun, np.zeros(3), 1e5)
-    return DiscLight(disc, np.eye(3), Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3), lens), GaussianPsf(SIGMA))
+    return DiscLight(
+        disc, np.eye(3), Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3), lens), GaussianPsf(SIGMA)
+    )
 
 
 def moon(light: DiscLight, radius_px: float) -> DiscLight:
     """A Moon of that radius off the middle, three quarters of it lit."""
     ahead, sun = np.array([0.02, -0.01, 1.0]), np.array([0.8, 0.3, -0.5])
     far = 1 / np.sin(radius_px / light.camera.focal_length_px)
-    face = Disc("Moon", ahead / np.linalg.norm(ahead), far, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), sun, "lunar-lambert", 1e6, 0.5)
+    face = Disc(
+        "Moon",
+        ahead / np.linalg.norm(ahead),
+        far,
+        1.0,
+        1.0,
+        np.array([0.0, 1.0, 0.0]),
+        sun,
+        "lunar-lambert",
+        1e6,
+        0.5,
+    )
     return replace(light, disc=replace(face, sun=sun / np.linalg.norm(sun)))
 
 
@@ -91,17 +110,31 @@ def test_tiles_without_a_linear_image_have_its_levels(method, rng):
     added to dither's levels.
     """
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as whole:
-        stars = sprites_at(rng.uniform(0, SIZE, (12, 2)), 10.0 ** rng.uniform(4, 6, 12), whole.footprint_px)
-        for name, white_share in (("low orbit, limb", 2e-3), ("low orbit, limb", 2.0), ("low orbit, terminator", 1e-2)):
+        stars = sprites_at(
+            rng.uniform(0, SIZE, (12, 2)), 10.0 ** rng.uniform(4, 6, 12), whole.footprint_px
+        )
+        for name, white_share in (
+            ("low orbit, limb", 2e-3),
+            ("low orbit, limb", 2.0),
+            ("low orbit, terminator", 1e-2),
+        ):
             light = SCENES[name]
             whole.draw(replace(stars, extended=(light,)))
             linear = whole.linear().copy()
-            target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(12), white_share * float(linear.max()), method)
+            target = Target(
+                SIZE,
+                GaussianPsf(SIGMA),
+                srgb_response(12),
+                white_share * float(linear.max()),
+                method,
+            )
             with Renderer(target) as gl:
                 for sprites in (stars, replace(stars, data=stars.data[:0], star=stars.star[:0])):
                     gl.draw(replace(sprites, extended=(light,)))
                     levels = gl.levels().copy()
-                    wanted = (round_levels if method == "round" else dither_levels)(gl.linear(), target.panel())
+                    wanted = (round_levels if method == "round" else dither_levels)(
+                        gl.linear(), target.panel()
+                    )
                     if method != "exact" or not len(sprites):
                         assert np.mean(levels != wanted) < 2e-4  # ties alone
                     assert np.abs(gl.linear() - linear).max() <= (

@@ -74,10 +74,21 @@ def body_of(disc: Disc) -> Body:
     law = lunar_lambert(disc.lunar_share) if disc.law == "lunar-lambert" else lambert
     air = None if disc.air is None else (disc.air.scale_km, disc.air.depth)
     centre = disc.distance_km * disc.direction
-    return Body(centre, disc.equator_km, disc.polar_km, disc.pole, disc.sun, law, disc.normal_e_per_s_sr, air)
+    return Body(
+        centre,
+        disc.equator_km,
+        disc.polar_km,
+        disc.pole,
+        disc.sun,
+        law,
+        disc.normal_e_per_s_sr,
+        air,
+    )
 
 
-def limb_off_px(disc: Disc, cam: Camera, got: np.ndarray, truth: np.ndarray, lit_above: float = 0.3) -> np.ndarray:
+def limb_off_px(
+    disc: Disc, cam: Camera, got: np.ndarray, truth: np.ndarray, lit_above: float = 0.3
+) -> np.ndarray:
     """How far outward of the truth's an image has the limb, all round where the Sun shines on
     it.
     """
@@ -88,7 +99,12 @@ def limb_off_px(disc: Disc, cam: Camera, got: np.ndarray, truth: np.ndarray, lit
     beyond_x, beyond_y = cam.project(on + 1e-4 * across)
     outward = np.stack([beyond_x - x, beyond_y - y], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    inside = np.isfinite(x) & (np.abs(x - 31.5) < 25) & (np.abs(y - 29.5) < 23) & (across @ disc.sun > lit_above)
+    inside = (
+        np.isfinite(x)
+        & (np.abs(x - 31.5) < 25)
+        & (np.abs(y - 29.5) < 23)
+        & (across @ disc.sun > lit_above)
+    )
     places = np.stack([x, y], axis=1)[inside]
     return edge_px(got, places, outward[inside]) - edge_px(truth, places, outward[inside])
 
@@ -129,7 +145,12 @@ def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
 
 @pytest.mark.parametrize(
     ("altitude_km", "focal_px", "aim_deg", "lens"),
-    [(400.0, 400.0, 2.0, None), (400.0, 200.0, 3.0, LENS), (400.0, 200.0, -40.0, None), (35_786.0, 250.0, -8.7, None)],
+    [
+        (400.0, 400.0, 2.0, None),
+        (400.0, 200.0, 3.0, LENS),
+        (400.0, 200.0, -40.0, None),
+        (35_786.0, 250.0, -8.7, None),
+    ],
     ids=["low orbit's limb", "through a lens", "fills the screen", "geostationary"],
 )
 def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px, aim_deg, lens):
@@ -141,7 +162,19 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
     direction /= np.linalg.norm(direction)
     sun = sun_from(direction, 30.0)
     pole = np.array([0.6, 0.0, 0.8])
-    disc = Disc("Earth", direction, distance_km, EARTH_KM, 6356.752, pole, sun, "lambert", 1e6, 1.0, Air(*AIR))
+    disc = Disc(
+        "Earth",
+        direction,
+        distance_km,
+        EARTH_KM,
+        6356.752,
+        pole,
+        sun,
+        "lambert",
+        1e6,
+        1.0,
+        Air(*AIR),
+    )
     (light,) = lights(disc, cam, covers=True)
     got = drawn(gl, light)
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=2)
@@ -164,6 +197,8 @@ def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     with Renderer(Target(SIZE, GaussianPsf(sigma_px))) as gl:
         got = drawn(gl, *disc_lights(disc, view, covers=True))
     # of the same middle
-    truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)
+    truth = spread_image(
+        body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5
+    )
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
     assert np.abs(centroid_px(got) - centroid_px(truth)).max() < PLACE_LIMIT_PX

@@ -28,7 +28,9 @@ def test_a_turned_screen_turns_the_attitude_that_is_seen_on_it() -> None:
     """
     q_mon = from_rotation_vector(-TURN_ARCSEC / ARCSEC_PER_RAD)  # Q'* Q is the turn where Q is none
     text = bench_text(TWIN, {"verify": {"true_q_cam_to_mon": q_mon.tolist()}})
-    attitudes = np.array([from_radec_roll_deg(84.057, -1.2, 0.0), from_radec_roll_deg(82.0, 1.0, 40.0)])
+    attitudes = np.array(
+        [from_radec_roll_deg(84.057, -1.2, 0.0), from_radec_roll_deg(82.0, 1.0, 40.0)]
+    )
     found = display_errors(bench_file_of(Path("bench.toml"), text), attitudes)
     assert found.shape == (2, 3)
     assert (np.abs(found - TURN_ARCSEC) < WITHIN_ARCSEC).all()

@@ -51,14 +51,18 @@ SIZE, SIGMA, WHITE = (96, 64), (0.85, 0.85), 1e6
 
 def stars(count, rng):
     return sprites_at(
-        rng.uniform([0, 0], SIZE, size=(count, 2)), 10.0 ** rng.uniform(4, 6, count), GaussianPsf(SIGMA).footprint_px
+        rng.uniform([0, 0], SIZE, size=(count, 2)),
+        10.0 ** rng.uniform(4, 6, count),
+        GaussianPsf(SIGMA).footprint_px,
     )
 
 
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact", "temporal"])
 def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quantisation, rng):
     few, many = stars(3, rng), stars(40, rng)
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)) as renderer:
+    with Renderer(
+        Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)
+    ) as renderer:
         renderer.draw(few)
         wanted = renderer.levels().copy()
         renderer.draw(many)
@@ -74,7 +78,9 @@ def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quan
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact"])
 def test_a_byte_of_each_table_is_noticed(quantisation):
     uneven = np.full(SIZE[::-1], 0.9, np.float32)
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation, uneven)) as renderer:
+    with Renderer(
+        Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation, uneven)
+    ) as renderer:
         renderer.remember_tables()
         assert renderer.tables and renderer.changed_tables() == 0
         for number, table in enumerate(renderer.tables, 1):

@@ -35,16 +35,27 @@ def gl():
 
 def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-    gl.draw(replace(none, extended=tuple(disc_lights(disc, DiscView(cam, GaussianPsf(SIGMA), (Pose(np.eye(3)),)), True))))
+    gl.draw(
+        replace(
+            none,
+            extended=tuple(
+                disc_lights(disc, DiscView(cam, GaussianPsf(SIGMA), (Pose(np.eye(3)),)), True)
+            ),
+        )
+    )
     return gl.linear().astype(float)
 
 
-def scene(distance_km: float, focal_px: float, aim_rad: float, phase_deg: float) -> tuple[Disc, Body, Camera]:
+def scene(
+    distance_km: float, focal_px: float, aim_rad: float, phase_deg: float
+) -> tuple[Disc, Body, Camera]:
     """The Earth with its centre so far below the boresight, the Sun on the side of the limb in
     view.
     """
     cam = Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3))
-    towards = np.array([0.3 * np.sin(aim_rad), np.sqrt(1 - 0.09) * np.sin(aim_rad), np.cos(aim_rad)])
+    towards = np.array(
+        [0.3 * np.sin(aim_rad), np.sqrt(1 - 0.09) * np.sin(aim_rad), np.cos(aim_rad)]
+    )
     side = np.array([0.2, -0.1, 1.0]) if aim_rad else np.array([1.0, 0.5, 0.0])
     side -= (side @ towards) * towards
     side /= np.linalg.norm(side)
@@ -78,7 +89,11 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_the_limb_and_the_light_are_those_of_rays(gl, rng, name):
     distance_km, focal_px, from_limb_deg, phase_deg = SCENES[name]
-    aim = 0.0 if from_limb_deg is None else np.arcsin(EQUATOR_KM / distance_km) + np.radians(from_limb_deg)
+    aim = (
+        0.0
+        if from_limb_deg is None
+        else np.arcsin(EQUATOR_KM / distance_km) + np.radians(from_limb_deg)
+    )
     disc, body, cam = scene(distance_km, focal_px, aim, phase_deg)
     got, truth = drawn(gl, disc, cam), spread_image(body, cam.rays, SIZE, SIGMA, rng, finer=2)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
@@ -89,12 +104,16 @@ def test_the_limb_and_the_light_are_those_of_rays(gl, rng, name):
     there = cam.project(on + 1e-3 * across)
     outward = np.stack([there[0] - x_px, there[1] - y_px], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    inside = np.isfinite(x_px) & (np.abs(x_px - MIDDLE_PX[0]) < 17) & (np.abs(y_px - MIDDLE_PX[1]) < 15)
+    inside = (
+        np.isfinite(x_px) & (np.abs(x_px - MIDDLE_PX[0]) < 17) & (np.abs(y_px - MIDDLE_PX[1]) < 15)
+    )
     inside &= across @ disc.sun > 0.3 * np.linalg.norm(across, axis=1)
     places = np.stack([x_px, y_px], axis=1)[inside]
     assert len(places) >= 15
     reach_px = 12.0 if "air" in name else 5.0
-    off_px = edge_px(got, places, outward[inside], reach_px) - edge_px(truth, places, outward[inside], reach_px)
+    off_px = edge_px(got, places, outward[inside], reach_px) - edge_px(
+        truth, places, outward[inside], reach_px
+    )
     assert np.abs(off_px).max() < PLACE_LIMIT_PX
 
 

@@ -84,7 +84,14 @@ def test_a_star_fades_in_the_air_as_rays_do_and_is_gone_behind_the_ground(bench)
         sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place))
         mine = sprites.data["electrons_per_s"][sprites.star == star].sum() / whole
         earth = Body(
-            -place, EQUATOR_KM, POLAR_KM, np.array([0.0, 0.0, 1.0]), direction, lambert, 1.0, (AIR.scale_km, AIR.depth)
+            -place,
+            EQUATOR_KM,
+            POLAR_KM,
+            np.array([0.0, 0.0, 1.0]),
+            direction,
+            lambert,
+            1.0,
+            (AIR.scale_km, AIR.depth),
         )
         _, through = traced(earth, direction[None])
         assert mine == pytest.approx(through[0], abs=AIR_LIMIT)
@@ -106,9 +113,14 @@ def test_the_moon_sets_behind_the_earth(bench):
         place = above(moon, np.radians(height_deg), side)
         moon = body_direction(bench, "Moon", place)
         picture = light(bench, moon, place)
-        listed = [disc.name for disc in bench.discs(bench.view(towards(moon), None, T_NS, np.zeros(3), place))]
+        listed = [
+            disc.name
+            for disc in bench.discs(bench.view(towards(moon), None, T_NS, np.zeros(3), place))
+        ]
         assert ("Moon" in listed) == (height_deg > 0)
-        faces = {disc.name: disc for disc in bench.moving.discs(moon, 0.0, 0.0, T_NS, np.zeros(3), place)}
+        faces = {
+            disc.name: disc for disc in bench.moving.discs(moon, 0.0, 0.0, T_NS, np.zeros(3), place)
+        }
         whole = faces["Moon"].normal_e_per_s_sr * faces["Moon"].law_integral_sr()
         y, x = np.mgrid[:240, :320]
         near = np.hypot(x - 159.5, y - 119.5) < 9  # the Moon is 9.5 px wide here
@@ -120,7 +132,10 @@ def test_the_moon_sets_behind_the_earth(bench):
 
 def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(bench):
     sun = body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
-    sums = [light(bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum() for h in (-3.0, -0.1, 0.1, 3.0)]
+    sums = [
+        light(bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum()
+        for h in (-3.0, -0.1, 0.1, 3.0)
+    ]
     assert (np.diff(sums) > 0).all()
     assert sums[0] < 1e-6 * sums[-1]
     assert 0 < sums[1] < 0.6 * sums[-1]
@@ -131,6 +146,8 @@ def test_from_low_above_the_day_side_the_earth_fills_the_field(bench):
     place = (EQUATOR_KM + ALTITUDE_KM) * sun
     picture = light(bench, -sun, place)
     assert (picture > bench.flux_at_white_e_per_s).all()
-    drawn = bench.draw_sprites(bench.light(bench.view(towards(-sun), None, T_NS, np.zeros(3), place)))
+    drawn = bench.draw_sprites(
+        bench.light(bench.view(towards(-sun), None, T_NS, np.zeros(3), place))
+    )
     assert drawn.star_count == 0
     assert drawn.clipped_hip == ("Earth",)

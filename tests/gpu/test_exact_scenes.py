@@ -42,7 +42,14 @@ OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
 
 
 def target_of(scene, quantisation="exact"):
-    return Target((SIDE, SIDE), GaussianPsf(scene.sigma_px), scene.response, WHITE, quantisation, scene.uniformity)
+    return Target(
+        (SIDE, SIDE),
+        GaussianPsf(scene.sigma_px),
+        scene.response,
+        WHITE,
+        quantisation,
+        scene.uniformity,
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -54,9 +61,13 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
         assert gl.gl_error() == "GL_NO_ERROR"
     assert levels.max() <= scene.response.white
     assert_no_worse(levels, name, scene)
-    oracle = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites)
+    oracle = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(
+        scene.sprites
+    )
     beside = "neighbour" in name or "apart" in name
-    assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (oracle > 0).sum()
+    assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (
+        oracle > 0
+    ).sum()
     assert np.abs(levels.astype(int) - oracle).max() <= 1
 
 
@@ -69,7 +80,10 @@ def test_streaks_are_as_right_where_they_might_fail(name):
         assert gl.gl_error() == "GL_NO_ERROR"
     assert_streaks_are_right(levels, scene)
     assert_streaks_are_right(
-        ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites), scene
+        ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(
+            scene.sprites
+        ),
+        scene,
     )
 
 
@@ -115,18 +129,31 @@ def test_codes_of_moving_neighbours_do_not_depend_on_the_order_of_stars(sigma_px
     rng, size = np.random.default_rng(7), 20 * TILE
     middle = rng.uniform(10, size - 10, (2, PAIRS))
     apart = rng.uniform(2, 7, PAIRS) * np.exp(1j * rng.uniform(0, 2 * np.pi, PAIRS)) / 2
-    x, y = (np.stack([at - half, at + half], axis=1).ravel() for at, half in zip(middle, (apart.real, apart.imag), strict=True))
+    x, y = (
+        np.stack([at - half, at + half], axis=1).ravel()
+        for at, half in zip(middle, (apart.real, apart.imag), strict=True)
+    )
     along = np.array([-0.15, 0.15])
-    rates = np.repeat(flux_of(rng.uniform(2, 5, PAIRS), sigma_px), 2) * rng.uniform(0.97, 1.03, 2 * PAIRS)
+    rates = np.repeat(flux_of(rng.uniform(2, 5, PAIRS), sigma_px), 2) * rng.uniform(
+        0.97, 1.03, 2 * PAIRS
+    )
 
     def paths(order):
         star = np.repeat(np.arange(len(order)), len(along))
         places = ((at[order][:, None] + along).ravel() for at in (x, y))
-        sprites = pack_sprites(*places, np.repeat(rates[order] / 2, 2), star, (size, size), GaussianPsf(sigma_px).footprint_px)
+        sprites = pack_sprites(
+            *places,
+            np.repeat(rates[order] / 2, 2),
+            star,
+            (size, size),
+            GaussianPsf(sigma_px).footprint_px,
+        )
         return replace(sprites, per_star=len(along))
 
     found = []
-    with Renderer(Target((size, size), GaussianPsf(sigma_px), srgb_response(8), WHITE, "exact")) as gl:
+    with Renderer(
+        Target((size, size), GaussianPsf(sigma_px), srgb_response(8), WHITE, "exact")
+    ) as gl:
         for order in (np.arange(2 * PAIRS), np.arange(2 * PAIRS)[::-1], rng.permutation(2 * PAIRS)):
             gl.draw(paths(order))
             found.append(gl.levels().copy())

@@ -43,7 +43,11 @@ def target_of(method, uniformity=None) -> Target:
 
 
 def stars(gl, rng, count=40):
-    return sprites_at(rng.uniform([5, 5], [250, 187], size=(count, 2)), 10.0 ** rng.uniform(4, 6, count), gl.footprint_px)
+    return sprites_at(
+        rng.uniform([5, 5], [250, 187], size=(count, 2)),
+        10.0 ** rng.uniform(4, 6, count),
+        gl.footprint_px,
+    )
 
 
 def map_of(rng, low=0.0, high=3e-3) -> LightMap:
@@ -79,7 +83,9 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
     of `dither`.
     """
     step_e = srgb_response(10).light[1] * WHITE
-    target = target_of("exact", rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None)
+    target = target_of(
+        "exact", rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None
+    )
     panel = target.panel()
     x, y = np.meshgrid(np.arange(20.0, 250, 30), np.arange(20.0, 180, 30))
     places = np.column_stack((x.ravel(), y.ravel())) + rng.uniform(-0.5, 0.5, (x.size, 2))
@@ -91,7 +97,9 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
         gl.draw(replace(some, extended=(light,)))
         levels = gl.levels().astype(int)
         both = shown_light(gl.levels(), panel)
-        assert np.allclose(gl.linear().sum(), 0.3 * step_e * light.image.size + 200 * step_e * x.size, rtol=1e-4)
+        assert np.allclose(
+            gl.linear().sum(), 0.3 * step_e * light.image.size + 200 * step_e * x.size, rtol=1e-4
+        )
         gl.draw(replace(some, data=some.data[:0], star=some.star[:0], extended=(light,)))
         floor = gl.levels().copy()
         assert (floor == dither_levels(light.image, panel)).mean() > 1 - 1e-4
@@ -101,7 +109,10 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
         for px, py in np.rint(places).astype(int):
             # Half a step of light: the method's own limit where steps are equal, as all are on an
             # even panel.
-            assert abs(difference[py - 9 : py + 10, px - 9 : px + 10].sum() - 200 * step_e) < (1.2 if uneven else 0.6) * step_e
+            assert (
+                abs(difference[py - 9 : py + 10, px - 9 : px + 10].sum() - 200 * step_e)
+                < (1.2 if uneven else 0.6) * step_e
+            )
         gl.draw(some)
         assert (gl.levels() == plain).all()
 
@@ -116,10 +127,15 @@ def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
         for frame in range(4):
             gl.draw(none, frame)
             # ties alone
-            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4
+            assert (
+                np.mean(gl.levels() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4
+            )
             shown.append(shown_light(gl.levels(), panel))
             gl.draw(replace(few, extended=(light,)), frame)
-            assert shown_light(gl.levels(), panel).sum() > shown[-1].sum() + 0.9 * few.data["electrons_per_s"].sum()
+            assert (
+                shown_light(gl.levels(), panel).sum()
+                > shown[-1].sum() + 0.9 * few.data["electrons_per_s"].sum()
+            )
         gl.draw(none, 9)
         error = [np.abs(image - gl.linear()).mean() for image in (shown[0], np.mean(shown, axis=0))]
         assert error[1] < error[0] / 3
@@ -138,4 +154,6 @@ def test_a_glow_has_its_profile_about_a_direction_on_and_off_the_image(lens):
             gl.draw(replace(none, extended=(GlowLight(towards, 5e4, 0.1, 3.0, cam),)))
             angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), seen @ towards)
             wanted = 5e4 * (1 + (angle / 0.1) ** 2) ** -1.5
-            assert np.abs(gl.linear().ravel() / wanted - 1).max() < (GLOW_LIMIT if lens is None else GLOW_LENS_LIMIT)
+            assert np.abs(gl.linear().ravel() / wanted - 1).max() < (
+                GLOW_LIMIT if lens is None else GLOW_LENS_LIMIT
+            )

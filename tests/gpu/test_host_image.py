@@ -39,7 +39,9 @@ def gl():
 
 def stars(gl: Renderer, count: int, rng: np.random.Generator, size=SIZE):
     flux = 10.0 ** rng.uniform(1, 7, count)
-    return sprites_at(rng.uniform([-5, -5], np.add(size, 5), size=(count, 2)), flux, gl.footprint_px)
+    return sprites_at(
+        rng.uniform([-5, -5], np.add(size, 5), size=(count, 2)), flux, gl.footprint_px
+    )
 
 
 @pytest.mark.parametrize("size", [SIZE, (255, 33), (7, 5), (640, 2)])
@@ -47,7 +49,10 @@ def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
     """Few are made black one by one, more by a clear; few are one band, more several, and the
     buffer grows.
     """
-    with Renderer(Target(size, GaussianPsf(SIGMA))) as gl, Rasterised(Target(size, GaussianPsf(SIGMA))) as raster:
+    with (
+        Renderer(Target(size, GaussianPsf(SIGMA))) as gl,
+        Rasterised(Target(size, GaussianPsf(SIGMA))) as raster,
+    ):
         assert raster._host is None
         for count in (3, 40, 2, 9000, 1, 300, 128, 129, 0, 40, 300, 131, 2, 0, 3):
             sprites = stars(gl, count, rng, size)
@@ -63,7 +68,10 @@ def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
 
 
 def test_few_stars_on_a_large_image_are_made_black_without_a_clear(rng, monkeypatch):
-    with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as gl, Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as fresh:
+    with (
+        Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as gl,
+        Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as fresh,
+    ):
         monkeypatch.setattr(host_image, "MAX_ERASED", 1.0)
         for count in (200, 150, 3, 2000, 100, 1, 400, 0):
             sprites = stars(gl, count, rng, (1024, 768))
@@ -107,7 +115,13 @@ def test_extended_light_and_stars_alone_take_turns(gl, rng):
     light = LightMap(np.full((8, 9), 5.0, dtype=np.float32), (20, 30))
     some, other = stars(gl, 50, rng), stars(gl, 60, rng)
     with Rasterised(Target(SIZE, GaussianPsf(SIGMA))) as raster:
-        for sprites in (some, replace(other, extended=(light,)), other, replace(some, extended=(light,)), some):
+        for sprites in (
+            some,
+            replace(other, extended=(light,)),
+            other,
+            replace(some, extended=(light,)),
+            some,
+        ):
             gl.draw(sprites)
             raster.draw(sprites)
             assert np.abs(gl.linear() - raster.linear()).max() <= WAYS_LIMIT * raster.linear().max()

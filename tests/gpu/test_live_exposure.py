@@ -32,7 +32,15 @@ def frame_of(bench, number: int) -> ShownFrame:
     found = levels.ravel()[lit]
     codes = found if rgb is None else rgb[found]
     height, width = levels.shape
-    head = FrameHead(number, number * PERIOD_NS, width, height, bench.config.monitor.bits, ORION_Q, 1 if rgb is None else 3)
+    head = FrameHead(
+        number,
+        number * PERIOD_NS,
+        width,
+        height,
+        bench.config.monitor.bits,
+        ORION_Q,
+        1 if rgb is None else 3,
+    )
     frame = read_frame(frame_parts(ShownFrame(head, lit.astype(np.uint32), codes)))
     assert isinstance(frame, ShownFrame), frame
     return frame
@@ -42,8 +50,15 @@ def frame_of(bench, number: int) -> ShownFrame:
     "changes",
     [
         {},
-        {"monitor": {"bits": 8}, "render": {"quantisation": "round", "bit_stealing": True}, "verify": {"true_mirror": "x"}},
-        {"render": {"quantisation": "dither"}, "monitor": {"bits": 8, "calibration": "lcd-example"}},
+        {
+            "monitor": {"bits": 8},
+            "render": {"quantisation": "round", "bit_stealing": True},
+            "verify": {"true_mirror": "x"},
+        },
+        {
+            "render": {"quantisation": "dither"},
+            "monitor": {"bits": 8, "calibration": "lcd-example"},
+        },
     ],
 )
 def test_both_trackers_see_the_same_electrons(tmp_path: Path, rng, monkeypatch, changes):

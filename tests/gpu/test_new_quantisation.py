@@ -52,7 +52,9 @@ class OrderedQuantiser(PixelQuantiser):
         wanted = linear_e_per_s if gain is None else linear_e_per_s * gain
         lower = np.searchsorted(light[1:], wanted, side="right")
         y, x = np.indices(wanted.shape)
-        threshold = np.float32(0.25) * (((x + 2 * y + number) & 3).astype(np.float32) + np.float32(0.5))
+        threshold = np.float32(0.25) * (
+            ((x + 2 * y + number) & 3).astype(np.float32) + np.float32(0.5)
+        )
         step = light[np.minimum(lower + 1, panel.response.white)] - light[lower]
         more = (lower < panel.response.white) & (wanted - light[lower] > threshold * step)
         return Levels((lower + more).astype(level_dtype(panel.response)))
@@ -90,7 +92,11 @@ def rows(tmp_path, monkeypatch):
 
 
 def stars(count, rng, footprint_px):
-    return sprites_at(rng.uniform([-5, -5], [260, 197], size=(count, 2)), 10.0 ** rng.uniform(0, 7, count), footprint_px)
+    return sprites_at(
+        rng.uniform([-5, -5], [260, 197], size=(count, 2)),
+        10.0 ** rng.uniform(0, 7, count),
+        footprint_px,
+    )
 
 
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
@@ -101,7 +107,11 @@ def test_a_new_pixel_quantiser_draws_its_oracle_s_levels_in_each_frame(count, ma
     """
     uniformity = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if mapped else None
     target = Target(SIZE, PSF, srgb_response(8), WHITE, "ordered", uniformity)
-    oracle, sprites, drawn = OrderedQuantiser(target.panel(), SIZE, PSF), stars(count, rng, PSF.footprint_px), []
+    oracle, sprites, drawn = (
+        OrderedQuantiser(target.panel(), SIZE, PSF),
+        stars(count, rng, PSF.footprint_px),
+        [],
+    )
     with Renderer(target) as gl:
         for number in range(FRAMES):
             gl.draw(sprites, number)
@@ -120,7 +130,10 @@ def test_a_new_star_quantiser_draws_its_oracle_s_levels(rng):
     with Renderer(target) as gl:
         gl.draw(sprites)
         levels = gl.levels().copy()
-    found, exact = (kind(target.panel(), SIZE, PSF).levels(sprites) for kind in (CarelessQuantiser, ExactQuantiser))
+    found, exact = (
+        kind(target.panel(), SIZE, PSF).levels(sprites)
+        for kind in (CarelessQuantiser, ExactQuantiser)
+    )
     assert np.count_nonzero(levels != found) <= OTHER_CHOICE * np.count_nonzero(found)
     assert np.count_nonzero(levels != exact) > 10 * OTHER_CHOICE * np.count_nonzero(found)
 
@@ -134,6 +147,10 @@ def test_numpy_draws_and_effort_judges_a_new_quantisation(method, rng):
         gl.draw(sprites, 1)
         lit = np.count_nonzero(gl.levels())
         assert np.count_nonzero(backend.levels() != gl.levels()) <= OTHER_CODES_BY_NUMPY * lit
-    light = Light(srgb_response(8), WHITE, 5e6 * 10 ** (-0.4 * np.linspace(0, 4, 50)), exposure_frames=FRAMES)
-    new, rounded = (plan_effort(RenderSettings(quantisation=each), light) for each in (method, "round"))
+    light = Light(
+        srgb_response(8), WHITE, 5e6 * 10 ** (-0.4 * np.linspace(0, 4, 50)), exposure_frames=FRAMES
+    )
+    new, rounded = (
+        plan_effort(RenderSettings(quantisation=each), light) for each in (method, "round")
+    )
     assert new.quantisation == method and new.error_px < rounded.error_px

@@ -47,7 +47,11 @@ def opened(name: str, folder) -> hilstar.Bench:
     text = same_codes.toml_of(name)
     if name == "bodies":  # NumPy takes 5 s for a disc that fills the whole monitor
         text = text.replace("[640, 480]", "[200, 150]")
-    files = {"geometry.toml": same_codes.GEOMETRY, "station.tle": same_codes.STATION, "others.tle": same_codes.OTHERS}
+    files = {
+        "geometry.toml": same_codes.GEOMETRY,
+        "station.tle": same_codes.STATION,
+        "others.tle": same_codes.OTHERS,
+    }
     for file, content in {"bench.toml": text, **files}.items():
         (folder / file).write_text(content)
     same_codes.write_log(folder / "log.csv", name)
@@ -61,7 +65,10 @@ def both(name: str, folder):
         by_numpy = replace(bench, renderer=NumpyBackend(bench.renderer.target))
         frames = []
         for number, row in enumerate(rows[::EVERY][:FRAMES]):
-            q, rate = (np.array([float(row[key]) for key in keys]) for keys in (("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")))
+            q, rate = (
+                np.array([float(row[key]) for key in keys])
+                for keys in (("qw", "qx", "qy", "qz"), ("rx", "ry", "rz"))
+            )
             sprites = bench.light(bench.view(q, rate, round(float(row["t_s"]) * NS_PER_S)))
             drawn = []
             for one in (bench, by_numpy):
@@ -75,7 +82,11 @@ def both(name: str, folder):
 def blocks(image):
     """Sums over squares of BLOCK_PX."""
     height, width = (size // BLOCK_PX * BLOCK_PX for size in image.shape)
-    return image[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX).sum(axis=(1, 3))
+    return (
+        image[:height, :width]
+        .reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+        .sum(axis=(1, 3))
+    )
 
 
 @pytest.mark.parametrize("name", OTHER)
@@ -88,7 +99,9 @@ def test_stars_have_the_same_light_and_levels(name, tmp_path):
         other, lit = other + int((levels != gl).sum()), lit + int((gl > 0).sum())
         assert np.abs(levels - gl).max() <= (8 if name == "effort" else 1)
         wanted = np.minimum(light, panel.flux_at_white_e_per_s)
-        errors.append([np.square(blocks(shown_light(found, panel) - wanted)).sum() for found in (gl, levels)])
+        errors.append(
+            [np.square(blocks(shown_light(found, panel) - wanted)).sum() for found in (gl, levels)]
+        )
     assert lit > 1000 and other <= OTHER[name] * lit
     gl_error, error = np.sqrt(np.sum(errors, axis=0))
     assert error == pytest.approx(gl_error, rel=CUT_ERRORS if name == "effort" else ERRORS)

@@ -83,7 +83,9 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
         gl.draw(sprites)
         linear, levels = gl.linear(), gl.levels().copy()
         oracle = {"round": round_levels, "dither": dither_levels}[method](linear, panel)
-        assert levels.dtype == oracle.dtype == (np.uint8 if len(response.light) <= 256 else np.uint16)
+        assert (
+            levels.dtype == oracle.dtype == (np.uint8 if len(response.light) <= 256 else np.uint16)
+        )
         assert_same_but_for_ties(levels, oracle, linear, panel)
         gl.draw(sprites, 6)
         assert np.array_equal(gl.levels(), levels)
@@ -141,7 +143,9 @@ OTHER_FLUX_MAG = 2e-3
 def apart(count, rng, footprint):
     """Stars of eight decades, each in a tile of its own, some of them over the edge."""
     x, y = np.meshgrid(np.arange(0, 257, 20), np.arange(0, 193, 20))
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)[:count] + rng.uniform(-4, 4, (min(count, x.size), 2))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)[:count] + rng.uniform(
+        -4, 4, (min(count, x.size), 2)
+    )
     return sprites_at(pixels, 10.0 ** rng.uniform(0, 7, len(pixels)), footprint)
 
 
@@ -155,11 +159,17 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
         for count in (130, 20):
             sprites = apart(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            found, oracle = gl.levels(), ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)
+            found, oracle = (
+                gl.levels(),
+                ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites),
+            )
             assert (found != oracle).sum() <= OTHER_PIXELS * (oracle > 0).sum() + A_STAR
             light = panel.light_e_per_s().astype(float)
             other = np.nonzero(found != oracle)
-            step = light[np.maximum(found, oracle)[other]] - light[np.maximum(found, oracle)[other] - 1]
+            step = (
+                light[np.maximum(found, oracle)[other]]
+                - light[np.maximum(found, oracle)[other] - 1]
+            )
             assert (np.abs(light[found] - light[oracle])[other] <= 1.01 * step + ERF * 1e7).all()
             whole = [shown_light(levels, panel).sum() for levels in (found, oracle)]
             assert abs(2.5 * np.log10(whole[0] / whole[1])) < OTHER_FLUX_MAG
@@ -180,14 +190,26 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
         at = np.concatenate([np.arange(n) - n / 2 for n in nodes])
         angle = rng.uniform(0, np.pi, 12)[star]
         x, y = np.meshgrid(np.arange(4) * 70 + 20.3, np.arange(3) * 70 + 30.6)
-        pixels = np.stack([x.ravel()[star] + 0.6 * at * np.cos(angle), y.ravel()[star] + 0.6 * at * np.sin(angle)], axis=1)
+        pixels = np.stack(
+            [
+                x.ravel()[star] + 0.6 * at * np.cos(angle),
+                y.ravel()[star] + 0.6 * at * np.sin(angle),
+            ],
+            axis=1,
+        )
         data = sprites_at(pixels, (10.0 ** rng.uniform(4, 6, 12) / nodes)[star], gl.footprint_px)
         sprites = replace(data, star=star, per_star=int(nodes.max()))
         gl.draw(sprites)
         wanted = gl.linear().astype(float)
-        for levels in (gl.levels().copy(), ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)):
+        for levels in (
+            gl.levels().copy(),
+            ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites),
+        ):
             assert abs(shown_light(levels, panel).sum() - wanted.sum()) < 12 * step
-            assert np.abs(shown_light(levels, panel) - np.minimum(wanted, WHITE)).max() < np.diff(panel.light_e_per_s()).max()
+            assert (
+                np.abs(shown_light(levels, panel) - np.minimum(wanted, WHITE)).max()
+                < np.diff(panel.light_e_per_s()).max()
+            )
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -199,7 +221,9 @@ def test_overlapping_stars_are_exact_together(rng):
     target = target_of(RESPONSES["srgb8"], "exact")
     panel = target.panel()
     sprites = sprites_at(
-        rng.uniform([0, 0], SIZE, (2000, 2)), 10.0 ** rng.uniform(3.5, 5, 2000), GaussianPsf(SIGMA).footprint_px
+        rng.uniform([0, 0], SIZE, (2000, 2)),
+        10.0 ** rng.uniform(3.5, 5, 2000),
+        GaussianPsf(SIGMA).footprint_px,
     )
     with Renderer(target) as gl:
         gl.draw(sprites)
@@ -207,7 +231,8 @@ def test_overlapping_stars_are_exact_together(rng):
     oracle = ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)
     rounded = round_levels(wanted.astype(np.float32), panel)
     blocks = [
-        2.5 * np.log10(block_sums(shown_light(levels, panel)) / block_sums(np.minimum(wanted, WHITE)))
+        2.5
+        * np.log10(block_sums(shown_light(levels, panel)) / block_sums(np.minimum(wanted, WHITE)))
         for levels in (found, oracle, rounded)
     ]
     rms = [float(np.sqrt(np.mean(np.square(block)))) for block in blocks]
@@ -237,7 +262,10 @@ def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
         assert np.array_equal(seen(11), first)
         gl.draw(None, 12)
         assert gl.levels().max() == 0
-        assert [np.array_equal(seen(frame), codes) for frame, codes in ((13, first), (14, second), (15, third))] == [True] * 3
+        assert [
+            np.array_equal(seen(frame), codes)
+            for frame, codes in ((13, first), (14, second), (15, third))
+        ] == [True] * 3
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -252,7 +280,10 @@ def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
         for count in (300, 20):
             sprites = stars(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            assert np.array_equal(gl.levels(), ExactQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)).levels(sprites))
+            assert np.array_equal(
+                gl.levels(),
+                ExactQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)).levels(sprites),
+            )
 
 
 def test_exact_and_round_draw_one_sky(rng):
@@ -304,5 +335,8 @@ def test_a_uniformity_map_of_another_size_is_refused(method):
 
 
 def test_a_target_without_a_monitor_has_no_texture():
-    with Renderer(Target((32, 32), GaussianPsf(SIGMA))) as gl, pytest.raises(TypeError, match="no monitor response"):
+    with (
+        Renderer(Target((32, 32), GaussianPsf(SIGMA))) as gl,
+        pytest.raises(TypeError, match="no monitor response"),
+    ):
         _ = gl.codes_texture

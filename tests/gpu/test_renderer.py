@@ -35,7 +35,9 @@ BLEND_LIMIT = 1e-6
 BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alone"])
 
 
-def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Sprites]:
+def draw(
+    target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, Sprites]:
     with Renderer(target) as gl:
         assert gl.gl_error() == "GL_NO_ERROR"
         sprites = sprites_at(pixels, electrons_per_s, gl.footprint_px)
@@ -46,17 +48,23 @@ def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tup
 
 
 def target_of(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -> Target:
-    return Target(resolution, GaussianPsf(sigma), None if bits is None else srgb_response(bits), white)
+    return Target(
+        resolution, GaussianPsf(sigma), None if bits is None else srgb_response(bits), white
+    )
 
 
 @BOTH_WAYS
-@pytest.mark.parametrize("sigma", [(0.4, 0.4), (0.55, 0.55), (0.85, 0.85), (1.3, 0.7), (0.5, 2.5), (3.0, 3.0)])
+@pytest.mark.parametrize(
+    "sigma", [(0.4, 0.4), (0.55, 0.55), (0.85, 0.85), (1.3, 0.7), (0.5, 2.5), (3.0, 3.0)]
+)
 def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma, bits):
     """A grid of 12 x 12 phases of a pixel, each star in a field of its own."""
     step = GaussianPsf(sigma).footprint_px + 3
     phases = np.linspace(-0.5, 0.5, 12)
     rows, columns = np.mgrid[0:12, 0:12]
-    pixels = np.column_stack(((columns * step + step).ravel() + phases[columns.ravel()], (rows * step + step).ravel()))
+    pixels = np.column_stack(
+        ((columns * step + step).ravel() + phases[columns.ravel()], (rows * step + step).ravel())
+    )
     pixels[:, 1] += phases[rows.ravel()]
     flux = 10.0 ** np.linspace(1, 9, 144)
     side = 14 * step
@@ -89,7 +97,11 @@ def test_every_pixel_is_that_of_the_oracle(sigma, bits, rng):
     oracle = linear_image(sprites, (256, 192), GaussianPsf(sigma))
     # Where stars overlap, each brings its own error.
     scale = (
-        linear_image(replace(sprites, data=sprites.data), (256, 192), GaussianPsf((sigma[0] * 1.5, sigma[1] * 1.5)))
+        linear_image(
+            replace(sprites, data=sprites.data),
+            (256, 192),
+            GaussianPsf((sigma[0] * 1.5, sigma[1] * 1.5)),
+        )
         + flux.max()
     )
     assert (np.abs(linear - oracle) / scale).max() < PIXEL_LIMIT
@@ -98,7 +110,17 @@ def test_every_pixel_is_that_of_the_oracle(sigma, bits, rng):
 
 @BOTH_WAYS
 def test_stars_partly_off_the_edge_are_drawn_partly(bits):
-    pixels = np.array([[-0.5, 50.0], [-3.0, 90.0], [100.0, -0.5], [255.5, 60.0], [258.0, 20.0], [130.0, 193.5], [-0.5, -0.5]])
+    pixels = np.array(
+        [
+            [-0.5, 50.0],
+            [-3.0, 90.0],
+            [100.0, -0.5],
+            [255.5, 60.0],
+            [258.0, 20.0],
+            [130.0, 193.5],
+            [-0.5, -0.5],
+        ]
+    )
     flux = np.full(len(pixels), 1e6)
     linear, _, sprites = draw(target_of(bits=bits), pixels, flux)
     oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
@@ -114,7 +136,9 @@ def test_the_footprint_cuts_no_more_than_it_says():
         size = GaussianPsf(sigma).footprint_px
         for phase in (-0.5, -0.25, 0.0, 0.4999, 0.5):
             sprite = sprites_at(np.array([[100 + phase, 80 + phase]]), np.ones(1), size)
-            cut = linear_image(sprite, (256, 192), GaussianPsf(sigma), footprint_px=2 * size + 9).sum()
+            cut = linear_image(
+                sprite, (256, 192), GaussianPsf(sigma), footprint_px=2 * size + 9
+            ).sum()
             kept = linear_image(sprite, (256, 192), GaussianPsf(sigma)).sum()
             assert 0 <= cut - kept <= MAX_CUT * 1.000001
 
@@ -191,7 +215,9 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
     size = (640, 480)
     with Renderer(target_of(size)) as gl, Renderer(target_of(size)) as fresh:
         for count in (3, 40, 2, 9000, 1, 300, 9000, 0, 40, 300, 2, 0, 3):
-            sprites = sprites_at(rng.uniform([0, 0], size, size=(count, 2)), np.full(count, 1e6), gl.footprint_px)
+            sprites = sprites_at(
+                rng.uniform([0, 0], size, size=(count, 2)), np.full(count, 1e6), gl.footprint_px
+            )
             gl.draw(sprites)
             if read:
                 gl.linear()

@@ -25,7 +25,11 @@ COMA, AIRY = SampledPsf(sampled(coma(), 5, 7), 5), SampledPsf(sampled(airy(1.5),
 
 def stars(psf: SampledPsf, seed: int = 3, count: int = 60):
     rng = np.random.default_rng(seed)
-    return sprites_at(rng.uniform([-8, -8], np.add(SIZE, 8), (count, 2)), 10 ** rng.uniform(3, 6.5, count), psf.footprint_px)
+    return sprites_at(
+        rng.uniform([-8, -8], np.add(SIZE, 8), (count, 2)),
+        10 ** rng.uniform(3, 6.5, count),
+        psf.footprint_px,
+    )
 
 
 @pytest.mark.parametrize("psf", [COMA, AIRY], ids=["coma", "airy"])

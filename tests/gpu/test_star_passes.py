@@ -19,7 +19,12 @@ from hilstar.optics.psf import GaussianPsf, pixel_shares
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
-PANELS = {"srgb6": srgb_response(6), "srgb8": srgb_response(8), "srgb10": srgb_response(10), "gamma8": gamma_response(8)}
+PANELS = {
+    "srgb6": srgb_response(6),
+    "srgb8": srgb_response(8),
+    "srgb10": srgb_response(10),
+    "gamma8": gamma_response(8),
+}
 # Light is summed in float32 by blending, in whole units here: both round by that of what they sum,
 # at most.
 FLOAT32 = 1e-6
@@ -57,7 +62,9 @@ def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, unev
     assert (found <= round_levels((whole + rounding).astype(np.float32), panel)).all()
     assert (found >= round_levels(np.maximum(least, 0).astype(np.float32), panel)).all()
     # Few pixels are near a threshold: the bounds above are wide, and most levels are the very same.
-    assert np.count_nonzero(found != round_levels(whole.astype(np.float32), panel)) <= 0.01 * np.count_nonzero(found)
+    assert np.count_nonzero(
+        found != round_levels(whole.astype(np.float32), panel)
+    ) <= 0.01 * np.count_nonzero(found)
 
 
 def test_the_order_of_stars_changes_nothing(rng):
@@ -86,7 +93,10 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
     step: the same as by points.
     """
     bright = stars(20_000, rng, decades=(6, 7))
-    for response, sprites in ((srgb_response(16), stars(300, rng)), (gamma_response(8, 3.0), bright)):
+    for response, sprites in (
+        (srgb_response(16), stars(300, rng)),
+        (gamma_response(8, 3.0), bright),
+    ):
         target = Target(SIZE, GaussianPsf(SIGMA), response, WHITE)
         with Renderer(target) as gl:
             assert gl._units is None or gl._units.unit_for(sprites) is None
@@ -103,7 +113,23 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
     few, many, bright = stars(9, rng), stars(600, rng), stars(20_000, rng, decades=(6, 7))
     lit = replace(few, extended=(glow,))
-    frames = [few, many, few, bright, few, None, bright, many, lit, few, lit, bright, lit, None, few]
+    frames = [
+        few,
+        many,
+        few,
+        bright,
+        few,
+        None,
+        bright,
+        many,
+        lit,
+        few,
+        lit,
+        bright,
+        lit,
+        None,
+        few,
+    ]
     with Renderer(target) as gl:
         if gl.path != "NumPy":  # without compute shaders, `exact` and `temporal`
             assert gl._units.unit_for(bright) is None
@@ -141,7 +167,10 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
     lit, size = response.threshold[0] * WHITE, GaussianPsf(SIGMA).footprint_px
     sides = (
         SpriteSide(3e38, size - 2),
-        *(SpriteSide(0.25 * lit / GaussianPsf(SIGMA).outside_share(k), k) for k in range(size - 4, 1, -2)),
+        *(
+            SpriteSide(0.25 * lit / GaussianPsf(SIGMA).outside_share(k), k)
+            for k in range(size - 4, 1, -2)
+        ),
     )
     with (
         Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE, sides=sides)) as gl,
@@ -150,14 +179,21 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
         sprites = stars(400, rng)
         gl.draw(sprites)
         all_.draw(sprites)
-        found, whole, panel = gl.levels().copy(), all_.linear().astype(np.float64), gl.target.panel()
+        found, whole, panel = (
+            gl.levels().copy(),
+            all_.linear().astype(np.float64),
+            gl.target.panel(),
+        )
         assert np.count_nonzero(found) <= np.count_nonzero(all_.levels())
         alone = sprites_at(np.array([[100.0, 90.0]]), np.array([1e12]), size)
         gl.draw(alone)
         assert np.count_nonzero(gl.levels()) == (size - 2) ** 2
     wings = covering(sprites, SIZE) * 0.25 * lit + CUT * whole
     assert (found <= round_levels((whole * (1 + FLOAT32)).astype(np.float32), panel)).all()
-    assert (found >= round_levels(np.maximum(whole * (1 - FLOAT32) - wings, 0).astype(np.float32), panel)).all()
+    assert (
+        found
+        >= round_levels(np.maximum(whole * (1 - FLOAT32) - wings, 0).astype(np.float32), panel)
+    ).all()
 
 
 @pytest.mark.parametrize("sigma", [(24.0, 24.0), (25.0, 25.0)])
@@ -178,10 +214,16 @@ def test_the_largest_sprites_are_whole(sigma):
 def test_the_texture_that_a_window_shows_has_the_levels_in_memory(quantisation, rng):
     """Whatever context is current, and where an image's bytes fill no whole words."""
     size = (37, 29)
-    with Renderer(Target(size, GaussianPsf(SIGMA), PANELS["srgb8"], WHITE, quantisation=quantisation)) as gl:
+    with Renderer(
+        Target(size, GaussianPsf(SIGMA), PANELS["srgb8"], WHITE, quantisation=quantisation)
+    ) as gl:
         for count in (40, 400, 30):
             gl.draw(stars(count, rng, size, (4, 6)))
             levels, texture = gl.levels().copy(), gl.codes_texture
             with gl.context:
                 shown = np.frombuffer(texture.read(alignment=1), dtype=np.uint8).reshape(size[::-1])
-            assert levels.any() and np.array_equal(shown, levels) and np.array_equal(gl.levels(), levels)
+            assert (
+                levels.any()
+                and np.array_equal(shown, levels)
+                and np.array_equal(gl.levels(), levels)
+            )

@@ -36,7 +36,14 @@ UNEVEN = np.random.default_rng(5).uniform(0.8, 1.2, SIZE[::-1]).astype(np.float3
 
 def stars(x, y, flux, numbers=None):
     numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, SIZE, GaussianPsf(SIGMA).footprint_px)
+    return pack_sprites(
+        x,
+        y,
+        np.broadcast_to(np.asarray(flux, float), x.shape),
+        numbers,
+        SIZE,
+        GaussianPsf(SIGMA).footprint_px,
+    )
 
 
 def places():
@@ -45,11 +52,18 @@ def places():
 
 
 def tiles(image):
-    return np.asarray(image.reshape(SIDE, TILE, SIDE, TILE).transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)[:, :-1, :-1], float)
+    return np.asarray(
+        image.reshape(SIDE, TILE, SIDE, TILE)
+        .transpose(0, 2, 1, 3)
+        .reshape(-1, TILE, TILE)[:, :-1, :-1],
+        float,
+    )
 
 
 def flux_mag(shown, wanted):
-    return float(np.sqrt(np.mean(np.square(2.5 * np.log10(shown.sum((1, 2)) / wanted.sum((1, 2)))))))
+    return float(
+        np.sqrt(np.mean(np.square(2.5 * np.log10(shown.sum((1, 2)) / wanted.sum((1, 2))))))
+    )
 
 
 @pytest.mark.parametrize("make", [srgb_response, gamma_response])
@@ -78,7 +92,14 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
     """Each frame begins with what the GPU's last one left; some stars go and come, and are half
     off the image.
     """
-    target = Target(SIZE, GaussianPsf(SIGMA), table_response(bits, np.linspace(0, 1, 2**bits)), WHITE, "temporal", uniformity)
+    target = Target(
+        SIZE,
+        GaussianPsf(SIGMA),
+        table_response(bits, np.linspace(0, 1, 2**bits)),
+        WHITE,
+        "temporal",
+        uniformity,
+    )
     panel, rng = target.panel(), np.random.default_rng(3)
     x, y = places()
     every = stars(x, y - 11, 10 ** rng.uniform(4, 6.5, len(x)))
@@ -86,14 +107,22 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
     with Renderer(target) as gl:
         for frame in range(6):
             keep = rng.random(len(every)) < 0.8
-            some = replace(every, data=every.data[keep], star=every.star[keep], x_px=every.x_px[keep], y_px=every.y_px[keep])
+            some = replace(
+                every,
+                data=every.data[keep],
+                star=every.star[keep],
+                x_px=every.x_px[keep],
+                y_px=every.y_px[keep],
+            )
             gl.draw(some, frame)
             found, wanted = gl.levels().copy(), oracle.levels(some)
             assert (found != wanted).sum() <= OTHER_PIXELS * (wanted > 0).sum() + 4
             with gl.context:
                 left = gl._exact_passes[0].left
             # and whole
-            same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (some.star >= SIDE)
+            same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (
+                some.star >= SIDE
+            )
             assert same.mean() > 0.5
             assert np.abs(left.error - oracle.left.error)[:, same].max() < LEFT
             oracle.left = left
@@ -102,7 +131,10 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
 def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
     monkeypatch.setattr("hilstar.display.exact.COMPUTE_VERSION", 999)
     target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), WHITE, "temporal")
-    oracle, sprites = TemporalQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)), stars(*places(), SIX_MAG)
+    oracle, sprites = (
+        TemporalQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)),
+        stars(*places(), SIX_MAG),
+    )
     with Renderer(target) as gl:
         for frame in range(3):
             gl.draw(sprites, frame)
@@ -120,7 +152,12 @@ def test_paths_keep_their_light_over_the_frames():
         shown, sky = np.zeros((2, *SIZE)), np.zeros(SIZE)
         for frame in range(FRAMES):
             at = np.tile(np.arange(5) * 1.2 - 2.4, len(x)) + 1.0 * (frame - 2.5)
-            sprites = stars(np.repeat(x, 5) + at * np.cos(way), np.repeat(y, 5) + at * np.sin(way), SIX_MAG / 5, numbers)
+            sprites = stars(
+                np.repeat(x, 5) + at * np.cos(way),
+                np.repeat(y, 5) + at * np.sin(way),
+                SIX_MAG / 5,
+                numbers,
+            )
             sprites = replace(sprites, per_star=5)
             gl.draw(sprites, frame)
             shown[0] += shown_light(gl.levels(), panel)
@@ -138,9 +175,18 @@ def test_frames_with_extended_light_go_on_where_others_stopped():
     """
     panel = Panel(table_response(2, np.linspace(0, 1, 4)), WHITE)
     sprites = stars(*places(), 1.3 * WHITE / 3)
-    none = replace(sprites, data=sprites.data[:0], star=sprites.star[:0], x_px=sprites.x_px[:0], y_px=sprites.y_px[:0])
+    none = replace(
+        sprites,
+        data=sprites.data[:0],
+        star=sprites.star[:0],
+        x_px=sprites.x_px[:0],
+        y_px=sprites.y_px[:0],
+    )
     light = LightMap(np.full(SIZE[::-1], 0.02 * WHITE, dtype=np.float32))
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA), panel.response, WHITE, "temporal")) as gl, Renderer(gl.target) as floor:
+    with (
+        Renderer(Target(SIZE, GaussianPsf(SIGMA), panel.response, WHITE, "temporal")) as gl,
+        Renderer(gl.target) as floor,
+    ):
         total = np.zeros(len(sprites))
         for frame in range(9):
             lights = (light,) if frame % 2 else ()

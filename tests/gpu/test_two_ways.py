@@ -48,7 +48,9 @@ def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
     along = np.arange(per_star)
     x, y = (place[:, :1] + 0.6 * along).ravel(), (place[:, 1:] + 0.35 * along).ravel()
     number = np.repeat(np.arange(count), per_star)
-    packed = pack_sprites(x, y, np.repeat(rate / per_star, per_star), number, SIZE, GaussianPsf(sigma_px).footprint_px)
+    packed = pack_sprites(
+        x, y, np.repeat(rate / per_star, per_star), number, SIZE, GaussianPsf(sigma_px).footprint_px
+    )
     return replace(packed, per_star=per_star)
 
 
@@ -62,7 +64,9 @@ def drawn(target: Target, frames: list[Sprites]) -> list[np.ndarray]:
     return found
 
 
-def both_ways(target: Target, frames: list[Sprites], monkeypatch) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def both_ways(
+    target: Target, frames: list[Sprites], monkeypatch
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The codes of frames star by star, and by points."""
     with Renderer(target) as gl:
         if not computes_in_software(gl.context):
@@ -70,7 +74,9 @@ def both_ways(target: Target, frames: list[Sprites], monkeypatch) -> tuple[list[
         assert gl.path == "compute shaders"
     star_by_star = drawn(target, frames)
     with monkeypatch.context() as patched:
-        patched.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
+        patched.setattr(
+            "hilstar.display.render.renderer.computes_in_software", lambda context: False
+        )
         with Renderer(target) as gl:
             assert gl.path.startswith("points")
         return star_by_star, drawn(target, frames)
@@ -86,7 +92,10 @@ def assert_same(star_by_star: list[np.ndarray], by_points: list[np.ndarray]) -> 
 def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
     """Sides as `effort` chooses them: a quarter of what lights a pixel may be left out."""
     size, lit = GaussianPsf(sigma_px).footprint_px, SRGB8.threshold[0] * WHITE
-    sides = [SpriteSide(0.25 * lit / GaussianPsf(sigma_px).outside_share(side), side) for side in range(size - 4, 1, -2)]
+    sides = [
+        SpriteSide(0.25 * lit / GaussianPsf(sigma_px).outside_share(side), side)
+        for side in range(size - 4, 1, -2)
+    ]
     return (SpriteSide(3e38, size - 2), *sides)
 
 
@@ -104,9 +113,15 @@ def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
     ],
     ids=["usual", "dense", "paths", "narrow", "wide", "10 bits", "gamma"],
 )
-def test_both_ways_choose_the_same_codes(quantisation, response, sigma_px, count, per_star, rng, monkeypatch):
+def test_both_ways_choose_the_same_codes(
+    quantisation, response, sigma_px, count, per_star, rng, monkeypatch
+):
     frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
-    assert_same(*both_ways(Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch))
+    assert_same(
+        *both_ways(
+            Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch
+        )
+    )
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
@@ -125,7 +140,9 @@ def test_so_they_do_of_three_primaries_beside_each_other(quantisation, rng, monk
 
 @pytest.mark.parametrize("quantisation", ["round", "exact"])
 @pytest.mark.parametrize("changed", ["uneven", "smaller sprites"])
-def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(quantisation, changed, rng, monkeypatch):
+def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(
+    quantisation, changed, rng, monkeypatch
+):
     uneven = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if changed == "uneven" else None
     sides = shrunk(USUAL) if changed == "smaller sprites" else ()
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, uneven, sides)
@@ -151,7 +168,9 @@ def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
     frames = [stars(600, sigma_px, rng) for _ in range(12)]
     side = GaussianPsf(sigma_px).footprint_px
     for codes, sprites in zip(
-        drawn(Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal"), frames), frames, strict=True
+        drawn(Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal"), frames),
+        frames,
+        strict=True,
     ):
         under = np.zeros(SIZE[::-1], dtype=bool)
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
@@ -184,7 +203,9 @@ def replayed(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], 
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
-def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_is_said(tmp_path, quantisation, monkeypatch):
+def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_is_said(
+    tmp_path, quantisation, monkeypatch
+):
     path, log, ledger = tmp_path / "bench.toml", tmp_path / "log.csv", tmp_path / "run.mcap"
     path.write_text(bench_text({"render": {"quantisation": quantisation}}))
     turn = [(k / 10, math.cos(0.01 * k), math.sin(0.01 * k)) for k in range(6)]
@@ -196,13 +217,17 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     assert all(np.array_equal(first[number], again[number]) for number in first)
     if before.path != "compute shaders":
         pytest.skip(f"{before} draws one way only")
-    monkeypatch.setattr("hilstar.display.render.renderer.computes_in_software", lambda context: False)
+    monkeypatch.setattr(
+        "hilstar.display.render.renderer.computes_in_software", lambda context: False
+    )
     by_points, told, now = replayed(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
     assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes
     for number, codes in first.items():
         assert np.abs(codes.astype(int) - by_points[number]).max() <= 1
-        assert np.count_nonzero(codes != by_points[number]) <= QUANTISERS[quantisation].other_codes * np.count_nonzero(codes)
+        assert np.count_nonzero(codes != by_points[number]) <= QUANTISERS[
+            quantisation
+        ].other_codes * np.count_nonzero(codes)
     assert max(codes.max() for codes in first.values()) > 0
 
 
@@ -227,13 +252,25 @@ print(*said, sep=", ")
 @pytest.mark.usefixtures("on_llvmpipe")
 def test_another_driver_s_codes_are_within_what_replay_says(tmp_path):
     for quantisation in QUANTISERS:
-        (tmp_path / f"{quantisation}.toml").write_text(bench_text({"render": {"quantisation": quantisation}}))
-    usual = {name: value for name, value in os.environ.items() if name not in ZINK and name != "MESA_GL_VERSION_OVERRIDE"}
+        (tmp_path / f"{quantisation}.toml").write_text(
+            bench_text({"render": {"quantisation": quantisation}})
+        )
+    usual = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ZINK and name != "MESA_GL_VERSION_OVERRIDE"
+    }
     names = []
     for file, environment in (("llvmpipe.npz", usual), ("zink.npz", usual | ZINK)):
         command = [sys.executable, "-c", DRAW, file, *QUANTISERS]
         ran = subprocess.run(
-            command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=PATIENCE_S, check=False
+            command,
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env=environment,
+            timeout=PATIENCE_S,
+            check=False,
         )
         if environment is not usual and "MachineError" in ran.stderr:
             pytest.skip("no zink here: Debian's mesa-vulkan-drivers has it")

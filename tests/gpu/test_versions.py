@@ -38,13 +38,22 @@ WITHOUT = {"round": "points", "dither": "points", "exact": "NumPy", "temporal": 
 
 def at_version(version: str, command: list[str], folder) -> str:
     environment = os.environ | {"MESA_GL_VERSION_OVERRIDE": version}
-    ran = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, timeout=PATIENCE_S, check=True)
+    ran = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=environment,
+        timeout=PATIENCE_S,
+        check=True,
+    )
     return ran.stdout
 
 
 @pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize(
-    ("version", "paths"), [("3.3", WITHOUT), ("4.2", WITHOUT), ("4.3", WITH_COMPUTE), ("4.5", WITH_COMPUTE)]
+    ("version", "paths"),
+    [("3.3", WITHOUT), ("4.2", WITHOUT), ("4.3", WITH_COMPUTE), ("4.5", WITH_COMPUTE)],
 )
 def test_the_newest_version_is_taken_and_each_path_is_named(tmp_path, version, paths):
     found = json.loads(at_version(version, [sys.executable, "-c", LOOK, SMALL_BENCH], tmp_path))

@@ -41,7 +41,14 @@ def blanking(server):
 
 
 def xset(server: Xorg, *words: str) -> str:
-    done = subprocess.run(["xset", *words], env=server.env, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    done = subprocess.run(
+        ["xset", *words],
+        env=server.env,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
     return done.stdout
 
 
@@ -59,14 +66,25 @@ def awake(server: Xorg) -> bool:
 
 
 @contextmanager
-def shown(server: Xorg, folder: Path, name: str = "bench", *options: str) -> Iterator[subprocess.Popen[bytes]]:
+def shown(
+    server: Xorg, folder: Path, name: str = "bench", *options: str
+) -> Iterator[subprocess.Popen[bytes]]:
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.toml").write_text(SCREEN_BENCH)
     still_log(folder / "still.csv")
-    command = [*HILSTAR, "replay", str(folder / f"{name}.toml"), str(folder / "still.csv"), "--force", *options]
+    command = [
+        *HILSTAR,
+        "replay",
+        str(folder / f"{name}.toml"),
+        str(folder / "still.csv"),
+        "--force",
+        *options,
+    ]
     with (
         (folder / f"{name}.txt").open("wb") as said,
-        Started(command, env=server.env, stdout=said, stderr=said, start_new_session=True) as process,
+        Started(
+            command, env=server.env, stdout=said, stderr=said, start_new_session=True
+        ) as process,
     ):
         try:
             yield process
@@ -75,7 +93,8 @@ def shown(server: Xorg, folder: Path, name: str = "bench", *options: str) -> Ite
 
 
 @pytest.mark.parametrize(
-    ("sign", "options"), [(signal.SIGINT, ()), (signal.SIGTERM, ("--windowed",)), (signal.SIGKILL, ("--windowed",))]
+    ("sign", "options"),
+    [(signal.SIGINT, ()), (signal.SIGTERM, ("--windowed",)), (signal.SIGKILL, ("--windowed",))],
 )
 def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_path, sign, options):
     with shown(server, tmp_path, "bench", *options) as process:
@@ -154,7 +173,12 @@ def test_standby_is_ended_prevented_and_restored(monkeypatch):
     before = server.blanking()
     assert before == (600, 300, 1, 1, True) and before.happens
     server.prevent(before)
-    assert [name for name, *_ in library.calls] == ["DPMSForceLevel", "DPMSDisable", "XForceScreenSaver", "XSync"]
+    assert [name for name, *_ in library.calls] == [
+        "DPMSForceLevel",
+        "DPMSDisable",
+        "XForceScreenSaver",
+        "XSync",
+    ]
     library.on = 0  # as the server has it after that
     assert not server.blanking().happens
     server.restore(before)

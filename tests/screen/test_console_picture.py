@@ -21,8 +21,18 @@ pytestmark = pytest.mark.screen
 def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tmp_path):
     bench = tmp_path / "bench.toml"
     bench.write_text(SCREEN_BENCH.replace('"exact"', '"round"'))
-    command = [*HILSTAR, "replay", str(bench), str(still_log(tmp_path / "still.csv")), "--console", "127.0.0.1:0", "--control"]
-    with Started(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env) as process:
+    command = [
+        *HILSTAR,
+        "replay",
+        str(bench),
+        str(still_log(tmp_path / "still.csv")),
+        "--console",
+        "127.0.0.1:0",
+        "--control",
+    ]
+    with Started(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env
+    ) as process:
         served = Served(process, 0)
         try:
             page = page_of(served)
@@ -36,7 +46,9 @@ def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tm
                     showed before the switch.
                     """
                     _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
-                    if (seen and np.array_equal(seen[-1], levels)) or not np.array_equal(screen.pixels()[:, :, 0], levels):
+                    if (seen and np.array_equal(seen[-1], levels)) or not np.array_equal(
+                        screen.pixels()[:, :, 0], levels
+                    ):
                         return False
                     seen.append(levels)
                     return True

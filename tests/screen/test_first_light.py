@@ -33,7 +33,17 @@ def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path)
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
     with plain_camera.on_duty() as camera:
         grab = f"{camera} {screen.file} {{output}} --reversed"
-        words = ["first-light", tmp_path / "bench.toml", "-o", tmp_path / "s", "--grab", grab, "--patches", "0", "--json"]
+        words = [
+            "first-light",
+            tmp_path / "bench.toml",
+            "-o",
+            tmp_path / "s",
+            "--grab",
+            grab,
+            "--patches",
+            "0",
+            "--json",
+        ]
         result = run_hilstar(*words, env=screen.env, timeout=PATIENCE_S)
     assert result.returncode == 0, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
@@ -43,7 +53,9 @@ def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path)
     assert steps["geometry"]["figures"]["focal_length_px"] == pytest.approx(120e3 / 57.65, rel=1e-4)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
     measured = tomllib.loads((tmp_path / "s/geometry.toml").read_text())
-    assert {"connector": "screen", "mode": "640x480@0.00", "bits": 8}.items() <= measured["monitor_identity"].items()
+    assert {"connector": "screen", "mode": "640x480@0.00", "bits": 8}.items() <= measured[
+        "monitor_identity"
+    ].items()
 
 
 def told_by(process, word):
@@ -77,17 +89,27 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
     bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
     command = [*HILSTAR, "first-light", str(bench), "-o", str(tmp_path / "s")]
     with (
-        Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process,
+        Started(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env
+        ) as process,
         client(screen.display) as user,
     ):
         try:
             told_by(process, "now press")
             legend = [process.stderr.readline() for _ in range(8)]
-            assert legend[2].strip().startswith("3  the largest square bottom left, the next one to its right, the smallest")
+            assert (
+                legend[2]
+                .strip()
+                .startswith(
+                    "3  the largest square bottom left, the next one to its right, the smallest"
+                )
+            )
             before = settled(screen)
             user.press("3")
             told_by(process, "now press")
-            wait_for(lambda: np.array_equal(screen.pixels()[::-1], before), "the figure, turned over")
+            wait_for(
+                lambda: np.array_equal(screen.pixels()[::-1], before), "the figure, turned over"
+            )
             user.press("1")
             while "geometry-1/frame_000" not in (line := told_by(process, "now save")):
                 save(line, screen)
@@ -99,7 +121,10 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
     steps = {step["name"]: step for step in session["steps"]}
     assert steps["orientation"]["figures"] == {"seen": "mirrored top to bottom", "told_by": "a key"}
     assert steps["focus"]["verdict"] == "done"
-    assert (session["running"], list(steps)) == ("geometry", ["machine", "display", "orientation", "focus", "warm-up"])
+    assert (session["running"], list(steps)) == (
+        "geometry",
+        ["machine", "display", "orientation", "focus", "warm-up"],
+    )
     assert "flip_y = true" in bench.read_text()
 
 
@@ -109,16 +134,30 @@ def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
     the diode's line comes out.
     """
     bench = tmp_path / "bench.toml"
-    bench.write_text(bench_text({"monitor": {"resolution_px": [640, 480], "photodiode_px": 40, "scanout_ms": 0}}))
+    bench.write_text(
+        bench_text({"monitor": {"resolution_px": [640, 480], "photodiode_px": 40, "scanout_ms": 0}})
+    )
     with Cable(tmp_path) as cable, Diode(screen, cable.sender, ADDED_MS):
         diode = f"serial:{cable.host}@921600"
-        words = ["first-light", bench, "-o", tmp_path / "s", "--grab", "false {output}", "--diode", diode, "--json"]
+        words = [
+            "first-light",
+            bench,
+            "-o",
+            tmp_path / "s",
+            "--grab",
+            "false {output}",
+            "--diode",
+            diode,
+            "--json",
+        ]
         result = run_hilstar(*words, env=screen.env, timeout=PATIENCE_S)
     assert result.returncode == 1, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["orientation"]["verdict"] == "failed"
     in_time(steps["latency"]["verdict"] == "done", steps["latency"]["line"])
-    in_time(abs(steps["latency"]["figures"]["panel_delay_ms"] - ADDED_MS) < MEDIAN_MS, steps["latency"])
+    in_time(
+        abs(steps["latency"]["figures"]["panel_delay_ms"] - ADDED_MS) < MEDIAN_MS, steps["latency"]
+    )
     assert f"panel_delay_ms = {steps['latency']['figures']['panel_delay_ms']}" in bench.read_text()
 
 
@@ -132,13 +171,17 @@ def test_colours_are_shown_and_frames_of_a_turn_one_after_the_other(screen, tmp_
     colours, other = table[rng.integers(0, 1000, (2, 480, 640))]
     looks = []
     with PatternDisplay() as display:
-        display.show_until(file, Pattern("colours", colours), lambda: looks.append(screen.pixels()) or True)
+        display.show_until(
+            file, Pattern("colours", colours), lambda: looks.append(screen.pixels()) or True
+        )
         assert (looks[-1] == colours).all()
         seen = set()
 
         def done():
             now = screen.pixels()
-            seen.update(number for number, frame in enumerate((colours, other)) if (now == frame).all())
+            seen.update(
+                number for number, frame in enumerate((colours, other)) if (now == frame).all()
+            )
             return len(seen) == 2
 
         display.show_until(file, Pattern("turn", colours, (other,)), done)

@@ -53,12 +53,27 @@ def shown(screen: Screen, folder: Path, kind: str):
     keys = f'photodiode_px = 40\nphotodiode = "{kind}"\nscanout_ms = 0'
     bench.write_text(SCREEN_BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
     still_log(folder / "still.csv")
-    command = ["replay", str(bench), str(folder / "still.csv"), "--ledger", str(folder / "run.mcap"), "--json", "--overwrite"]
+    command = [
+        "replay",
+        str(bench),
+        str(folder / "still.csv"),
+        "--ledger",
+        str(folder / "run.mcap"),
+        "--json",
+        "--overwrite",
+    ]
     (folder / "run.mcap").unlink(missing_ok=True)
-    with Started([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=screen.env) as process:
+    with Started(
+        [*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=screen.env
+    ) as process:
         try:
             ledger = folder / "run.mcap"
-            wait_for(lambda: process.poll() is not None or (ledger.exists() and ledger.stat().st_size > 20_000))
+            wait_for(
+                lambda: (
+                    process.poll() is not None
+                    or (ledger.exists() and ledger.stat().st_size > 20_000)
+                )
+            )
             assert process.poll() is None
             yield bench
             process.terminate()
@@ -67,8 +82,14 @@ def shown(screen: Screen, folder: Path, kind: str):
             process.kill()
 
 
-def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:
-    with Cable(folder) as cable, shown(screen, folder, kind) as bench, Diode(screen, cable.sender, added_ms, device_clock):
+def measured(
+    screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str
+) -> tuple[dict, Path]:
+    with (
+        Cable(folder) as cable,
+        shown(screen, folder, kind) as bench,
+        Diode(screen, cable.sender, added_ms, device_clock),
+    ):
         diode = ["--diode", f"serial:{cable.host}@921600", "--duration", str(WATCHED_S)]
         output = ["--json", "--save", folder / "edges.csv", "--overwrite", "-o", folder / "charts"]
         with real_time():
@@ -86,7 +107,9 @@ def measured_undisturbed(*wanted, edges: int = MIN_EDGES) -> tuple[dict, Path]:
         found, bench = measured(*wanted)
         if found["edges"] > edges and found["unmatched"] <= MAX_UNMATCHED * found["edges"]:
             return found, bench
-        assert time.monotonic() < deadline_s, f"in each measurement too many edges belong to no frame: {found}"
+        assert time.monotonic() < deadline_s, (
+            f"in each measurement too many edges belong to no frame: {found}"
+        )
 
 
 @best_of_three("the diode is a thread of this process: while it has no core, it sees a light late")
@@ -99,20 +122,33 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
     assert not plain["ambiguous"]
     # Its line keeps this diode from looking for so long: not every edge is seen, and those that
     # are, are as late as this.
-    late, bench = measured(screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml")
+    late, bench = measured(
+        screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml"
+    )
     added_ms = late["latency_ms"]["p50"] - plain["latency_ms"]["p50"]
     in_time(abs(added_ms - ADDED_MS) < MEDIAN_MS, (plain, late))
     assert late["swap_to_square_ms"] == 0
     assert f"panel_delay_ms = {round(late['panel_delay_ms'], 3)}\n" in bench.read_text()
-    assert run_hilstar_here("frame", bench, "--quaternion", ATTITUDE, "--truth", tmp_path / "t.csv").returncode == 0
+    assert (
+        run_hilstar_here(
+            "frame", bench, "--quaternion", ATTITUDE, "--truth", tmp_path / "t.csv"
+        ).returncode
+        == 0
+    )
     assert (tmp_path / "charts" / "latency.png").stat().st_size > 10_000
-    again = run_hilstar_here("latency", tmp_path / "run.mcap", "--edges", tmp_path / "edges.csv", "--json")
+    again = run_hilstar_here(
+        "latency", tmp_path / "run.mcap", "--edges", tmp_path / "edges.csv", "--json"
+    )
     # The run went on after the edges were read: the last few find their frames only now.
-    assert json.loads(again.stdout)["latency_ms"]["p50"] == pytest.approx(late["latency_ms"]["p50"], abs=DEVICE_MS)
+    assert json.loads(again.stdout)["latency_ms"]["p50"] == pytest.approx(
+        late["latency_ms"]["p50"], abs=DEVICE_MS
+    )
 
 
 @best_of_three("the diode is a thread of this process: while it has no core, it sees a light late")
-def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(screen, tmp_path):
+def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(
+    screen, tmp_path
+):
     found, _ = measured_undisturbed(screen, tmp_path, "toggle", 0.0, True, edges=100)
     run = read_run(tmp_path / "run.mcap")
     steady = np.abs(np.diff([frame.swap_ns for frame in run.frames]) - PERIOD_NS) < STEADY_NS
@@ -122,7 +158,9 @@ def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_o
     # The device's stamps are of its own clock; its least delay on the line, 1 ms here, is what a
     # one-way line cannot tell.
     in_time(abs(found["latency_ms"]["p50"] - 1.0) < MEDIAN_MS, found)
-    assert [frame.marker for frame in run.frames] == [marker_light(frame.frame, "toggle") for frame in run.frames]
+    assert [frame.marker for frame in run.frames] == [
+        marker_light(frame.frame, "toggle") for frame in run.frames
+    ]
     assert run.process and run.process[0].resident_bytes > 1e6
 
 
@@ -138,12 +176,20 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
     ledger = tmp_path / "run.mcap"
     log = tmp_path / "log.csv"
     log.write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n0.1,{ATTITUDE}\n")
-    run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger)
+    run_hilstar_here(
+        "replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger
+    )
     assert_refused(run_hilstar_here("latency", ledger, "--edges", edges), 2, "photodiode_px")
     assert_refused(run_hilstar_here("latency", ledger), 2, "--edges", "--diode")
     assert_refused(run_hilstar_here("latency", edges, "--edges", edges), 2, "edges.csv")
     assert_refused(run_hilstar_here("latency", ledger, "--edges", log), 2, "host_ns")
-    assert_refused(run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"), 3, "/dev/nothing")
+    assert_refused(
+        run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"),
+        3,
+        "/dev/nothing",
+    )
     assert_refused(run_hilstar_here("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
     assert_refused(run_hilstar_here("report", log, "-o", tmp_path / "r"), 2, "log.csv")
-    assert_refused(run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap")
+    assert_refused(
+        run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap"
+    )

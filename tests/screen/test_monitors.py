@@ -42,8 +42,23 @@ def bench(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
 def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Popen]:
     """A run on the screen, its ledger growing."""
     ledger = path.parent / "run.mcap"
-    command = ["replay", str(path), str(path.parent / "still.csv"), "--force", "--json", "--ledger", str(ledger), *options]
-    with Started([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env) as process:
+    command = [
+        "replay",
+        str(path),
+        str(path.parent / "still.csv"),
+        "--force",
+        "--json",
+        "--ledger",
+        str(ledger),
+        *options,
+    ]
+    with Started(
+        [*HILSTAR, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=server.env,
+    ) as process:
         try:
             wait_for(lambda: frames(path) > 10 or process.poll() is not None)
             yield process
@@ -61,7 +76,9 @@ def frames(path: Path) -> int:
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal(server, tmp_path, how):
+def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal(
+    server, tmp_path, how
+):
     server.xrandr("--output", "DUMMY0", "--gamma", OTHER_GAMMA)
     before = server.gamma("DUMMY0")
     assert before != (1.0, 1.0, 1.0)
@@ -79,21 +96,31 @@ def test_swaps_that_do_not_wait_for_a_known_refresh_are_refused(server, tmp_path
     path = bench(tmp_path)
     result = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
     assert result.returncode == 3, result.stderr
-    assert "vertical sync" in result.stderr and "--force" in result.stderr and "Traceback" not in result.stderr
+    assert (
+        "vertical sync" in result.stderr
+        and "--force" in result.stderr
+        and "Traceback" not in result.stderr
+    )
 
 
 def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
     server.xrandr("--output", "DUMMY1", "--mode", "800x600", "--right-of", "DUMMY0")
     try:
         listed = run_hilstar("doctor", "--json", env=server.env)
-        detail = next(c["detail"] for c in json.loads(listed.stdout)["checks"] if c["name"] == "display")
+        detail = next(
+            c["detail"] for c in json.loads(listed.stdout)["checks"] if c["name"] == "display"
+        )
         assert "DUMMY0, 640 x 480, 60 Hz" in detail and "DUMMY1, 800 x 600" in detail
         path = bench(tmp_path, 'display = "dummy1"')
-        path.write_text(path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [800, 600]"))
+        path.write_text(
+            path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [800, 600]")
+        )
         with showing(server, path):
             pass
         assert frames(path) > 10
-        warned = run_hilstar("replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env)
+        warned = run_hilstar(
+            "replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env
+        )
         assert "other displays, DUMMY0" in warned.stderr and "X screen of its own" in warned.stderr
         wrong = bench(tmp_path, 'display = "DUMMY1"')
         result = run_hilstar("replay", wrong, tmp_path / "still.csv", env=server.env)
@@ -104,7 +131,9 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
 
 
 @pytest.mark.parametrize(("wanted_hz", "shown_hz"), [(60, 59.94), (120, 119.88), (75, 59.94)])
-def test_a_display_keeps_its_refresh_or_takes_the_bench_s_where_it_has_it(server, tmp_path, wanted_hz, shown_hz):
+def test_a_display_keeps_its_refresh_or_takes_the_bench_s_where_it_has_it(
+    server, tmp_path, wanted_hz, shown_hz
+):
     """Left to itself GLFW opens a window at the highest refresh that a display has."""
     assert server.refresh_hz("DUMMY0") == 59.94
     path = bench(tmp_path)
@@ -123,7 +152,9 @@ def test_a_session_of_wayland_alone_is_refused_in_a_plain_line(server, tmp_path)
 
 def test_x11_is_used_where_the_session_says_wayland(server, tmp_path):
     env = server.env | {"XDG_SESSION_TYPE": "wayland", "WAYLAND_DISPLAY": "wayland-0"}
-    result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", "--force", "--stop", "0.3", env=env)
+    result = run_hilstar(
+        "replay", bench(tmp_path), tmp_path / "still.csv", "--force", "--stop", "0.3", env=env
+    )
     assert result.returncode == 0, result.stderr
 
 
@@ -166,7 +197,9 @@ def test_a_compositing_manager_is_refused(server, tmp_path):
     x11 = ctypes.CDLL("libX11.so.6")
     x11.XOpenDisplay.restype = ctypes.c_void_p
     x11.XOpenDisplay.argtypes = [ctypes.c_char_p]
-    x11.XInternAtom.restype = x11.XDefaultRootWindow.restype = x11.XCreateSimpleWindow.restype = ctypes.c_ulong
+    x11.XInternAtom.restype = x11.XDefaultRootWindow.restype = x11.XCreateSimpleWindow.restype = (
+        ctypes.c_ulong
+    )
     x11.XInternAtom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
     x11.XDefaultRootWindow.argtypes = [ctypes.c_void_p]
     x11.XCreateSimpleWindow.argtypes = [
@@ -176,11 +209,21 @@ def test_a_compositing_manager_is_refused(server, tmp_path):
         *[ctypes.c_uint] * 3,
         *[ctypes.c_ulong] * 2,
     ]
-    x11.XSetSelectionOwner.argtypes = [ctypes.c_void_p, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong]
-    x11.XSync.argtypes, x11.XCloseDisplay.argtypes = [ctypes.c_void_p, ctypes.c_int], [ctypes.c_void_p]
+    x11.XSetSelectionOwner.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_ulong,
+        ctypes.c_ulong,
+        ctypes.c_ulong,
+    ]
+    x11.XSync.argtypes, x11.XCloseDisplay.argtypes = (
+        [ctypes.c_void_p, ctypes.c_int],
+        [ctypes.c_void_p],
+    )
     client = x11.XOpenDisplay(server.display.encode())
     try:
-        window = x11.XCreateSimpleWindow(client, x11.XDefaultRootWindow(client), 0, 0, 1, 1, 0, 0, 0)
+        window = x11.XCreateSimpleWindow(
+            client, x11.XDefaultRootWindow(client), 0, 0, 1, 1, 0, 0, 0
+        )
         x11.XSetSelectionOwner(client, x11.XInternAtom(client, b"_NET_WM_CM_S0", 0), window, 0)
         x11.XSync(client, 0)
         result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=server.env)

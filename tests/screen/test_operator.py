@@ -17,7 +17,12 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.attitude.wire.protocol import HEALTH_BLANK, HEALTH_HIDDEN, HEALTH_NO_ATTITUDE, HEALTH_OPERATOR_OVERRIDE
+from hilstar.attitude.wire.protocol import (
+    HEALTH_BLANK,
+    HEALTH_HIDDEN,
+    HEALTH_NO_ATTITUDE,
+    HEALTH_OPERATOR_OVERRIDE,
+)
 from hilstar.server.record.ledger_records import EventRecord, FrameRecord, frame_records
 from tests.support.benches import ORION_Q, SCREEN_BENCH
 from tests.support.forks import HILSTAR, Started
@@ -38,23 +43,37 @@ def last_frame(ledger: Path) -> FrameRecord | None:
 
 
 @contextmanager
-def shown_with_ledger(screen: Screen, bench_file: Path, *options: str) -> Iterator[tuple[Shown, Client, Path]]:
+def shown_with_ledger(
+    screen: Screen, bench_file: Path, *options: str
+) -> Iterator[tuple[Shown, Client, Path]]:
     ledger = bench_file.parent / "run.mcap"
-    with Shown(screen, bench_file, "--ledger", str(ledger), *options) as shown, client(screen.display) as user:
+    with (
+        Shown(screen, bench_file, "--ledger", str(ledger), *options) as shown,
+        client(screen.display) as user,
+    ):
         wait_for(lambda: last_frame(ledger) is not None)
         yield shown, user, ledger
 
 
 def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(screen, bench_file):
     """Keys, what the frames then say, and whether they have an attitude."""
-    steps = [("b", "blank", False), ("g", "blank, grid", False), ("b", "grid", True), ("g", "", True), ("c", "crosshair", True)]
+    steps = [
+        ("b", "blank", False),
+        ("g", "blank, grid", False),
+        ("b", "grid", True),
+        ("g", "", True),
+        ("c", "crosshair", True),
+    ]
     steps += [("t", "crosshair, patch 0%", False), ("b", "blank, crosshair, patch 0%", False)]
     with shown_with_ledger(screen, bench_file) as (shown, user, ledger):
         for key, operator, has_sky in steps:
             user.press(key)
             wait_for(lambda operator=operator: last_frame(ledger).operator == operator)
             frame = last_frame(ledger)
-            assert (frame.q is not None, frame.age_ns is not None) == (has_sky, has_sky), (key, frame)
+            assert (frame.q is not None, frame.age_ns is not None) == (has_sky, has_sky), (
+                key,
+                frame,
+            )
             assert (frame.stars_drawn > 0) == has_sky
         summary = shown.stop()
     told = [event.detail for event in events(ledger) if event.kind == "operator"]
@@ -86,9 +105,24 @@ def test_a_paused_attitude_grows_old(screen, bench_file):
     ("hide", "show", "why", "options"),
     [
         (lambda user: user.unmap(), lambda user, made: user.map(), "not on the screen", []),
-        (lambda user: user.move(-200, 50), lambda user, made: user.move(0, 0), "moved off its display", []),
-        (lambda user: user.move(-200, 0), lambda user, made: user.move(0, 0), "off the screen", ["--windowed"]),
-        (lambda user: user.cover(100, 100), lambda user, made: user.uncover(made), "covered in part", []),
+        (
+            lambda user: user.move(-200, 50),
+            lambda user, made: user.move(0, 0),
+            "moved off its display",
+            [],
+        ),
+        (
+            lambda user: user.move(-200, 0),
+            lambda user, made: user.move(0, 0),
+            "off the screen",
+            ["--windowed"],
+        ),
+        (
+            lambda user: user.cover(100, 100),
+            lambda user, made: user.uncover(made),
+            "covered in part",
+            [],
+        ),
         (lambda user: user.cover(640, 480), lambda user, made: user.uncover(made), "covered", []),
     ],
 )
@@ -102,13 +136,19 @@ def test_a_window_that_is_not_seen_is_in_the_record(screen, bench_file, hide, sh
         wait_for(lambda: not last_frame(ledger).hidden)
         summary = shown.stop()
     assert summary["events"]["hidden"] == summary["events"]["visible"] == 1
-    assert summary["screen"]["hidden"]["frames"] == sum(bool(frame.hidden) for frame in frame_records(ledger)) > 0
+    assert (
+        summary["screen"]["hidden"]["frames"]
+        == sum(bool(frame.hidden) for frame in frame_records(ledger))
+        > 0
+    )
 
 
 def test_the_status_says_what_the_screen_shows(screen, tmp_path):
     """In lockstep, where each attitude gets its status."""
     port, bench = free_port(), tmp_path / "bench.toml"
-    bench.write_text(f'{SCREEN_BENCH}\n[attitude]\nlockstep = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
+    bench.write_text(
+        f'{SCREEN_BENCH}\n[attitude]\nlockstep = true\nendpoint = "tcp://127.0.0.1:{port}"\n'
+    )
     count = 0
 
     def status() -> tuple[int, int]:

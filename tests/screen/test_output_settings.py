@@ -88,7 +88,9 @@ def test_the_ramp_is_read_as_it_is_set_and_an_output_that_is_off_has_none(here):
 def test_nvidia_s_settings_are_asked_of_its_tool_where_its_driver_runs(here, monkeypatch, tmp_path):
     """A stand-in for nvidia-settings; no such driver was there."""
     tool = tmp_path / "nvidia-settings"
-    tool.write_text('#!/bin/sh\ncase "$3" in *CurrentDithering) echo 1;; *ColorRange) echo 0;; *) echo ERROR;; esac\n')
+    tool.write_text(
+        '#!/bin/sh\ncase "$3" in *CurrentDithering) echo 1;; *ColorRange) echo 0;; *) echo ERROR;; esac\n'
+    )
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     assert "nvidia-settings: CurrentDithering" not in dummy0().properties
@@ -110,16 +112,24 @@ def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(server):
 
 def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server, tmp_path):
     path, ledger = bench(tmp_path), tmp_path / "run.mcap"
-    with server.property("DUMMY0", "dithering mode", "auto"), server.property("DUMMY0", "TearFree", "on"):
+    with (
+        server.property("DUMMY0", "dithering mode", "auto"),
+        server.property("DUMMY0", "TearFree", "on"),
+    ):
         refused = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
-        assert refused.returncode == 3 and refused.stdout == "" and "Traceback" not in refused.stderr
+        assert (
+            refused.returncode == 3 and refused.stdout == "" and "Traceback" not in refused.stderr
+        )
         last = refused.stderr.splitlines()[-1]
         assert "dithering mode of DUMMY0 is auto" in last
         assert last.endswith('xrandr --output DUMMY0 --set "dithering mode" "off"; or add --force')
         options = ("--force", "--json", "--stop", "0.3", "--ledger", ledger)
         forced = run_hilstar("replay", path, tmp_path / "still.csv", *options, env=server.env)
     assert forced.returncode == 0, forced.stderr
-    assert "dithering mode of DUMMY0 is auto" in forced.stderr and "shown anyway (--force)" in forced.stderr
+    assert (
+        "dithering mode of DUMMY0 is auto" in forced.stderr
+        and "shown anyway (--force)" in forced.stderr
+    )
     assert "TearFree of DUMMY0 is on" in forced.stderr
     screen = json.loads(forced.stdout)["screen"]
     assert screen["output"]["properties"]["dithering mode"] == "auto"
@@ -146,12 +156,17 @@ def test_another_program_s_gamma_ramp_is_told_once_and_its_frames_are_counted(se
 
 def test_frames_that_the_server_copies_are_told_as_copied(here, tmp_path: Path):
     """A client presents a pixmap itself: llvmpipe does not, and this server cannot flip."""
-    x11, xcb, present = (ctypes.CDLL(name) for name in ("libX11.so.6", "libxcb.so.1", "libxcb-present.so.0"))
+    x11, xcb, present = (
+        ctypes.CDLL(name) for name in ("libX11.so.6", "libxcb.so.1", "libxcb-present.so.0")
+    )
     pointer, number, long = ctypes.c_void_p, ctypes.c_ulong, ctypes.c_uint32
     x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = pointer, [ctypes.c_char_p]
     for name, arguments in (
         ("XDefaultRootWindow", [pointer]),
-        ("XCreateSimpleWindow", [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2]),
+        (
+            "XCreateSimpleWindow",
+            [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2],
+        ),
         ("XCreatePixmap", [pointer, number, *[ctypes.c_uint] * 3]),
     ):
         function = getattr(x11, name)
@@ -161,7 +176,11 @@ def test_frames_that_the_server_copies_are_told_as_copied(here, tmp_path: Path):
         [pointer, ctypes.c_int],
         [pointer],
     )
-    xcb.xcb_connect.restype, xcb.xcb_flush.argtypes, xcb.xcb_disconnect.argtypes = pointer, [pointer], [pointer]
+    xcb.xcb_connect.restype, xcb.xcb_flush.argtypes, xcb.xcb_disconnect.argtypes = (
+        pointer,
+        [pointer],
+        [pointer],
+    )
     wide = ctypes.c_uint64
     present.xcb_present_pixmap.argtypes = [
         pointer, *[long] * 5, *[ctypes.c_int16] * 2, *[long] * 4, wide, wide, wide, long, pointer
@@ -176,7 +195,9 @@ def test_frames_that_the_server_copies_are_told_as_copied(here, tmp_path: Path):
     try:
         assert events.modes() == [] and presented_as({}) == "unknown"
         for serial in range(3):
-            present.xcb_present_pixmap(connection, window, pixmap, serial, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None)
+            present.xcb_present_pixmap(
+                connection, window, pixmap, serial, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None
+            )
         xcb.xcb_flush(connection)
         seen: list[str] = []
         wait_for(lambda: seen.extend(events.modes()) or "copy" in seen)

@@ -77,6 +77,11 @@ print("presented")
 
 def test_a_window_shows_what_numpy_presents(screen):
     ran = subprocess.run(
-        [sys.executable, "-c", RUN], capture_output=True, text=True, env=screen.env, timeout=PATIENCE_S, check=False
+        [sys.executable, "-c", RUN],
+        capture_output=True,
+        text=True,
+        env=screen.env,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert ran.stdout == "presented\n", ran.stderr

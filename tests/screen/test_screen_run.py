@@ -40,19 +40,43 @@ def run(tmp_path_factory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("run")
     text = resource_path("configs", "demo.toml").read_text()
     port = free_port()
-    text = text.replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}").replace("faintest_v_mag = 7.5", "faintest_v_mag = 8.0")
+    text = text.replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}").replace(
+        "faintest_v_mag = 7.5", "faintest_v_mag = 8.0"
+    )
     # frames in a row, on a busy machine too
     text = text.replace('quantisation = "exact"', 'quantisation = "round"')
     assert '"round"' in text
     bench, ledger = folder / "bench.toml", folder / "run.mcap"
     bench.write_text(text)
-    serve = [*HILSTAR, "serve", str(bench), "--json", "--duration", str(DURATION_S), "--ledger", str(ledger)]
-    to = ["--to", f"tcp://127.0.0.1:{port}", "--connect", "--duration", str(DURATION_S + PATIENCE_S)]
+    serve = [
+        *HILSTAR,
+        "serve",
+        str(bench),
+        "--json",
+        "--duration",
+        str(DURATION_S),
+        "--ledger",
+        str(ledger),
+    ]
+    to = [
+        "--to",
+        f"tcp://127.0.0.1:{port}",
+        "--connect",
+        "--duration",
+        str(DURATION_S + PATIENCE_S),
+    ]
     send = [*HILSTAR, "send", "--spin", f"x,{RATE_DEG_S}", "--rate", str(PACKET_HZ), *to]
     with xvfb(folder, "1920x1080x24") as screen, Started(send, stderr=subprocess.DEVNULL) as sender:
         try:
             patience_s = DURATION_S + 2 * PATIENCE_S
-            done = subprocess.run(serve, env=screen.env, capture_output=True, text=True, timeout=patience_s, check=False)
+            done = subprocess.run(
+                serve,
+                env=screen.env,
+                capture_output=True,
+                text=True,
+                timeout=patience_s,
+                check=False,
+            )
         finally:
             sender.terminate()
     assert done.returncode == 0, done.stderr
@@ -64,7 +88,11 @@ def test_every_refresh_period_is_a_frame_or_missed(run):
     assert summary["frames"] + summary["missed_frames"] == DURATION_S * REFRESH_HZ
     frames = read_run(ledger).frames
     assert len(frames) == summary["frames"]
-    assert sum(frame.missed_before for frame in frames) == frames[-1].missed <= summary["missed_frames"]
+    assert (
+        sum(frame.missed_before for frame in frames)
+        == frames[-1].missed
+        <= summary["missed_frames"]
+    )
     assert summary["stars_drawn"]["max"] > 200
     assert summary["packets"]["refused"] == 0
 
@@ -105,7 +133,9 @@ def test_the_report_says_it_on_one_page(run, tmp_path):
     result = run_hilstar("report", ledger, "-o", tmp_path / "report", "--json")
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
-    assert found["frames"] == summary["frames"] and found["missed_frames"] <= summary["missed_frames"]
+    assert (
+        found["frames"] == summary["frames"] and found["missed_frames"] <= summary["missed_frames"]
+    )
     # None without a row
     assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"])
     for key in ("attitude_age_ms", "packet_to_swap_ms", "swap_late_ms"):
@@ -115,7 +145,9 @@ def test_the_report_says_it_on_one_page(run, tmp_path):
     assert len(found["bench_sha256"]) == len(found["calibration_sha256"]) == 64
     page = (tmp_path / "report" / "report.html").read_text()
     data = run_data_of(page)
-    assert [len(data["spans"][name][0]) for name in ("interval", "late", "age")] == 3 * [len(data["spans"]["t_s"])]
+    assert [len(data["spans"][name][0]) for name in ("interval", "late", "age")] == 3 * [
+        len(data["spans"]["t_s"])
+    ]
     assert sum(data["spans"]["missed"]) == found["missed_frames"]
     # The pictures are the codes that the run showed: replay draws them again from the same ledger.
     assert len(data["pictures"]) > 8 and not list((tmp_path / "report").glob("*.png"))
@@ -130,12 +162,31 @@ def test_paths_are_drawn_again_from_the_ledger(run, tmp_path):
     still = bench.parent / "still.toml"
     still.write_text(bench.read_text() + "motion_above_px = 1e6\n")
     frames = read_run(ledger).frames
-    at_s = (next(frame for frame in frames[len(frames) // 2 :] if frame.rate).swap_ns - frames[0].swap_ns) / 1e9
-    options = ["--headless", "--speed", "max", "--start", f"{at_s - 1e-6}", "--stop", f"{at_s + 1e-6}"]
+    at_s = (
+        next(frame for frame in frames[len(frames) // 2 :] if frame.rate).swap_ns
+        - frames[0].swap_ns
+    ) / 1e9
+    options = [
+        "--headless",
+        "--speed",
+        "max",
+        "--start",
+        f"{at_s - 1e-6}",
+        "--stop",
+        f"{at_s + 1e-6}",
+    ]
     for path in (bench, still):
-        assert run_hilstar_here("replay", path, ledger, *options, "-o", tmp_path / path.stem).returncode == 0
+        assert (
+            run_hilstar_here(
+                "replay", path, ledger, *options, "-o", tmp_path / path.stem
+            ).returncode
+            == 0
+        )
     name = sorted(path.name for path in (tmp_path / "bench").glob("*.png"))[0]
-    assert (np.array(Image.open(tmp_path / "still" / name)) != np.array(Image.open(tmp_path / "bench" / name))).any()
+    assert (
+        np.array(Image.open(tmp_path / "still" / name))
+        != np.array(Image.open(tmp_path / "bench" / name))
+    ).any()
 
 
 def test_the_frame_path_makes_no_cycles_for_the_collector():
@@ -160,5 +211,11 @@ with load(resource_path("configs", "demo.toml")) as bench:
         loop.draw(number, 0, turning)
     print(gc.collect())
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
     assert int(result.stdout) == 0

@@ -54,7 +54,9 @@ MIN_SHARE = 0.2  # of the milliseconds waited: a machine whose cores are busy gi
 
 def test_another_thread_advances_while_a_frame_is_waited_for(screen):
     command = [sys.executable, "-c", FRAME]
-    ran = subprocess.run(command, capture_output=True, text=True, env=screen.env, timeout=PATIENCE_S, check=False)
+    ran = subprocess.run(
+        command, capture_output=True, text=True, env=screen.env, timeout=PATIENCE_S, check=False
+    )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
     counted, waited_s = found.pop("finish")  # moderngl's own keeps the lock

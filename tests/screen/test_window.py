@@ -63,7 +63,9 @@ def test_bit_stealing_reaches_the_screen(screen, bench_file):
         assert (shown.wait_for(codes) == codes).all()
 
 
-def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(screen, bench_file, tmp_path):
+def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
+    screen, bench_file, tmp_path
+):
     folder = tmp_path
     rate = np.array([0.01, 0.02, 0.0])
     q = np.array([float(part) for part in ATTITUDE.split(",")])
@@ -71,9 +73,20 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(scree
     lines = [f"{k * 0.1},{','.join(repr(float(v)) for v in row)}" for k, row in enumerate(rows)]
     (folder / "turn.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]))
     ledger = folder / "run.mcap"
-    shown = run_hilstar("replay", bench_file, folder / "turn.csv", "-o", folder / "shown", "--ledger", ledger, env=screen.env)
+    shown = run_hilstar(
+        "replay",
+        bench_file,
+        folder / "turn.csv",
+        "-o",
+        folder / "shown",
+        "--ledger",
+        ledger,
+        env=screen.env,
+    )
     assert shown.returncode == 0, shown.stderr
-    again = run_hilstar("replay", bench_file, ledger, "--headless", "--speed", "max", "-o", folder / "again")
+    again = run_hilstar(
+        "replay", bench_file, ledger, "--headless", "--speed", "max", "-o", folder / "again"
+    )
     assert again.returncode == 0, again.stderr
     frames = list(frame_records(ledger))
     assert all(frame.rate is not None for frame in frames)
@@ -110,7 +123,10 @@ def test_keys_show_the_grid_the_crosshair_a_patch_and_nothing_and_end_the_run(sc
 def test_the_window_s_close_button_ends_the_run_in_order(screen, bench_file):
     codes = codes_of(bench_file)
     ledger = bench_file.parent / "run.mcap"
-    with Shown(screen, bench_file, "--ledger", str(ledger)) as shown, client(screen.display) as user:
+    with (
+        Shown(screen, bench_file, "--ledger", str(ledger)) as shown,
+        client(screen.display) as user,
+    ):
         shown.wait_for(codes)
         user.close_window()
         summary = shown.ended()
@@ -118,7 +134,9 @@ def test_the_window_s_close_button_ends_the_run_in_order(screen, bench_file):
     assert len(list(frame_records(ledger))) == summary["frames"]
 
 
-def refused(screen: Screen, bench_file: Path, *options: str, display: str | None = None) -> tuple[int, str]:
+def refused(
+    screen: Screen, bench_file: Path, *options: str, display: str | None = None
+) -> tuple[int, str]:
     env = screen.env if display is None else screen.env | {"DISPLAY": display}
     result = run_hilstar("replay", bench_file, bench_file.parent / "still.csv", *options, env=env)
     assert "Traceback" not in result.stderr
@@ -142,7 +160,9 @@ def test_the_gate_refuses_8_bits_where_10_are_asked_for(screen, bench_file):
     assert "8 bits" in said and "10" in said
 
 
-def test_without_a_refresh_of_its_own_the_display_is_paced_by_software_and_that_is_said(screen, bench_file):
+def test_without_a_refresh_of_its_own_the_display_is_paced_by_software_and_that_is_said(
+    screen, bench_file
+):
     code, said = refused(screen, bench_file, "--stop", "0.3")
     assert code == 0
     assert "paced by software" in said
@@ -161,9 +181,22 @@ def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
 
 def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
     """Two levels: black and white; the square of the first white one stays 5 s."""
-    command = ["calibrate", "plan", "-o", str(tmp_path / "plan.csv"), "--levels", "2", "--repeats", "1", "--show"]
+    command = [
+        "calibrate",
+        "plan",
+        "-o",
+        str(tmp_path / "plan.csv"),
+        "--levels",
+        "2",
+        "--repeats",
+        "1",
+        "--show",
+    ]
     with Started(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "1"], stderr=subprocess.PIPE, text=True, env=screen.env
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=screen.env,
     ) as process:
         seen = set()
         end = time.monotonic() + PATIENCE_S
@@ -178,9 +211,23 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
 
 def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, tmp_path):
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
-    command = ["calibrate", "dots", str(bench_file), "-o", str(tmp_path / "plan"), "--frames", "8", "--dots", "10", "--show"]
+    command = [
+        "calibrate",
+        "dots",
+        str(bench_file),
+        "-o",
+        str(tmp_path / "plan"),
+        "--frames",
+        "8",
+        "--dots",
+        "10",
+        "--show",
+    ]
     with Started(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"], stderr=subprocess.PIPE, text=True, env=screen.env
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=screen.env,
     ) as process:
         wanted = None
         seen = False
@@ -188,7 +235,10 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, 
         while process.poll() is None and time.monotonic() < end:
             last = tmp_path / "plan" / "frame_007.png"
             if wanted is None and last.exists():
-                wanted = [np.asarray(Image.open(tmp_path / "plan" / f"frame_{k:03}.png"))[:, ::-1] for k in range(8)]
+                wanted = [
+                    np.asarray(Image.open(tmp_path / "plan" / f"frame_{k:03}.png"))[:, ::-1]
+                    for k in range(8)
+                ]
             if wanted is not None:
                 pixels = screen.pixels()[..., 0]
                 seen |= any((pixels == image).all() for image in wanted)
@@ -202,7 +252,14 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, 
 @pytest.mark.parametrize(
     ("depth", "bits", "words"),
     [
-        (24, 10, ("8 bits per colour and the bench file says 10", "codes are not drawn as they are, (1, 1, 1) as (0, 0, 0)")),
+        (
+            24,
+            10,
+            (
+                "8 bits per colour and the bench file says 10",
+                "codes are not drawn as they are, (1, 1, 1) as (0, 0, 0)",
+            ),
+        ),
         (16, 8, ("the X screen has 5 bits per colour and the window 8, so that X converts",)),
         (30, 8, ("the X screen has 10 bits per colour and the window 8, so that X converts",)),
         (30, 10, ("gamma ramp has 256 steps, too few for 10 bits",)),

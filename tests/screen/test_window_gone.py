@@ -35,7 +35,10 @@ def xkill(screen: Screen) -> None:
         user.kill_client()
 
 
-@pytest.mark.parametrize(("how", "said"), [(kill_server, "X server"), (destroy_window, "another program"), (xkill, "closed")])
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [(kill_server, "X server"), (destroy_window, "another program"), (xkill, "closed")],
+)
 def test_a_window_that_goes_away_ends_the_run_in_order(tmp_path, how, said):
     with xvfb(tmp_path) as screen:
         out, err, code = ended_by(screen, tmp_path, lambda: how(screen))
@@ -55,7 +58,9 @@ def ended_by(screen: Screen, folder: Path, end: Callable[[], None]) -> tuple[str
     bench.write_text(SCREEN_BENCH)
     still_log(log)
     command = [*HILSTAR, "replay", str(bench), str(log), "--json", "--ledger", str(ledger)]
-    with Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process:
+    with Started(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env
+    ) as process:
         try:
             wait_for(lambda: process.poll() is not None or len(recorded(ledger)) > 20)
             end()

@@ -26,13 +26,17 @@ TIMERS = {"in_turn", "medians_ms", "measured", "spent", "perf_counter", "perf_co
 # `chain` is run by a way of its own, whose times tests/study/test_study_chain.py plants.
 CHAIN = "chain"
 TIME_LABEL = re.compile(r"\btime\b.*\[(ms|us|s)\]|\(\d+ us\)|, time$", re.IGNORECASE | re.DOTALL)
-TIMES_IN_TITLE = re.compile(r"\d m?s\b(?! of latency)|\d us\b|times as (fast|long|SLOW)|of its time")
+TIMES_IN_TITLE = re.compile(
+    r"\d m?s\b(?! of latency)|\d us\b|times as (fast|long|SLOW)|of its time"
+)
 WINNERS = re.compile(r"times as (fast|long|SLOW)|less time")
 
 
 def called_names(path: Path) -> set[str]:
     """The names that a module calls, with or without the module they are of."""
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    calls = [
+        node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+    ]
     return {getattr(call, "attr", getattr(call, "id", "")) for call in calls}
 
 
@@ -46,7 +50,9 @@ def files_of(study: str) -> list[Path]:
 
 
 def test_every_study_that_takes_times_is_known_as_one():
-    timing = {study for study in STUDIES if any(TIMERS & called_names(path) for path in files_of(study))}
+    timing = {
+        study for study in STUDIES if any(TIMERS & called_names(path) for path in files_of(study))
+    }
     assert timing == study_command.TIMED | {CHAIN}
 
 
@@ -88,13 +94,17 @@ def words_of(figure) -> list[str]:
 
 @pytest.mark.study
 @pytest.mark.parametrize("study", sorted(study_command.TIMED))
-def test_a_study_of_times_declines_on_a_busy_machine(study, tmp_path, monkeypatch, fewest_rounds, drawn):
+def test_a_study_of_times_declines_on_a_busy_machine(
+    study, tmp_path, monkeypatch, fewest_rounds, drawn
+):
     monkeypatch.setattr(OtherWork, "load", lambda self: BUSY)
     lines, right = study_command.study_lines(study, tmp_path, quick=True)
     assert right is None
     assert lines[-1] == BUSY.caution
     assert not [line for line in lines if WINNERS.search(line)]
-    timed = [figure for figure in drawn if any(TIME_LABEL.search(words) for words in words_of(figure))]
+    timed = [
+        figure for figure in drawn if any(TIME_LABEL.search(words) for words in words_of(figure))
+    ]
     assert timed, "no chart of times was seen"
     for figure in timed:
         title = " ".join(figure.get_suptitle().split())
@@ -112,5 +122,7 @@ def test_an_idle_machine_names_its_winners():
 
 def test_a_study_of_times_says_what_it_found_through_load():
     for study in study_command.TIMED:
-        run = import_module(f"hilstar.instruments.study.{study}{'.run' if study in study_command.ROOMS else ''}").run
+        run = import_module(
+            f"hilstar.instruments.study.{study}{'.run' if study in study_command.ROOMS else ''}"
+        ).run
         assert run.__annotations__["return"] in ("Judged", sweep.Judged)

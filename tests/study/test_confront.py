@@ -15,13 +15,19 @@ from tests.support.planted_sky import SKY, Planted, photograph, write_bench
 pytestmark = pytest.mark.study
 
 
-def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photograph(tmp_path: Path) -> None:
+def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photograph(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "set" / "planted"
     folder.mkdir(parents=True)
     write_bench(folder / "guess.toml")
-    Image.fromarray(photograph(Planted(), SKY.pointings[2], np.random.default_rng(5))).save(folder / "a.png")
+    Image.fromarray(photograph(Planted(), SKY.pointings[2], np.random.default_rng(5))).save(
+        folder / "a.png"
+    )
     (folder / "b.png").write_text("no image")
-    done = run_hilstar_here("study", "confront", "--images", tmp_path / "set", "-o", tmp_path / "out", "--quick")
+    done = run_hilstar_here(
+        "study", "confront", "--images", tmp_path / "set", "-o", tmp_path / "out", "--quick"
+    )
     assert done.returncode == 0, done.stderr
     with (tmp_path / "out" / "confront.csv").open(newline="") as file:
         rows = {row["image"]: row for row in csv.DictReader(file)}
@@ -37,7 +43,9 @@ def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photogra
     ("words", "said"),
     [(("confront",), "add --images DIR"), (("models", "--images", "."), "leave out --images")],
 )
-def test_photographs_belong_to_their_study(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+def test_photographs_belong_to_their_study(
+    tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
     done = run_hilstar_here("study", *words, "-o", tmp_path)
     assert (done.returncode, said in done.stderr) == (2, True)
 

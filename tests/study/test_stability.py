@@ -54,17 +54,29 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
     assert printed["right"] is True and len(printed["findings"]) == len(measured) == CASES
     rows = table(folder / "stability.csv")
     assert [row["case"] for row in rows] == [case.case for case in measured]
-    assert {case.case for name in ("catalogue_and_geometry", "detector_and_attitude") for case in recorded(name)} < {
-        row["case"] for row in rows
-    }
+    assert {
+        case.case
+        for name in ("catalogue_and_geometry", "detector_and_attitude")
+        for case in recorded(name)
+    } < {row["case"] for row in rows}
     for row in rows:
-        assert row["verdict"] == "right" and row["failing method"] and row["its failure"] and row["why"]
+        assert (
+            row["verdict"] == "right"
+            and row["failing method"]
+            and row["its failure"]
+            and row["why"]
+        )
         assert float(row["error"]) <= float(row["tolerance"])
         assert not float(row["its error"]) <= float(row["tolerance"])
-    peaks = {float(row["sigma_px"]): float(row["sampled_peak_error"]) for row in table(folder / "narrow_stars.csv")}
+    peaks = {
+        float(row["sigma_px"]): float(row["sampled_peak_error"])
+        for row in table(folder / "narrow_stars.csv")
+    }
     # a Gaussian's middle is over the mean of its pixel
     assert all(peak > 0.02 for peak in peaks.values())
-    assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(0.12, abs=0.02)
+    assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(
+        0.12, abs=0.02
+    )
     for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
         assert_drawn(folder / f"{stem}.png")
         assert len(table(folder / f"{stem}.csv")) > 25
@@ -103,7 +115,9 @@ WRONG_ROADS = (
 )
 
 
-@pytest.mark.parametrize(("visit", "name", "method"), WRONG_ROADS, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("visit", "name", "method"), WRONG_ROADS, ids=lambda value: getattr(value, "__name__", "")
+)
 def test_a_verdict_is_wrong_where_hilstar_goes_the_failing_way(visit, name, method, monkeypatch):
     monkeypatch.setitem(visit.__globals__, name, method)
     place = visit()
@@ -120,6 +134,7 @@ def test_the_chart_of_popping_shows_what_its_title_says(study):
     rows = table(study[0] / "popping.csv")
     assert len(rows) == image.STEPS
     spread = {
-        name: np.ptp([float(row[f"{name} [mag]"]) for row in rows]) for name in ("linear image", "codes, exact", "codes, round")
+        name: np.ptp([float(row[f"{name} [mag]"]) for row in rows])
+        for name in ("linear image", "codes, exact", "codes, round")
     }
     assert spread["linear image"] <= image.RIPPLE < spread["codes, exact"] < spread["codes, round"]

@@ -32,7 +32,9 @@ def test_each_scene_is_timed_against_the_same_frame_without_bodies(study):
     assert shown["Earth fills the field"] == ["Earth"]
     assert not any("not in view" in name or "none in view" in name for name in shown)
     for row in rows.values():
-        assert float(row["cost_ms"]) == pytest.approx(float(row["frame_ms"]) - float(row["without_ms"]))
+        assert float(row["cost_ms"]) == pytest.approx(
+            float(row["frame_ms"]) - float(row["without_ms"])
+        )
 
 
 def test_discs_are_within_a_percent_and_a_tenth_of_a_pixel_and_a_point_is_not(study):

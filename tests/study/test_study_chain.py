@@ -19,7 +19,13 @@ from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
-from hilstar.instruments.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
+from hilstar.instruments.study.chain.choices import (
+    ChainScene,
+    Combination,
+    Parts,
+    five_scenes,
+    lead_ns,
+)
 from hilstar.instruments.study.chain.glass import draw_glass, glass_rows
 from hilstar.instruments.study.chain.measuring import Rounds, SceneMeasurement, error_budget
 from hilstar.instruments.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
@@ -94,7 +100,9 @@ def study(tmp_path_factory):
         patch.setattr(measuring, "MIN_ROUNDS", 2)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
         patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
-        result = run_hilstar_here("study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json")
+        result = run_hilstar_here(
+            "study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json"
+        )
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout), folder / "out"
 
@@ -106,7 +114,9 @@ def test_the_front_is_what_anyone_finds_in_the_table(study):
         for error, column in (("error_arcsec", "on_front"), ("error_mag", "on_front_mag")):
             spots = [(float(row["time_ms"]), float(row[error])) for row in own]
             for spot, row in zip(spots, own, strict=True):
-                beaten = any(other != spot and other[0] <= spot[0] and other[1] <= spot[1] for other in spots)
+                beaten = any(
+                    other != spot and other[0] <= spot[0] and other[1] <= spot[1] for other in spots
+                )
                 assert row[column] == ("false" if beaten else "true")
         assert 1 <= sum(row["on_front"] == "true" for row in own) < len(own)
 
@@ -124,7 +134,11 @@ def test_auto_and_default_are_each_one_point_of_each_scene(study):
         (line,) = (line for line in told["findings"] if line.startswith(f"{name}: auto"))
         assert "on the front" in line or NOT_JUDGED in line
     assert {row["quantisation"] for row in rows} == {"round", "dither", "temporal", "exact"}
-    assert {row["prediction"] for row in rows if row["scene"] == "1 deg/s"} == {"rate", "two samples", "held"}
+    assert {row["prediction"] for row in rows if row["scene"] == "1 deg/s"} == {
+        "rate",
+        "two samples",
+        "held",
+    }
     assert {row["bit_stealing"] for row in rows} == {"true", "false"}
     for name in ("chain", "chain_budget"):
         assert_drawn(out / f"{name}.png")
@@ -137,15 +151,41 @@ def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
     monkeypatch.setattr(chain_glass, "QUICK_TIME_S", 0.1)
     write_glass(tmp_path / "psf.fits", glass_of(stack(3)))
     tracker = "[tracker]\nfocal_length_mm = 12\nresolution_px = [256, 256]"
-    text = re.sub(r"focal_length_mm = 70\n|resolution_px = \[320, 320\]\n", "", SMALL).replace("[tracker]", tracker, 1)
-    file = small_file(tmp_path, text.replace("[sky]", '[tracker.optics]\npsf = "psf.fits"\n[sky]').replace("= 9", "= 6"))
+    text = re.sub(r"focal_length_mm = 70\n|resolution_px = \[320, 320\]\n", "", SMALL).replace(
+        "[tracker]", tracker, 1
+    )
+    file = small_file(
+        tmp_path,
+        text.replace("[sky]", '[tracker.optics]\npsf = "psf.fits"\n[sky]').replace("= 9", "= 6"),
+    )
     rows = glass_rows(file, ChainScene("Orion", "", np.array(ORION_Q)), quick=True)
-    names = ["a Gaussian", "one PSF for all stars", "Gaussians by field", "a basis of 3", "a basis of 6", "a basis of 12"]
+    names = [
+        "a Gaussian",
+        "one PSF for all stars",
+        "Gaussians by field",
+        "a basis of 3",
+        "a basis of 6",
+        "a basis of 12",
+    ]
     assert [row.psf for row in rows] == [*names, "each star by its place and spectrum"]
     gaussian, *_, third, sixth, twelfth, whole = rows
-    assert gaussian.error_arcsec > third.error_arcsec > sixth.error_arcsec > twelfth.error_arcsec > whole.error_arcsec > 0
-    assert whole.error_arcsec < 1e-3 * 13e-3 / 12 * ARCSEC_PER_RAD and whole.error_percent < 0.02 < gaussian.error_percent
-    assert [row.chosen for row in rows].count("auto") == 1 and gaussian.stars > 10 and all(row.time_ms > 0 for row in rows)
+    assert (
+        gaussian.error_arcsec
+        > third.error_arcsec
+        > sixth.error_arcsec
+        > twelfth.error_arcsec
+        > whole.error_arcsec
+        > 0
+    )
+    assert (
+        whole.error_arcsec < 1e-3 * 13e-3 / 12 * ARCSEC_PER_RAD
+        and whole.error_percent < 0.02 < gaussian.error_percent
+    )
+    assert (
+        [row.chosen for row in rows].count("auto") == 1
+        and gaussian.stars > 10
+        and all(row.time_ms > 0 for row in rows)
+    )
     assert [row.on_front == "true" for row in rows] == front(rows, "error_arcsec")
     with charts.panels_of("A finding", 2, share_x=False) as (place, light):
         draw_glass(place, light, rows)
@@ -162,13 +202,22 @@ def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
             by_step = {part["step"]: float(part[error]) for part in parts if part["scene"] == scene}
             whole, rss = by_step.pop("whole"), by_step.pop("rss")
             assert whole == pytest.approx(float(auto[error]), rel=ROUNDED)
-            assert rss == pytest.approx(math.sqrt(sum(value**2 for value in by_step.values())), rel=ROUNDED)
+            assert rss == pytest.approx(
+                math.sqrt(sum(value**2 for value in by_step.values())), rel=ROUNDED
+            )
             assert rss == pytest.approx(whole, rel=RSS_SHARE)
         assert by_step["codes"] > 0
-    turning = {part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"}
+    turning = {
+        part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"
+    }
     assert turning["prediction"] > 0 and turning["refresh"] > 0
     stages = table(study[1] / "chain_time.csv")
-    assert {stage["stage"] for stage in stages} == {"prediction", "sprites", "drawing and codes", "read-back"}
+    assert {stage["stage"] for stage in stages} == {
+        "prediction",
+        "sprites",
+        "drawing and codes",
+        "read-back",
+    }
 
 
 def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
@@ -176,7 +225,11 @@ def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
     for number, limit_px in ((1, FLOOR_PX), (3, PATH_FLOOR_PX)):
         (judge,) = scene_of(parts, number).judges
         true = judge.true[judge.judged]
-        off_px = np.linalg.norm(judge.sky.directions - true, axis=1) * ARCSEC_PER_RAD / parts[1].arcsec_per_px
+        off_px = (
+            np.linalg.norm(judge.sky.directions - true, axis=1)
+            * ARCSEC_PER_RAD
+            / parts[1].arcsec_per_px
+        )
         assert len(judge) > 10
         assert np.median(off_px) < limit_px
 
@@ -189,9 +242,13 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     ages_ns = [light - (light - lead) // sample_ns * sample_ns for light in judge.seen.light_ns]
     age_s = np.average(ages_ns, weights=judge.seen.weights.mean(axis=(1, 2))) / NS_PER_S
     true = judge.true[judge.judged]
-    row_s = bench.scan.late_s(*bench.camera.project(true @ bench.camera.cam_to_image.T), bench.camera.resolution_px)
+    row_s = bench.scan.late_s(
+        *bench.camera.project(true @ bench.camera.cam_to_image.T), bench.camera.resolution_px
+    )
     late_s = age_s + row_s + bench.scan.hold_s / 2
-    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, predictors.AXIS), axis=1)) ** 2))
+    expected = np.sqrt(
+        np.mean((3600 * late_s * np.linalg.norm(np.cross(true, predictors.AXIS), axis=1)) ** 2)
+    )
     held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).error_arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
@@ -217,11 +274,15 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     late = off(judge, judge.measure(image_e), judge.sky)
     dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)
     assert dark.lost.all() and not late.lost.all()
-    assert dark.arcsec.min() > late.arcsec[~late.lost].max() > MATCH_PX * scene.tracker.arcsec_per_px
+    assert (
+        dark.arcsec.min() > late.arcsec[~late.lost].max() > MATCH_PX * scene.tracker.arcsec_per_px
+    )
 
 
 def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
-    with Parts(small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))) as long:
+    with Parts(
+        small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))
+    ) as long:
         said = choices.shortened_line(long.own)
         seen = choices.exposure(long.own, 20)
     assert said == "exposures of 16 refreshes, 0.267 s, in the place of [tracker] exposure_s = 3.5"
@@ -242,7 +303,9 @@ def planted(**figures) -> CombinationRow:
         "chosen": "",
         "rate_deg_s": 0.0,
     }
-    return CombinationRow(**(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures))
+    return CombinationRow(
+        **(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures)
+    )
 
 
 @pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
@@ -252,7 +315,10 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     """
     time_ms, error = sorted((1.0, 9.0))[place[0]], sorted((0.1, 900.0))[place[1]]
     rows = [planted(time_ms=t, error_arcsec=e) for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
-    rows += [planted(time_ms=time_ms * k, error_arcsec=error, chosen=name) for name, k in (("default", 1), ("auto", 1.01))]
+    rows += [
+        planted(time_ms=time_ms * k, error_arcsec=error, chosen=name)
+        for name, k in (("default", 1), ("auto", 1.01))
+    ]
     kept = []
     monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
     run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
@@ -260,13 +326,21 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     assert_legible(figure)
     names = [text.get_text() for text in figure.axes[0].texts]
     for name, k in (("default", 1), ("auto", 1.01)):
-        assert f"{name}: {charts.two_digits(error)} arcsec, {charts.two_digits(time_ms * k)} ms" in names
+        assert (
+            f"{name}: {charts.two_digits(error)} arcsec, {charts.two_digits(time_ms * k)} ms"
+            in names
+        )
     assert "exact" in names and "dither" not in " ".join(names)
 
 
 def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
-    rows = [run.without_fronts(planted(time_ms=t, error_arcsec=10 / t, chosen=name)) for t, name in ((1.0, "auto"), (3.0, ""))]
-    assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {("", "", "")}
+    rows = [
+        run.without_fronts(planted(time_ms=t, error_arcsec=10 / t, chosen=name))
+        for t, name in ((1.0, "auto"), (3.0, ""))
+    ]
+    assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {
+        ("", "", "")
+    }
     kept = []
     monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
     run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
@@ -276,14 +350,33 @@ def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
 
 
 def test_scenes_that_are_alike_are_drawn_once():
-    rates = {"average field": (0.0, 0.23), "dense field": (0.0, 0.24), "faint field": (0.0, 0.9), "1 deg/s": (1.0, 0.25)}
-    rows = [planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto") for name, (rate, error) in rates.items()]
-    assert run.differing(rows) == {"average field": ["dense field"], "faint field": [], "1 deg/s": []}
+    rates = {
+        "average field": (0.0, 0.23),
+        "dense field": (0.0, 0.24),
+        "faint field": (0.0, 0.9),
+        "1 deg/s": (1.0, 0.25),
+    }
+    rows = [
+        planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto")
+        for name, (rate, error) in rates.items()
+    ]
+    assert run.differing(rows) == {
+        "average field": ["dense field"],
+        "faint field": [],
+        "1 deg/s": [],
+    }
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
     spots = [(1.0, 3.0), (2.0, 2.0), (2.0, 2.0), (2.0, 2.5), (3.0, 1.0), (3.5, 1.0)]
-    assert front([planted(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [True, True, True, False, True, False]
+    assert front([planted(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [
+        True,
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
 
     def beaters(which, *points):
         rows = [planted(time_ms=t, error_arcsec=e, noise_ms=n) for t, e, n in points]
@@ -301,12 +394,20 @@ def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
     (tmp_path / "dark.toml").write_text(SMALL.replace("aperture_mm", "exposure_s = 0\naperture_mm"))
     (tmp_path / "bare.toml").write_text("[tracker]\naperture_mm = 30\n")
     out = tmp_path / "out"
-    assert_refused(run_hilstar_here("study", "chain", tmp_path / "dark.toml", "-o", out), 2, "exposure_s = 0")
-    assert_refused(run_hilstar_here("study", "chain", tmp_path / "bare.toml", "-o", out), 2, "bare.toml")
+    assert_refused(
+        run_hilstar_here("study", "chain", tmp_path / "dark.toml", "-o", out), 2, "exposure_s = 0"
+    )
+    assert_refused(
+        run_hilstar_here("study", "chain", tmp_path / "bare.toml", "-o", out), 2, "bare.toml"
+    )
     assert_refused(run_hilstar_here("study", "chain", "-o", out), 2, "BENCH.toml")
-    assert_refused(run_hilstar_here("study", "timing", tmp_path / "dark.toml", "-o", out), 2, "dark.toml")
+    assert_refused(
+        run_hilstar_here("study", "timing", tmp_path / "dark.toml", "-o", out), 2, "dark.toml"
+    )
     (tmp_path / "chain.csv").write_text(SMALL)
-    assert_refused(run_hilstar_here("study", "chain", tmp_path / "chain.csv", "-o", tmp_path), 2, "chain.csv")
+    assert_refused(
+        run_hilstar_here("study", "chain", tmp_path / "chain.csv", "-o", tmp_path), 2, "chain.csv"
+    )
 
 
 def test_a_directory_without_the_right_to_write_is_refused_before_the_study(tmp_path, monkeypatch):
@@ -320,7 +421,9 @@ def test_a_directory_without_the_right_to_write_is_refused_before_the_study(tmp_
 
 def test_a_bench_of_which_no_star_stays_in_view_is_refused(tmp_path):
     (tmp_path / "bench.toml").write_text(SMALL.replace("[320, 320]", "[12, 12]"))
-    refused = run_hilstar_here("study", "chain", tmp_path / "bench.toml", "-o", tmp_path / "out", "--quick")
+    refused = run_hilstar_here(
+        "study", "chain", tmp_path / "bench.toml", "-o", tmp_path / "out", "--quick"
+    )
     assert_refused(refused, 2, "no star stands alone in view")
 
 
@@ -329,16 +432,29 @@ def test_the_study_ends_with_answers_from_its_own_rows(study):
     rows, parts = table(out / "chain.csv"), table(out / "chain_budget.csv")
     assert len(told["answers"]) >= 4
     still = [row for row in rows if row["scene"] == "average field" and row["sprite"] == "cut"]
-    by_codes = {(row["quantisation"], row["bit_stealing"]): row for row in still if float(row["faintest_v_mag"]) == 9}
-    exact, stealing = (charts.two_digits(float(by_codes["exact", flag]["error_arcsec"])) for flag in ("false", "true"))
-    assert told["answers"][0].startswith(f'at rest on 8 bits: set quantisation = "exact", {exact} arcsec')
+    by_codes = {
+        (row["quantisation"], row["bit_stealing"]): row
+        for row in still
+        if float(row["faintest_v_mag"]) == 9
+    }
+    exact, stealing = (
+        charts.two_digits(float(by_codes["exact", flag]["error_arcsec"]))
+        for flag in ("false", "true")
+    )
+    assert told["answers"][0].startswith(
+        f'at rest on 8 bits: set quantisation = "exact", {exact} arcsec'
+    )
     assert f"takes {exact} arcsec to {stealing}" in told["answers"][1]
-    of_turn = {part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"}
+    of_turn = {
+        part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"
+    }
     whole = charts.two_digits(of_turn.pop("whole"))
     del of_turn["rss"]
     largest = max(of_turn, key=of_turn.get)
     words = answers.STEP_WORDS.get(largest, largest)
-    assert told["answers"][2].startswith(f"from 1 deg/s on {words} is the largest part ({charts.two_digits(of_turn[largest])}")
+    assert told["answers"][2].startswith(
+        f"from 1 deg/s on {words} is the largest part ({charts.two_digits(of_turn[largest])}"
+    )
     assert f"of {whole} arcsec)" in told["answers"][2]
     assert told["answers"][-1].startswith("depth: ")
 
@@ -395,10 +511,19 @@ def test_each_turn_is_named_from_which_another_step_is_most_of_the_error():
         for prediction, arcsec in (("rate", 1.0), ("two samples", 2.0)):
             errors = {"error_arcsec": arcsec, "bit_stealing": "false"}
             rows.append(planted(scene=scene, rate_deg_s=rate, prediction=prediction, **errors))
-        steps = {step: 2.0 if step == largest else 0.5 for step in ("codes", "prediction", "refresh")}
+        steps = {
+            step: 2.0 if step == largest else 0.5 for step in ("codes", "prediction", "refresh")
+        }
         budget += [
-            measuring.ErrorPart(scene, "auto", step, size, 0.0) for step, size in {**steps, "rss": 3.0, "whole": 2.5}.items()
+            measuring.ErrorPart(scene, "auto", step, size, 0.0)
+            for step, size in {**steps, "rss": 3.0, "whole": 2.5}.items()
         ]
     lines = answers.turn_lines(answers.scenes_of(rows)[1:], budget)
-    assert [line.split(" is ")[0] for line in lines] == ["from 1 deg/s on prediction", "from 10 deg/s on the panel's refresh"]
-    assert "2 of 2.5 arcsec): send rates (by the packets' rates 1, by two samples 2 arcsec)" in lines[0]
+    assert [line.split(" is ")[0] for line in lines] == [
+        "from 1 deg/s on prediction",
+        "from 10 deg/s on the panel's refresh",
+    ]
+    assert (
+        "2 of 2.5 arcsec): send rates (by the packets' rates 1, by two samples 2 arcsec)"
+        in lines[0]
+    )

@@ -10,7 +10,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from hilstar.basics import charts
-from hilstar.instruments.simulate.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
+from hilstar.instruments.simulate.budget import (
+    CENTROID_LIMIT_PX,
+    FLUX_LIMITS_MAG,
+    budget,
+    write_report,
+)
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome, economy_finding
 from hilstar.instruments.study.speed import report as benchmark_report
 from hilstar.instruments.study.speed.report import Machine, MethodTiming, Result, Spread
@@ -37,7 +42,9 @@ def two_lines(tmp_path):
     """A chart that is as it should be, after what a test does to it."""
 
     def draw(spoil=lambda axes: None) -> Figure:
-        with charts.chart(tmp_path / "lines", "One line is twice the other", note="Of nothing.") as (axes,):
+        with charts.chart(
+            tmp_path / "lines", "One line is twice the other", note="Of nothing."
+        ) as (axes,):
             for name, k in (("once", 1), ("twice", 2)):
                 axes.plot([1, 10, 100], [k, 10 * k, 100 * k], label=name)
             axes.set(xscale="log", yscale="log", xlabel="time [s]", ylabel="place [m]")
@@ -88,13 +95,31 @@ def test_the_looks_of_a_chart_are_looked_at(two_lines):
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda axes: axes.annotate("here", (0.01, 0.5), xycoords="figure fraction", color=charts.INK), "lies over"),
-        (lambda axes: axes.annotate("far", (0.99, 0.4), xycoords="figure fraction"), "leaves the canvas"),
+        (
+            lambda axes: axes.annotate(
+                "here", (0.01, 0.5), xycoords="figure fraction", color=charts.INK
+            ),
+            "lies over",
+        ),
+        (
+            lambda axes: axes.annotate("far", (0.99, 0.4), xycoords="figure fraction"),
+            "leaves the canvas",
+        ),
         (lambda axes: axes.text(2, 100, "small", fontsize=7), "px high"),
         (lambda axes: axes.plot([1, 2], [3, 4], color=charts.RED), "nothing names"),
-        (lambda axes: axes.plot([1, 2], [3, 4], color="C0", label="red") and axes.legend(loc="lower left"), "under the legend"),
+        (
+            lambda axes: (
+                axes.plot([1, 2], [3, 4], color="C0", label="red") and axes.legend(loc="lower left")
+            ),
+            "under the legend",
+        ),
         (lambda axes: axes.set_ylim(1, 100), "leaves its axes"),
-        (lambda axes: axes.plot([1, 2], [3, 4], color="tab:red", label="a red") and axes.legend(), "has no dark one"),
+        (
+            lambda axes: (
+                axes.plot([1, 2], [3, 4], color="tab:red", label="a red") and axes.legend()
+            ),
+            "has no dark one",
+        ),
         (lambda axes: axes.figure.suptitle("a\nb\nc"), "a\nb"),
     ],
 )
@@ -105,7 +130,10 @@ def test_what_is_wrong_with_a_chart_is_seen(two_lines, spoil, said):
 
 def test_a_title_with_a_figure_that_is_not_drawn_is_seen(tmp_path):
     """As `choices` once told 0.16 mag of one line beside another line at 0.31."""
-    for title, is_drawn in (("The line is at 0.31 mag, within 4.2·10⁻⁸", True), ("The line is at 0.16 mag", False)):
+    for title, is_drawn in (
+        ("The line is at 0.31 mag, within 4.2·10⁻⁸", True),
+        ("The line is at 0.16 mag", False),
+    ):
         with charts.panels_of(title) as (axes,):
             axes.plot([1, 2], [0.3082, 0.3079], color=charts.BLUE, label="a line")
             charts.label_ends(axes)
@@ -140,30 +168,47 @@ def test_figures_of_an_axis_are_a_persons():
     assert [charts.plain(v) for v in (3000, 0.5, 0.0001, 1e-5, 3e-6, 2e6, 0)] == [
         *("3000", "0.5", "0.0001", "10⁻⁵", "3·10⁻⁶", "2·10⁶", "0")
     ]
-    assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == ["Rate [Hz]", "x [px]", "V [mag]"]
+    assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == [
+        "Rate [Hz]",
+        "x [px]",
+        "V [mag]",
+    ]
 
 
 def outcome(frame_ms: float, worst_mag: float = 0.01, bits: int = 8) -> EffortOutcome:
     errors = (worst_mag, 0.01, 0.02, 0.02, True, 5, *[0.01] * len(FAMILY))
-    return EffortOutcome("a scene", bits, "default", 0.05, 0.1, "round", 10, frame_ms, frame_ms, *errors)
+    return EffortOutcome(
+        "a scene", bits, "default", 0.05, 0.1, "round", 10, frame_ms, frame_ms, *errors
+    )
 
 
 @pytest.mark.parametrize(
     ("times_ms", "said"),
     [
-        (((2.0, 1.0), (10.0, 2.0)), "is 2.0 at 8, 5.0 at 10 bits times as fast as full effort (2.0 to 5.0 over"),
-        (((0.5, 1.0), (10.0, 2.0)), "is 0.5 at 8, 5.0 at 10 bits times as fast as full effort (0.5 to 5.0 over"),
+        (
+            ((2.0, 1.0), (10.0, 2.0)),
+            "is 2.0 at 8, 5.0 at 10 bits times as fast as full effort (2.0 to 5.0 over",
+        ),
+        (
+            ((0.5, 1.0), (10.0, 2.0)),
+            "is 0.5 at 8, 5.0 at 10 bits times as fast as full effort (0.5 to 5.0 over",
+        ),
     ],
 )
 def test_economy_says_its_gain_by_bits_and_its_range(times_ms, said):
     each = zip(times_ms, (8, 10), strict=True)
-    comparisons = [EffortComparison(outcome(full, bits=bits), outcome(auto, bits=bits)) for (full, auto), bits in each]
+    comparisons = [
+        EffortComparison(outcome(full, bits=bits), outcome(auto, bits=bits))
+        for (full, auto), bits in each
+    ]
     finding = economy_finding(comparisons)
     assert said in finding and finding.endswith("within tolerance")
 
 
 def test_economy_does_not_call_within_tolerance_what_is_over_it():
-    assert economy_finding([EffortComparison(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 OVER tolerance")
+    assert economy_finding([EffortComparison(outcome(2.0), outcome(1.0, 0.5))]).endswith(
+        "1 of 1 OVER tolerance"
+    )
 
 
 @pytest.mark.parametrize("sizes", [((1920, 1080),), ((640, 480), (1920, 1080))])
@@ -192,11 +237,17 @@ def test_every_line_of_the_budget_has_a_name_where_it_ends(figures, bench_with, 
     (figure,) = figures
     assert_legible(figure)
     for axis in figure.axes:
-        named = [str(line.get_label()) for line in axis.get_lines() if not str(line.get_label()).startswith("_")]
+        named = [
+            str(line.get_label())
+            for line in axis.get_lines()
+            if not str(line.get_label()).startswith("_")
+        ]
         assert sorted(text.get_text() for text in axis.texts) == sorted(named)
     flux, place, each = figure.axes
     for axis, limits in ((flux, FLUX_LIMITS_MAG), (place, (CENTROID_LIMIT_PX,))):
         drawn = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axis.get_lines()}
-        assert (np.diff(drawn["largest to V"]) >= 0).all() and (drawn["largest to V"] >= drawn["rms"]).all()
+        assert (np.diff(drawn["largest to V"]) >= 0).all() and (
+            drawn["largest to V"] >= drawn["rms"]
+        ).all()
         assert sum(name.startswith("limit") for name in drawn) == len(limits)
     assert {text.get_text() for text in each.texts} == set(FAMILY)

@@ -42,15 +42,25 @@ def test_codes_of_stars_own_mixtures_keep_every_channel_and_colour_before_a_baye
 def test_mixtures_reach_every_star_of_a_mosaic_and_not_the_near_infrared_of_a_mono_sensor(study):
     _, rows = study
     gamut = rows("colour_gamut")
-    assert {(row["panel"], row["sensor"]) for row in gamut} == {(one, two) for one in PANELS for two in (*MONO, *SENSORS)}
+    assert {(row["panel"], row["sensor"]) for row in gamut} == {
+        (one, two) for one in PANELS for two in (*MONO, *SENSORS)
+    }
     assert all(float(row["subtypes"]) < AIM_SUBTYPES for row in gamut if row["sensor"] in SENSORS)
-    assert all(float(row["subtypes"]) < 1e-3 for row in gamut if row["sensor"] == "ccd47-20 to 700 nm")
-    by_class = {(row["panel"], row["sensor"], row["class"]): float(row["subtypes"]) for row in rows("colour_class")}
+    assert all(
+        float(row["subtypes"]) < 1e-3 for row in gamut if row["sensor"] == "ccd47-20 to 700 nm"
+    )
+    by_class = {
+        (row["panel"], row["sensor"], row["class"]): float(row["subtypes"])
+        for row in rows("colour_class")
+    }
     # the near infrared is what is missing
     assert all(by_class["OLED", "ccd47-20", kind] < AIM_SUBTYPES for kind in "OBAF")
     assert all(by_class["OLED", "ccd47-20", kind] > AIM_SUBTYPES for kind in "GKM")
     wide = [row for row in gamut if row["sensor"] == "ccd47-20"]
-    assert all(0.3 < float(row["out_share"]) < 0.7 and float(row["subtypes"]) > AIM_SUBTYPES for row in wide)
+    assert all(
+        0.3 < float(row["out_share"]) < 0.7 and float(row["subtypes"]) > AIM_SUBTYPES
+        for row in wide
+    )
     red = {row["sensor"]: [float(row[kind]) for kind in "OBAFGKM"] for row in rows("colour_red")}
     assert all(shares == sorted(shares) for shares in red.values())
     assert red["ccd47-20"][-1] > 0.7 and red["Bayer, infrared cut"][-1] < 0.01
@@ -58,7 +68,10 @@ def test_mixtures_reach_every_star_of_a_mosaic_and_not_the_near_infrared_of_a_mo
 
 def test_lateral_colour_of_a_known_glass_and_of_one_that_is_linear_in_wavelength_is_the_skys(study):
     _, rows = study
-    off = {(row["lens"], row["panel"], row["colour"]): float(row["off_share"]) for row in rows("colour_lateral")}
+    off = {
+        (row["lens"], row["panel"], row["colour"]): float(row["off_share"])
+        for row in rows("colour_lateral")
+    }
     # the planar's filter has none of a laser's blue
     assert {panel for _, panel, _ in off} == {"OLED", "sRGB LCD"}
     assert {lens for lens, *_ in off} == {"planar-1897", "linear"}
@@ -67,7 +80,12 @@ def test_lateral_colour_of_a_known_glass_and_of_one_that_is_linear_in_wavelength
 
 def test_superpixels_have_less_bias_than_the_raw_mosaic_and_wide_stars_little(study):
     _, rows = study
-    rms = {(row["image"], row["sigma_px"], row["temperature_k"]): float(row["rms_px"]) for row in rows("colour_mosaic")}
-    assert all(rms["superpixel", *key] < off for (image, *key), off in rms.items() if image == "mosaic")
+    rms = {
+        (row["image"], row["sigma_px"], row["temperature_k"]): float(row["rms_px"])
+        for row in rows("colour_mosaic")
+    }
+    assert all(
+        rms["superpixel", *key] < off for (image, *key), off in rms.items() if image == "mosaic"
+    )
     assert rms["superpixel", "1.5", "3500.0"] < 0.005
     assert rms["superpixel", "0.55", "3500.0"] > 0.05

@@ -62,8 +62,12 @@ def test_the_published_figures_have_the_thesis_s_temperatures(published):
     was 7288 K.
     """
     folder, lines = published
-    assert temperatures_k(folder, "orion_as_published").max() == pytest.approx(HOTTEST_IN_ORION_K, abs=1)
-    assert temperatures_k(folder, "rosetta_as_published").mean() == pytest.approx(MEAN_OF_ROSETTA_K, abs=1)
+    assert temperatures_k(folder, "orion_as_published").max() == pytest.approx(
+        HOTTEST_IN_ORION_K, abs=1
+    )
+    assert temperatures_k(folder, "rosetta_as_published").mean() == pytest.approx(
+        MEAN_OF_ROSETTA_K, abs=1
+    )
     assert "hottest 23559 K" in lines["orion_as_published"]
     assert "mean 6931 K" in lines["rosetta_as_published"]
 
@@ -90,7 +94,9 @@ def test_centres_are_astropy_s(published, name):
     row = order[np.searchsorted(catalog.hip[order], truth["hip"])]
     years = 2000.0 - 1991.25
     dec_deg = catalog.dec_deg[row] + years * catalog.pm_dec_mas_yr[row] / 3.6e6
-    ra_deg = catalog.ra_deg[row] + years * catalog.pm_ra_cosdec_mas_yr[row] / 3.6e6 / np.cos(np.radians(dec_deg))
+    ra_deg = catalog.ra_deg[row] + years * catalog.pm_ra_cosdec_mas_yr[row] / 3.6e6 / np.cos(
+        np.radians(dec_deg)
+    )
     x_px, y_px = plane.all_world2pix(ra_deg, dec_deg, 0)
     on = (x_px >= -0.5) & (x_px < shape[1] - 0.5) & (y_px >= -0.5) & (y_px < shape[0] - 0.5)
     assert int(on.sum()) == ON_IMAGE[name]
@@ -98,7 +104,9 @@ def test_centres_are_astropy_s(published, name):
 
 def test_a_bench_of_one_s_own_has_seven_outputs_in_four_fields(tmp_path):
     (tmp_path / "bench.toml").write_text(BENCH)
-    result = run_hilstar("study", "outputs", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out")
+    result = run_hilstar(
+        "study", "outputs", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out"
+    )
     assert result.returncode == 0, result.stderr
     for stem in ("orion", "lyra", "zeta_cas", "field"):
         assert_drawn(tmp_path / "out" / f"{stem}.png")
@@ -115,7 +123,9 @@ def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):
     """
     glass = BENCH.replace('"kai-4021"\n', '"kai-4021"\ntransmission = "n-bk7-10mm"\n')
     (tmp_path / "bench.toml").write_text(glass)
-    result = run_hilstar_here("study", "models", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out")
+    result = run_hilstar_here(
+        "study", "models", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out"
+    )
     assert result.returncode == 0, result.stderr
     rows = {float(row["temperature_k"]): row for row in table(tmp_path / "out" / "rapp_bench.csv")}
     assert float(rows[9000.0]["rapp3_energy"]) == pytest.approx(1.055, abs=5e-4)
@@ -131,15 +141,31 @@ def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):
 def test_what_a_study_does_not_use_is_refused(tmp_path):
     (tmp_path / "bench.toml").write_text(BENCH)
     bench, folder = tmp_path / "bench.toml", tmp_path / "out"
-    assert_refused(run_hilstar_here("study", "bodies", bench, "-o", folder), 2, "has benches of its own")
-    assert_refused(run_hilstar_here("study", "outputs", "--radec", "1,2,3", "-o", folder), 2, "study outputs BENCH.toml")
-    assert_refused(run_hilstar_here("study", "bodies", "--radec", "1,2,3", "-o", folder), 2, "leave out --radec")
-    assert_refused(run_hilstar_here("study", "models", bench, "--radec", "1,99,3", "-o", folder), 2, "declination")
+    assert_refused(
+        run_hilstar_here("study", "bodies", bench, "-o", folder), 2, "has benches of its own"
+    )
+    assert_refused(
+        run_hilstar_here("study", "outputs", "--radec", "1,2,3", "-o", folder),
+        2,
+        "study outputs BENCH.toml",
+    )
+    assert_refused(
+        run_hilstar_here("study", "bodies", "--radec", "1,2,3", "-o", folder),
+        2,
+        "leave out --radec",
+    )
+    assert_refused(
+        run_hilstar_here("study", "models", bench, "--radec", "1,99,3", "-o", folder),
+        2,
+        "declination",
+    )
     assert not folder.exists()
 
 
 def test_an_unwritable_directory_and_an_unknown_study_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    assert_refused(run_hilstar_here("study", "models", "-o", tmp_path / "file" / "x"), 2, "cannot be written")
+    assert_refused(
+        run_hilstar_here("study", "models", "-o", tmp_path / "file" / "x"), 2, "cannot be written"
+    )
     assert_refused(run_hilstar_here("study", "weather", "-o", tmp_path), 2, "weather")
     assert_refused(run_hilstar_here("study", "models"), 2, "-o")

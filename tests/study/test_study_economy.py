@@ -22,15 +22,22 @@ def study(tmp_path_factory):
 
 
 def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(study):
-    full, *autos = [row for row in study[2] if (row["scene"], row["bits"]) == (SCENES[2].name, "12")]
+    full, *autos = [
+        row for row in study[2] if (row["scene"], row["bits"]) == (SCENES[2].name, "12")
+    ]
     assert full["tolerance"] == "full" and full["quantisation"] == "exact"
     assert [row["tolerance"] for row in autos] == ["default", "0.1"]
     for row in autos:
-        assert row["quantisation"] == "round" and int(row["measured_stars"]) == int(full["measured_stars"]) > 100
+        assert (
+            row["quantisation"] == "round"
+            and int(row["measured_stars"]) == int(full["measured_stars"]) > 100
+        )
         places_px = [float(row[f"max_px_{kind}"]) for kind in FAMILY]
         assert float(row["max_px_fit"]) < float(row["max_px_moment"])
         assert max(float(row["centroid_max_px"]), *places_px) <= float(row["tolerance_px"])
-        assert float(full["flux_max_mag"]) < float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
+        assert (
+            float(full["flux_max_mag"]) < float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
+        )
 
 
 def test_what_is_within_by_the_plan_is_within_by_its_stars(study):
@@ -41,7 +48,11 @@ def test_what_is_within_by_the_plan_is_within_by_its_stars(study):
         # A path's codes are not in the claim: `exact` at 12 bits and 1 deg/s leaves 0.0024 mag for
         # 0.0011.
         if "deg/s" not in row["scene"]:
-            assert float(row["flux_max_mag"]) <= float(row["claimed_mag"]) <= float(row["tolerance_mag"])
+            assert (
+                float(row["flux_max_mag"])
+                <= float(row["claimed_mag"])
+                <= float(row["tolerance_mag"])
+            )
 
 
 def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(study):

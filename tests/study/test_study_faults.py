@@ -33,7 +33,9 @@ def test_every_kind_but_a_dropped_frame_has_its_cost(study):
     kinds = {table["kind"] for tables in CASES.values() for table in tables}
     assert kinds == set(KINDS) - {"drop"}  # which draws nothing
     costs = rows(folder / "faults-cost.csv")
-    assert [(row["quantisation"], row["case"]) for row in costs] == [(q, case) for q in QUANTISATIONS for case in CASES]
+    assert [(row["quantisation"], row["case"]) for row in costs] == [
+        (q, case) for q in QUANTISATIONS for case in CASES
+    ]
     assert all(float(row["without_ms"]) > 0 for row in costs)
     assert NOWHERE in CASES and len(findings) == 4
 
@@ -42,7 +44,11 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
     folder, _ = study
     strays = rows(folder / "faults-stray.csv")
     for quantisation in QUANTISATIONS:
-        mine = {float(row["share_of_white"]): row for row in strays if row["quantisation"] == quantisation}
+        mine = {
+            float(row["share_of_white"]): row
+            for row in strays
+            if row["quantisation"] == quantisation
+        }
         assert float(mine[1.0]["lost"]) == 1.0
         assert float(mine[0.0]["lost"]) < 0.05
         assert int(mine[0.0]["stars"]) > 20

@@ -28,7 +28,9 @@ def test_each_model_is_charted_against_dots_and_noise(study):
 def test_simple_lenses_fail_and_are_marked_and_the_full_model_does_not(study):
     lines, rows, _ = study
     usual = {
-        row["model"]: float(row["stars_rms_arcsec"]) for row in rows if row["noise_px"] == "0.02" and row["frames"] == "20"
+        row["model"]: float(row["stars_rms_arcsec"])
+        for row in rows
+        if row["noise_px"] == "0.02" and row["frames"] == "20"
     }
     assert usual["a pinhole"] > 50 * FAIL_ARCSEC
     assert usual["the same with a field of degree 4"] < 0.25
@@ -46,6 +48,8 @@ def test_held_out_dots_rank_the_models_as_the_stars_do(study):
 
 def test_errors_grow_with_noise(study):
     _, rows, _ = study
-    same = [row for row in rows if row["frames"] == "20" and row["model"] == "Brown-Conrady with tilt"]
+    same = [
+        row for row in rows if row["frames"] == "20" and row["model"] == "Brown-Conrady with tilt"
+    ]
     small, large = sorted(same, key=lambda row: float(row["noise_px"]))
     assert float(large["stars_rms_arcsec"]) > float(small["stars_rms_arcsec"])

@@ -80,7 +80,9 @@ def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
 
 
 def planted(errors, at=(1.0, 2.0, 4.0)) -> Limit:
-    return Limit("A method", limits.AGE, "packets over {} ms old", "px", np.array(at), np.array(errors))
+    return Limit(
+        "A method", limits.AGE, "packets over {} ms old", "px", np.array(at), np.array(errors)
+    )
 
 
 def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
@@ -92,4 +94,6 @@ def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
     assert planted([1.0, 1.0, 1.0]).words == "everywhere"
     falling = planted([0.0, tolerance * 10, 0.0])
     assert 1.0 < falling.meets < 2.0
-    assert limits_finding([crossing, planted([0.0, 0.0, 0.0])]).startswith("1 of 2 methods of hilstar leave their tolerance")
+    assert limits_finding([crossing, planted([0.0, 0.0, 0.0])]).startswith(
+        "1 of 2 methods of hilstar leave their tolerance"
+    )

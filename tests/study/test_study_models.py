@@ -13,7 +13,12 @@ from astropy.wcs import WCS
 from PIL import Image
 
 from hilstar.basics.charts import TITLE_COLUMNS, title_lines
-from hilstar.instruments.study.models import choices_finding, running_percentiles, torres2010_k, zero_points
+from hilstar.instruments.study.models import (
+    choices_finding,
+    running_percentiles,
+    torres2010_k,
+    zero_points,
+)
 from hilstar.instruments.study.rapp import rapp_ratios
 from hilstar.instruments.study.settings import held_out_errors, study_optics
 from hilstar.sky import electrons
@@ -23,7 +28,14 @@ from hilstar.sky.spectrum import DATA_DIR
 from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
-STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
+STEMS = (
+    "rapp_ccd47-20",
+    "rapp_kai-4021",
+    "temperature_scales",
+    "zero_points",
+    "choices",
+    "spectra",
+)
 STEMS += ("catalogue_errors", "passbands", "curves", "detector_laws", "zodiacal")
 STEMS += ("star_density", "frames", "sun", "vega_logarithmic", "backgrounds")
 
@@ -88,7 +100,9 @@ def integral(function, knots_nm):
     """Over straight pieces, each by 12 nodes: adaptive quadrature agrees within 1e-15."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     half = np.diff(knots_nm)[:, None] / 2
-    return float((half * weights * function(np.asarray(knots_nm)[:-1, None] + half * (1 + nodes))).sum())
+    return float(
+        (half * weights * function(np.asarray(knots_nm)[:-1, None] + half * (1 + nodes))).sum()
+    )
 
 
 def rapp_by_quadrature(kelvin, sensor, power):
@@ -99,14 +113,18 @@ def rapp_by_quadrature(kelvin, sensor, power):
     knots = knots[(knots >= low) & (knots <= high)]
 
     def light(temperature, response):
-        v_band = integral(lambda nm: planck(nm, temperature) * np.interp(nm, *johnson) * nm**power, johnson[0])
+        v_band = integral(
+            lambda nm: planck(nm, temperature) * np.interp(nm, *johnson) * nm**power, johnson[0]
+        )
         return integral(lambda nm: planck(nm, temperature) * response(nm), knots) / v_band
 
     def seen(nm):
         return np.interp(nm, *qe) * np.interp(nm, *glass)
 
     mean_nm, width_nm = (low + high) / 2, high - low
-    mean_qe, mean_glass = (integral(lambda nm, c=c: np.interp(nm, *c), knots) / width_nm for c in (qe, glass))
+    mean_qe, mean_glass = (
+        integral(lambda nm, c=c: np.interp(nm, *c), knots) / width_nm for c in (qe, glass)
+    )
     average = light(REFERENCE_K, lambda nm: 1.0)
     return (
         light(kelvin, lambda nm: 1.0) / average,
@@ -123,7 +141,9 @@ def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
     for kelvin in (3000.0, 5000.0, 50_000.0):
         row = np.flatnonzero(table["temperature_k"] == kelvin)[0]
         ratios = [table[f"rapp{k}_{weighting}"][row] for k in (1, 2, 3)]
-        assert ratios == pytest.approx(rapp_by_quadrature(kelvin, sensor, power), rel=QUADRATURE_LIMIT)
+        assert ratios == pytest.approx(
+            rapp_by_quadrature(kelvin, sensor, power), rel=QUADRATURE_LIMIT
+        )
 
 
 def test_rapp_is_one_where_both_models_are_the_same(study):
@@ -148,7 +168,8 @@ def test_torres_gives_the_sun_its_temperature():
 def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
     table = columns(study[0] / "zero_points.csv")
     bolometric = [
-        setting == ("iau-bolometric", "energy") for setting in zip(table["zero_point"], table["weighting"], strict=True)
+        setting == ("iau-bolometric", "energy")
+        for setting in zip(table["zero_point"], table["weighting"], strict=True)
     ]
     assert table["mag_against_default"][bolometric] == pytest.approx([0.31, 0.31], abs=0.01)
 
@@ -161,7 +182,12 @@ def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(study):
         errors = np.abs(table[f"ccd47-20: {name} [%]"])[table["vi_mag"] < 2.5]
         median[name] = np.median(errors)
         assert f"{np.median(errors):.1f} %" in text
-    assert median["pickles, leave-one-out"] < 1.0 < 3 * median["pickles, leave-one-out"] < median["black body, ballesteros2012"]
+    assert (
+        median["pickles, leave-one-out"]
+        < 1.0
+        < 3 * median["pickles, leave-one-out"]
+        < median["black body, ballesteros2012"]
+    )
 
 
 def test_a_held_out_star_is_not_in_its_own_table():
@@ -219,14 +245,23 @@ def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
     h, c, k, sigma = 6.62607015e-34, 299792458.0, 1.380649e-23, 5.670374419e-8
 
     def exitance(nm):
-        return 2 * np.pi * h * c**2 / (nm * 1e-9) ** 5 / np.expm1(h * c / (nm * 1e-9 * k * REFERENCE_K))
+        return (
+            2
+            * np.pi
+            * h
+            * c**2
+            / (nm * 1e-9) ** 5
+            / np.expm1(h * c / (nm * 1e-9 * k * REFERENCE_K))
+        )
 
     mean = integral(lambda nm: exitance(nm) * np.interp(nm, *johnson), johnson[0])
     mean /= integral(lambda nm: np.interp(nm, *johnson), johnson[0])
     faint_mag = -2.5 * np.log10(2.518021002e-8 / (sigma * REFERENCE_K**4) * mean / 3.631e-2)
     table = columns(study[0] / "zero_points.csv")
     cost = table["mag_against_default"]
-    for k, (zero, weighting) in enumerate(zip(table["zero_point"], table["weighting"], strict=True)):
+    for k, (zero, weighting) in enumerate(
+        zip(table["zero_point"], table["weighting"], strict=True)
+    ):
         if zero == "iau-bolometric":
             assert cost[k] == pytest.approx(faint_mag, abs=BOLOMETRIC_MAG_LIMIT)
         elif weighting == "energy":
@@ -257,7 +292,9 @@ def test_choices_cost_what_a_bench_would_see(study):
 
 def test_there_are_no_percentiles_where_stars_are_few():
     bv_mag = np.concatenate([np.full(19, 0.0), np.full(20, 1.0)])
-    low, middle, high, count = running_percentiles(bv_mag, np.arange(39.0), np.array([0.0, 1.0, 2.0]))
+    low, middle, high, count = running_percentiles(
+        bv_mag, np.arange(39.0), np.array([0.0, 1.0, 2.0])
+    )
     assert count.tolist() == [19, 20, 0]
     for values in (low, middle, high):
         assert np.isnan(values).tolist() == [True, False, True]
@@ -269,7 +306,9 @@ def test_real_spectra_are_as_wrong_as_measured(study, sensor):
     table = columns(study[0] / "spectra.csv")
     assert len(table["spectral_type"]) == 106
     errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
-    assert np.percentile(errors, (50, 95)) == pytest.approx(HELD_OUT[sensor], abs=HUNDREDTH_OF_A_PERCENT)
+    assert np.percentile(errors, (50, 95)) == pytest.approx(
+        HELD_OUT[sensor], abs=HUNDREDTH_OF_A_PERCENT
+    )
 
 
 def test_titles_say_what_the_tables_hold(study):
@@ -277,14 +316,20 @@ def test_titles_say_what_the_tables_hold(study):
     for sensor in ("ccd47-20", "kai-4021"):
         table = columns(folder / f"rapp_{sensor}.csv")
         at = dict(zip(table["temperature_k"], table["rapp3_energy"], strict=True))
-        for words in (f"{at[3000]:.2f} times", f"{at[5000]:.2f} at 5000", f"{100 * at[9000] - 100:+.1f} %"):
+        for words in (
+            f"{at[3000]:.2f} times",
+            f"{at[5000]:.2f} at 5000",
+            f"{100 * at[9000] - 100:+.1f} %",
+        ):
             assert words in texts[f"rapp_{sensor}"]
     zero = columns(folder / "zero_points.csv")
     assert f"{zero['electrons_per_s'][0] / 1e6:.1f} million" in texts["zero_points"]
     assert f"({zero['mag_against_default'][2]:.2f} mag)" in texts["zero_points"]
     flat = columns(folder / "choices.csv")["zero_point_iau-bolometric_mag"]
     assert f"iau-bolometric {np.median(flat):.2f}" in texts["choices"]
-    assert choices_finding({"zero": np.array([0.31, 0.31]), "b ags": np.array([0.16, 0.32])}).endswith(
+    assert choices_finding(
+        {"zero": np.array([0.31, 0.31]), "b ags": np.array([0.16, 0.32])}
+    ).endswith(
         "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are changed most by ags, by 0.32 mag"
     )
     table = columns(folder / "spectra.csv")
@@ -297,7 +342,9 @@ def test_a_title_follows_its_data(tmp_path, monkeypatch):
     """A zero point a magnitude brighter is in the title without a change to it."""
     before = zero_points(tmp_path).text
     monkeypatch.setattr(electrons, "BOLOMETRIC_0_W_M2", electrons.BOLOMETRIC_0_W_M2 * 10**0.4)
-    (old,), (new,) = (re.findall(r"\((-?[\d.]+) mag\)", text) for text in (before, zero_points(tmp_path).text))
+    (old,), (new,) = (
+        re.findall(r"\((-?[\d.]+) mag\)", text) for text in (before, zero_points(tmp_path).text)
+    )
     assert float(new) == pytest.approx(float(old) - 1, abs=0.011)  # two figures rounded at 0.01
 
 
@@ -306,7 +353,13 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
     rows = columns(folder / "catalogue_errors.csv")
     here, thesis = (dict(zip(rows["what"], rows[name], strict=True)) for name in ("here", "thesis"))
     assert thesis["V from T"] == here["V from T"] == 409  # table 2.2
-    for name in ("sigma_bv_mag", "sigma_ra_mas", "sigma_dec_mas", "sigma_parallax_mas", "sigma_pm_ra_mas_yr"):
+    for name in (
+        "sigma_bv_mag",
+        "sigma_ra_mas",
+        "sigma_dec_mas",
+        "sigma_parallax_mas",
+        "sigma_pm_ra_mas_yr",
+    ):
         assert here[name] == pytest.approx(thesis[name], abs=0.025)  # table 2.3
     bands = columns(folder / "passbands.csv")
     assert list(bands["band"]) == ["U", "B", "V", "R", "I"]
@@ -317,7 +370,10 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
     at = np.flatnonzero(dark["temperature_k"] == 293)[0]
     assert [dark[law][at] for law in list(dark)[1:]] == pytest.approx([203] * 5)
     assert "97.2 photons" in texts["zodiacal"] and "96.9 as sunlight" in texts["zodiacal"]
-    assert "RAPP1 at 50000 K is 1.02, and 1.56 with any curve from 300 to 1050 nm" in texts["rapp_kai-4021"]
+    assert (
+        "RAPP1 at 50000 K is 1.02, and 1.56 with any curve from 300 to 1050 nm"
+        in texts["rapp_kai-4021"]
+    )
 
 
 def test_every_figure_is_drawn_and_found(study):
@@ -363,7 +419,9 @@ def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
     k = int(table["stars_deg2"].argmax())
     half = 1 / 18
     middle = np.sin(np.radians(table["dec_deg"][k]))
-    near = (np.abs(catalog.ra_deg - table["ra_deg"][k]) < 5) & (np.abs(np.sin(np.radians(catalog.dec_deg)) - middle) < half)
+    near = (np.abs(catalog.ra_deg - table["ra_deg"][k]) < 5) & (
+        np.abs(np.sin(np.radians(catalog.dec_deg)) - middle) < half
+    )
     assert table["stars_deg2"][k] * cell_deg2 == pytest.approx(near.sum(), abs=0.5)
 
 
@@ -373,7 +431,11 @@ def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
     """
     table = columns(study[0] / "frames.csv")
     plane = WCS(naxis=2)
-    plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [84.057, -1.2], [1.0, 1.0]
+    plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = (
+        ["RA---TAN", "DEC--TAN"],
+        [84.057, -1.2],
+        [1.0, 1.0],
+    )
     plane.wcs.crpix = [1.0, 1.0]
     ra_deg = np.degrees(np.arctan2(table["y_icrs"], table["x_icrs"])) % 360
     east_deg, north_deg = plane.all_world2pix(ra_deg, np.degrees(np.arcsin(table["z_icrs"])), 0)
@@ -404,7 +466,10 @@ def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(study):
     for stem, star, kelvin in (("sun", "g2v", 5772.0), ("vega_logarithmic", "vega", 9602.0)):
         table = columns(study[0] / f"{stem}.csv")
         weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
-        means = [np.trapezoid(table[name] * weight, table["wavelength_nm"]) for name in (star, "blackbody")]
+        means = [
+            np.trapezoid(table[name] * weight, table["wavelength_nm"])
+            for name in (star, "blackbody")
+        ]
         assert means[0] == pytest.approx(means[1], rel=2e-3)
         shape = table["blackbody"] / planck(table["wavelength_nm"], kelvin)
         assert shape == pytest.approx(shape[0], rel=1e-6)

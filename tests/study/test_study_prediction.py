@@ -33,12 +33,18 @@ def rows_of(path, record):
     """A table as records of texts and numbers."""
     kinds = get_type_hints(record)
     with path.open(newline="") as file:
-        return [record(**{name: kinds[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
+        return [
+            record(**{name: kinds[name](text) for name, text in row.items()})
+            for row in csv.DictReader(file)
+        ]
 
 
 @pytest.fixture(scope="module")
 def outcomes(study):
-    return {(o.method, o.rate_hz, o.latency_ms): o for o in rows_of(study[0] / "prediction.csv", PredictionOutcome)}
+    return {
+        (o.method, o.rate_hz, o.latency_ms): o
+        for o in rows_of(study[0] / "prediction.csv", PredictionOutcome)
+    }
 
 
 def test_holding_costs_the_rate_times_the_age(outcomes):
@@ -57,12 +63,17 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
     errors = [outcomes[own, USUAL_HZ, ms].rms_arcsec for ms in LATENCIES_MS]
     assert errors == sorted(errors)
     for ms in LATENCIES_MS:
-        assert outcomes[own, USUAL_HZ, ms].rms_arcsec < outcomes["hold", USUAL_HZ, ms].rms_arcsec / 3
+        assert (
+            outcomes[own, USUAL_HZ, ms].rms_arcsec < outcomes["hold", USUAL_HZ, ms].rms_arcsec / 3
+        )
 
 
 @pytest.fixture(scope="module")
 def shaken(study):
-    return {(s.way, s.packets, s.jitter_hz): s for s in rows_of(study[0] / "prediction_jitter.csv", Shaken)}
+    return {
+        (s.way, s.packets, s.jitter_hz): s
+        for s in rows_of(study[0] / "prediction_jitter.csv", Shaken)
+    }
 
 
 def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
@@ -72,16 +83,22 @@ def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
     for hz in (2.0, 5.0, 10.0, 14.0):
         x = math.tau * hz * USUAL_MS / 1e3
         assert shaken["rate", "with rates", hz].gain == pytest.approx(math.hypot(1, x), rel=0.05)
-        assert shaken["newest", "with rates", hz].residual == pytest.approx(2 * math.sin(x / 2), rel=0.1)
+        assert shaken["newest", "with rates", hz].residual == pytest.approx(
+            2 * math.sin(x / 2), rel=0.1
+        )
 
 
 def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(study, shaken):
     for packets in ("with rates", "without rates"):
         for hz in (2.0, 5.0):
-            assert shaken["auto", packets, hz].residual == pytest.approx(shaken["rate", packets, hz].residual, rel=0.05)
+            assert shaken["auto", packets, hz].residual == pytest.approx(
+                shaken["rate", packets, hz].residual, rel=0.05
+            )
         for hz in (20.0, 45.0):
             assert shaken["auto", packets, hz].residual < 0.7 * shaken["rate", packets, hz].residual
-            assert shaken["auto", packets, hz].residual < 2.0 * shaken["newest", packets, hz].residual
+            assert (
+                shaken["auto", packets, hz].residual < 2.0 * shaken["newest", packets, hz].residual
+            )
         # sin x = x / 2: 15 Hz with rates
         assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16
     assert study[1][-1].startswith("Of a vibration above 1")

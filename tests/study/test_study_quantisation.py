@@ -38,20 +38,33 @@ def test_fainter_stars_have_less_light():
 def test_the_study_writes_charts_tables_and_findings(tmp_path):
     findings, _ = run(tmp_path, quick=True)
     assert len(findings) == len(BITS) + 3
-    for name in ("quantisation.png", "quantisation_centroiders.png", "quantisation_time.png", "over_frames.png"):
+    for name in (
+        "quantisation.png",
+        "quantisation_centroiders.png",
+        "quantisation_time.png",
+        "over_frames.png",
+    ):
         assert_drawn(tmp_path / name)
     with (tmp_path / "quantisation.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(BITS) * len(WAYS) * 5
     for bits, (aim_mag, limit) in AIMS.items():
-        exact = [r for r in rows if r["bits"] == str(bits) and r["method"] == "exact" and float(r["mag_under_white"]) <= limit]
+        exact = [
+            r
+            for r in rows
+            if r["bits"] == str(bits)
+            and r["method"] == "exact"
+            and float(r["mag_under_white"]) <= limit
+        ]
         assert max(float(r["flux_max_mag"]) for r in exact) <= aim_mag
     faint = {r["method"]: r for r in rows if (r["bits"], float(r["mag_under_white"])) == ("8", 6.0)}
     for kind in FAMILY:
         rounded, exact = (float(faint[name][f"axis_rms_px_{kind}"]) for name in ("round", "exact"))
         assert 0 < exact < MOST_LEFT * rounded
         assert float(faint["exact"][f"max_px_{kind}"]) > exact
-    assert float(faint["exact"]["centroid_rms_px"]) == pytest.approx(np.sqrt(2) * float(faint["exact"]["axis_rms_px_moment"]))
+    assert float(faint["exact"]["centroid_rms_px"]) == pytest.approx(
+        np.sqrt(2) * float(faint["exact"]["axis_rms_px_moment"])
+    )
     with (tmp_path / "quantisation_time.csv").open() as file:
         assert all(float(row["frame_ms"]) > 0 for row in csv.DictReader(file))
     with (tmp_path / "over_frames.csv").open() as file:

@@ -72,7 +72,9 @@ def test_each_step_takes_away_what_physics_says_it_should(outcomes):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"down": (0, -1)}, {"scanout_s": 0.0}, {"hold_s": 0.0}], ids=["rows upwards", "no scan-out", "no hold"]
+    "wrong",
+    [{"down": (0, -1)}, {"scanout_s": 0.0}, {"hold_s": 0.0}],
+    ids=["rows upwards", "no scan-out", "no hold"],
 )
 def test_a_scan_that_is_assumed_wrong_is_seen(tmp_path, outcomes, wrong):
     panel = ScanningPanel("+ smear", tmp_path / "bench.toml")
@@ -104,17 +106,24 @@ def test_the_study_writes_a_chart_and_a_table(study):
 
 
 def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(study):
-    rows = [{name: float(value) for name, value in row.items()} for row in table(study[0] / "stripes.csv")]
+    rows = [
+        {name: float(value) for name, value in row.items()}
+        for row in table(study[0] / "stripes.csv")
+    ]
     assert_drawn(study[0] / "stripes.png")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
     deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
     assert max(deep) > 1.2 and min(deep) < 0.9
-    assert all(abs(row["light"] - 1) < 1e-6 for row in rows if row["refreshes"] == 2 or row["lit_ms"] > 16)
+    assert all(
+        abs(row["light"] - 1) < 1e-6 for row in rows if row["refreshes"] == 2 or row["lit_ms"] > 16
+    )
 
 
 def test_a_tracker_sees_the_beat_that_is_foretold(study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
-    rows = [{name: float(value) for name, value in row.items()} for row in table(study[0] / "beat.csv")]
+    rows = [
+        {name: float(value) for name, value in row.items()} for row in table(study[0] / "beat.csv")
+    ]
     assert_drawn(study[0] / "beat.png")
     for case in QUICK_CASES:
         mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]

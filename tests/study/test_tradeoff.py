@@ -16,7 +16,16 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
-from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Figure, Trial, Trials, in_turn, measured, pareto_front
+from hilstar.instruments.study.sweep import (
+    MAX_ROUNDS,
+    MIN_ROUNDS,
+    Figure,
+    Trial,
+    Trials,
+    in_turn,
+    measured,
+    pareto_front,
+)
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, trapezoid
 from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
@@ -27,7 +36,17 @@ from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from tests.support.pictures import assert_drawn
 
-NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
+NAMES = [
+    "brightness",
+    "spectrum",
+    "depth",
+    "culling",
+    "projection",
+    "prediction",
+    "smear",
+    "psf",
+    "quantisation",
+]
 # A relative error in magnitudes: 2.5 / ln 10.
 MAG_PER_SHARE = 1.0858
 # Of the brightest star, in a pixel that holds 0.44 of it along each axis. The exp erf: two edges of
@@ -46,7 +65,11 @@ def study(tmp_path_factory):
         lines, _ = tradeoff.run(folder, quick=True)
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
-    return folder, lines, {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}
+    return (
+        folder,
+        lines,
+        {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES},
+    )
 
 
 def error_of(step, method):
@@ -69,24 +92,40 @@ def test_a_default_is_on_the_front_or_says_what_beats_it(study):
         default = next(row for row in step.values() if row["default"] == "True")
         assert (default["front"] == "True") == (default["beaten_by"] == "")
         if default["beaten_by"]:
-            assert any(method in default["beaten_by"] for method in step if method != default["method"])
+            assert any(
+                method in default["beaten_by"] for method in step if method != default["method"]
+            )
             assert any(default["beaten_by"] in line for line in lines)
 
 
 def test_the_defaults_are_the_code_s_own(study):
     steps = study[2]
-    default = {name: next(m for m, row in step.items() if row["default"] == "True") for name, step in steps.items()}
+    default = {
+        name: next(m for m, row in step.items() if row["default"] == "True")
+        for name, step in steps.items()
+    }
     assert default["brightness"] == f"table over 1/T, degree {TABLE_DEGREE}"
     assert default["culling"] == f"cells of {CELL_DEG:g} deg"
     assert default["projection"].endswith("whole pixel + float32 fraction")
-    assert (default["spectrum"], default["depth"], default["quantisation"]) == ("real spectra by V-I", "V to 7.5", "exact")
+    assert (default["spectrum"], default["depth"], default["quantisation"]) == (
+        "real spectra by V-I",
+        "V to 7.5",
+        "exact",
+    )
     assert default["prediction"] == "linear, by the sample's rate"
     assert default["smear"].startswith("Gauss-Legendre by length")
 
 
 def test_what_is_exact_is_so_to_rounding(study):
     """Figures from each step's `floor`: float64 integrals, float32 sprites, extended precision."""
-    floors = {"brightness": 5e-12, "spectrum": 5e-12, "depth": 0.0, "culling": 0.0, "projection": 1e-12, "smear": 1e-7}
+    floors = {
+        "brightness": 5e-12,
+        "spectrum": 5e-12,
+        "depth": 0.0,
+        "culling": 0.0,
+        "projection": 1e-12,
+        "smear": 1e-7,
+    }
     for name, floor in floors.items():
         exact = [row for row in study[2][name].values() if row["exact"] == "True"]
         assert len(exact) == 1 and float(exact[0]["error"]) <= floor
@@ -96,7 +135,10 @@ def test_what_is_exact_is_so_to_rounding(study):
 
 def test_the_defaults_keep_their_modules_promises(study):
     steps = study[2]
-    own = {name: next(row for row in step.values() if row["default"] == "True") for name, step in steps.items()}
+    own = {
+        name: next(row for row in step.values() if row["default"] == "True")
+        for name, step in steps.items()
+    }
     assert float(own["psf"]["error"]) <= MAX_CUT * MAG_PER_SHARE
     assert float(own["smear"]["error"]) <= 1e-6  # scene/exposure_motion.py
     assert float(own["culling"]["error"]) == 0
@@ -108,17 +150,45 @@ def test_less_is_worse(study):
 
     def falls(step, *methods):
         errors = [error_of(steps[step], method) for method in methods]
-        assert all(worse > better for worse, better in itertools.pairwise(errors)), (methods, errors)
+        assert all(worse > better for worse, better in itertools.pairwise(errors)), (
+            methods,
+            errors,
+        )
 
-    falls("psf", "GL polynomial, R32F, 6 px", "GL polynomial, R32F, 8 px", "GL polynomial, R32F, 10 px")
-    falls("psf", "GL polynomial, R16F, 10 px", "GL table of 512, 10 px", "GL polynomial, R32F, 10 px")
-    falls("brightness", "AGS", "trapezoid, 10 nm", "trapezoid, 5 nm", "trapezoid, 1 nm", "Gauss-Legendre, 3 per knot")
+    falls(
+        "psf",
+        "GL polynomial, R32F, 6 px",
+        "GL polynomial, R32F, 8 px",
+        "GL polynomial, R32F, 10 px",
+    )
+    falls(
+        "psf", "GL polynomial, R16F, 10 px", "GL table of 512, 10 px", "GL polynomial, R32F, 10 px"
+    )
+    falls(
+        "brightness",
+        "AGS",
+        "trapezoid, 10 nm",
+        "trapezoid, 5 nm",
+        "trapezoid, 1 nm",
+        "Gauss-Legendre, 3 per knot",
+    )
     falls("brightness", *(f"table over 1/T, degree {n}" for n in (5, 10, 20, 40)))
     falls("spectrum", "AGS, one average", "black body, ballesteros2012", "real spectra by V-I")
     falls("depth", *(f"V to {limit:g}" for limit in LIMITS_V_MAG), "all of Hipparcos")
     falls("culling", "cells of 10 deg, by centres only", "cells of 10 deg")
-    falls("projection", "float32 throughout", "float64, place in float32", "float64, whole pixel + float32 fraction")
-    falls("prediction", "hold", "linear, by the last two samples", "linear, by the sample's rate", "C2 blend, a sample later")
+    falls(
+        "projection",
+        "float32 throughout",
+        "float64, place in float32",
+        "float64, whole pixel + float32 fraction",
+    )
+    falls(
+        "prediction",
+        "hold",
+        "linear, by the last two samples",
+        "linear, by the sample's rate",
+        "C2 blend, a sample later",
+    )
     falls("smear", *(f"evenly in time, {n}" for n in (4, 8, 16, 32, 64)), "Gauss-Legendre, 24")
     falls("quantisation", "round", "exact", "exact, bit stealing")
 
@@ -153,7 +223,9 @@ def planted(clock, own_ms, floor=0.0):
         Trial("own", 1e-3, 0.0, clock(own_ms), is_default=True),
         Trial("slow and rough", 0.1, 0.0, clock(100.0)),
     ]
-    return Trials("planted", "sums", Figure("error", "px", floor), Figure("rms", "px"), "it is tidy", trials)
+    return Trials(
+        "planted", "sums", Figure("error", "px", floor), Figure("rms", "px"), "it is tidy", trials
+    )
 
 
 def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(clock):
@@ -163,7 +235,9 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
     # all errors count as none: the fastest is best
     beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)
     assert not beaten.default.on_front
-    assert beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
+    assert (
+        beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
+    )
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
 
 
@@ -184,7 +258,12 @@ def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_star
     wanted = linear_image(field, (160, 120), SPRITE_PSF)
     brightest = float(field.data["electrons_per_s"].max())
     drawn = {}
-    for variant in (SplatVariant(), SplatVariant("exp erf"), SplatVariant("table", table_size=4096), SplatVariant("centre")):
+    for variant in (
+        SplatVariant(),
+        SplatVariant("exp erf"),
+        SplatVariant("table", table_size=4096),
+        SplatVariant("centre"),
+    ):
         with VariantRenderer(Target((160, 120), SPRITE_PSF), variant) as renderer:
             renderer.draw_and_wait(field)
             drawn[variant.profile] = np.abs(renderer.linear() - wanted).max()
@@ -195,7 +274,9 @@ def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_star
 
 
 def test_half_floats_are_told_apart_and_smaller_sprites_are_smaller():
-    with VariantRenderer(Target((64, 64), SPRITE_PSF), SplatVariant(half_float=True, footprint_px=6)) as renderer:
+    with VariantRenderer(
+        Target((64, 64), SPRITE_PSF), SplatVariant(half_float=True, footprint_px=6)
+    ) as renderer:
         assert (renderer.texel, renderer.footprint_px) == ("R16F", 6)
 
 

@@ -23,15 +23,22 @@ def reported(bench: Bench, true: BenchGeometry, q_icrs_to_cam: FloatArray) -> Fl
     """
     truth = bench.frame(q_icrs_to_cam).truth
     order = np.argsort(bench.stars.hip)
-    catalogue = bench.stars.vectors[order[np.searchsorted(bench.stars.hip, truth["hip"], sorter=order)]]
+    catalogue = bench.stars.vectors[
+        order[np.searchsorted(bench.stars.hip, truth["hip"], sorter=order)]
+    ]
     seen = true.tracker.rays(*true.to_tracker(truth["x_px"], truth["y_px"]))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     u, _, vt = np.linalg.svd(seen.T @ catalogue)
     return from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
-def write_pairs(path: Path, commanded: Iterable[FloatArray], reported: Iterable[FloatArray]) -> Path:
+def write_pairs(
+    path: Path, commanded: Iterable[FloatArray], reported: Iterable[FloatArray]
+) -> Path:
     """A table of pairs, with every bit."""
-    rows = [",".join(map(repr, [*c.tolist(), *t.tolist()])) for c, t in zip(commanded, reported, strict=True)]
+    rows = [
+        ",".join(map(repr, [*c.tolist(), *t.tolist()]))
+        for c, t in zip(commanded, reported, strict=True)
+    ]
     path.write_text("\n".join([HEADER, *rows]) + "\n")
     return path

@@ -33,7 +33,9 @@ def bench_text(*changes: Tables) -> str:
     lines = []
     for name, keys in tables.items():
         lines.append(f"\n[{name}]")
-        lines += [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
+        lines += [
+            f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -46,7 +48,9 @@ LIVE_BENCH = bench_text({"render": {"quantisation": "round"}})
 
 # The size of the X servers of tests/support/x11/screens.py. On a busy machine `auto` might choose
 # other codes than `frame`.
-SCREEN_BENCH = bench_text({"monitor": {"resolution_px": [640, 480]}, "render": {"quantisation": "exact"}})
+SCREEN_BENCH = bench_text(
+    {"monitor": {"resolution_px": [640, 480]}, "render": {"quantisation": "exact"}}
+)
 
 # Changes that make a bench of it whose light the twin can see whole: 10 bits, and a tracker's pixel
 # for a monitor's.

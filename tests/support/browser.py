@@ -59,7 +59,10 @@ class Browser(Chrome):
 
     def prefer(self, **features: str) -> None:
         """What the user's system asks for: color_scheme="light", reduced_motion="reduce"."""
-        asked = [{"name": f"prefers-{name.replace('_', '-')}", "value": value} for name, value in features.items()]
+        asked = [
+            {"name": f"prefers-{name.replace('_', '-')}", "value": value}
+            for name, value in features.items()
+        ]
         self.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": asked})
 
     def picture(self, path: Path, whole: bool = False) -> Path:
@@ -91,11 +94,17 @@ class Browser(Chrome):
 
     def text(self, selector: str) -> str:
         """What an element says, as it stands in the page, whatever its style makes of it."""
-        return " ".join(str(self.run("return document.querySelector(arguments[0]).textContent", selector)).split())
+        return " ".join(
+            str(
+                self.run("return document.querySelector(arguments[0]).textContent", selector)
+            ).split()
+        )
 
     def until(self, condition: str, patience_s: float = PATIENCE_S) -> None:
         """Wait until a condition in JavaScript holds."""
-        WebDriverWait(self, patience_s, poll_frequency=0.02).until(lambda _: self.run(f"return {condition}"), condition)
+        WebDriverWait(self, patience_s, poll_frequency=0.02).until(
+            lambda _: self.run(f"return {condition}"), condition
+        )
 
     def overflowing(self) -> list[str]:
         """What reaches out of the page's window to the right, and what text is wider than its
@@ -119,7 +128,9 @@ def browser() -> Iterator[Browser]:
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    found = Browser(options=options, service=Service(shutil.which("chromedriver") or "/usr/bin/chromedriver"))
+    found = Browser(
+        options=options, service=Service(shutil.which("chromedriver") or "/usr/bin/chromedriver")
+    )
     try:
         yield found
     finally:
@@ -137,7 +148,9 @@ def assert_fits_every_size_in_light_and_dark(page: Browser, directory: Path) -> 
         page.until(f"document.documentElement.dataset.theme === '{theme}'")
         assert page.run("return document.documentElement.scrollWidth <= innerWidth")
         assert page.overflowing() == [], size
-        shot = np.asarray(Image.open(page.picture(directory / f"{theme}.png")).convert("L"), dtype=float)
+        shot = np.asarray(
+            Image.open(page.picture(directory / f"{theme}.png")).convert("L"), dtype=float
+        )
         assert shot.shape[::-1] == SIZES_PX[size]
         ground = float(np.median(shot[:5]))
         assert ground < DARK if theme == "dark" else ground > LIGHT

@@ -52,7 +52,9 @@ class Planted:
     seed: int = 1
 
 
-def seen(planted: Planted, middle_ns: int, known: list[dict[str, Any]]) -> tuple[int, np.ndarray] | None:
+def seen(
+    planted: Planted, middle_ns: int, known: list[dict[str, Any]]
+) -> tuple[int, np.ndarray] | None:
     """The case and the attitude that were lit over the whole exposure; None where none was.
     `known`: the last two cases.
     """
@@ -74,10 +76,14 @@ def wave(q: np.ndarray, length_px: float) -> np.ndarray:
     FIRST_DIRECTION.
     """
     star = to_matrix(q) @ FIRST_DIRECTION
-    return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[..., :2] / star[..., 2:] / length_px))
+    return np.asarray(
+        np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[..., :2] / star[..., 2:] / length_px)
+    )
 
 
-def error_arcsec(planted: Planted, q: np.ndarray, at_s: float, rng: np.random.Generator) -> np.ndarray:
+def error_arcsec(
+    planted: Planted, q: np.ndarray, at_s: float, rng: np.random.Generator
+) -> np.ndarray:
     """The planted error at an attitude, so long after the start."""
     error = np.array(planted.bias_arcsec) + np.array(planted.noise_arcsec) * rng.standard_normal(3)
     error[:2] += planted.fov_arcsec * wave(q, WAVE_PX) + planted.pixel_arcsec * wave(q, 1.0)
@@ -94,7 +100,14 @@ def main() -> None:
     while not select.select([sys.stdin], [], [], 0)[0]:
         middle_ns = begun_ns + round(k / planted.answer_hz * 1e9)
         k += 1
-        time.sleep(max(0.0, (middle_ns - time.monotonic_ns()) / 1e9 + planted.exposure_s / 2 + planted.latency_s))
+        time.sleep(
+            max(
+                0.0,
+                (middle_ns - time.monotonic_ns()) / 1e9
+                + planted.exposure_s / 2
+                + planted.latency_s,
+            )
+        )
         found, at_s = seen(planted, middle_ns, known), (middle_ns - begun_ns) / 1e9
         told: dict[str, object] = {"t_ns": middle_ns, "q": [1.0, 0.0, 0.0, 0.0], "valid": False}
         if found is not None and found[0] not in planted.blind:

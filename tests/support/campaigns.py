@@ -11,7 +11,14 @@ import pyarrow.parquet as pq
 from tests.support.benches import bench_text
 
 SMALL_TRACKER = {"focal_length_mm": 20, "resolution_px": [128, 128], "transmission": None}
-DETECTOR = {"read_noise_e": 10, "dark_e_per_s": 200, "dsnu_e_per_s": 40, "prnu": 0.01, "gain_e_per_dn": 5, "full_well_e": 70000}
+DETECTOR = {
+    "read_noise_e": 10,
+    "dark_e_per_s": 200,
+    "dsnu_e_per_s": 40,
+    "prnu": 0.01,
+    "gain_e_per_dn": 5,
+    "full_well_e": 70000,
+}
 VARY: tuple[dict[str, Any], ...] = (
     {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0},
     {"key": "tracker.detector.temperature_k", "minimum": 260, "maximum": 300},
@@ -19,9 +26,13 @@ VARY: tuple[dict[str, Any], ...] = (
 )
 
 
-def write_campaign(folder: Path, *vary: dict[str, Any], attitudes: dict[str, Any] | None = None, **keys: Any) -> Path:
+def write_campaign(
+    folder: Path, *vary: dict[str, Any], attitudes: dict[str, Any] | None = None, **keys: Any
+) -> Path:
     """`bench.toml` and `plan.toml` in a folder; the plan's path."""
-    (folder / "bench.toml").write_text(bench_text({"tracker": SMALL_TRACKER, "tracker.detector": DETECTOR}))
+    (folder / "bench.toml").write_text(
+        bench_text({"tracker": SMALL_TRACKER, "tracker.detector": DETECTOR})
+    )
     plan = folder / "plan.toml"
     plan.write_text(plan_text(*(vary or VARY), attitudes=attitudes, **keys))
     return plan

@@ -14,7 +14,9 @@ BLUR_PX = 0.62  # of a tracker's optics, on the monitor
 
 
 def blurred(stars, sigma_px=BLUR_PX):
-    return gaussian_filter1d(gaussian_filter1d(stars, sigma_px, axis=1, truncate=6), sigma_px, axis=2, truncate=6)
+    return gaussian_filter1d(
+        gaussian_filter1d(stars, sigma_px, axis=1, truncate=6), sigma_px, axis=2, truncate=6
+    )
 
 
 def axis(stars):
@@ -49,14 +51,23 @@ def fitted(stars, sigma_px):
         (share_x, slope_x), (share_y, slope_y) = (_profile(at, place, sigma_px) for place in (x, y))
         model = share_y[:, :, None] * share_x[:, None, :]
         slopes = flux[:, None, None] * np.stack(
-            [model / flux[:, None, None], share_y[:, :, None] * slope_x[:, None, :], slope_y[:, :, None] * share_x[:, None, :]]
+            [
+                model / flux[:, None, None],
+                share_y[:, :, None] * slope_x[:, None, :],
+                slope_y[:, :, None] * share_x[:, None, :],
+            ]
         )
         slopes = slopes.reshape(3, len(stars), -1)
         left = (stars - flux[:, None, None] * model).reshape(len(stars), -1)
-        step = np.linalg.solve(np.einsum("knp,lnp->nkl", slopes, slopes), np.einsum("knp,np->nk", slopes, left)[..., None])[
-            ..., 0
-        ]
-        flux, x, y = flux + step[:, 0], x + np.clip(step[:, 1], -0.3, 0.3), y + np.clip(step[:, 2], -0.3, 0.3)
+        step = np.linalg.solve(
+            np.einsum("knp,lnp->nkl", slopes, slopes),
+            np.einsum("knp,np->nk", slopes, left)[..., None],
+        )[..., 0]
+        flux, x, y = (
+            flux + step[:, 0],
+            x + np.clip(step[:, 1], -0.3, 0.3),
+            y + np.clip(step[:, 2], -0.3, 0.3),
+        )
     return x, y, flux
 
 
@@ -95,4 +106,6 @@ def family_errors_px(shown, wanted, sigma_px):
         "3 x 3, blurred": (box_mean(seen, 1, sky), box_mean(sky, 1, sky)),
         "5 x 5, blurred": (box_mean(seen, 2, sky), box_mean(sky, 2, sky)),
     }
-    return {name: float(np.sqrt(np.mean(np.square(np.subtract(*pair))))) for name, pair in pairs.items()}
+    return {
+        name: float(np.sqrt(np.mean(np.square(np.subtract(*pair))))) for name, pair in pairs.items()
+    }

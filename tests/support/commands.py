@@ -21,7 +21,10 @@ from tests.support.waiting import PATIENCE_S
 
 
 def run_hilstar(
-    *arguments: str | Path, cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
+    *arguments: str | Path,
+    cwd: Path | None = None,
+    timeout: float = PATIENCE_S,
+    env: dict[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own, without the half second of its
     imports (see `Started`).
@@ -30,14 +33,23 @@ def run_hilstar(
 
 
 def run_started(
-    command: list[str], cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
+    command: list[str],
+    cwd: Path | None = None,
+    timeout: float = PATIENCE_S,
+    env: dict[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Any command of Python's, the same way."""
     env = dict(os.environ) if env is None else env
     # A group of its own: what the command has started (`demo` a sender) ends with it, however it
     # ends.
     with Started(
-        command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        cwd=cwd,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     ) as process:
         try:
             out, err = process.communicate(timeout=timeout)
@@ -57,7 +69,10 @@ def run_hilstar_here(
     starts) is `run_hilstar`'s.
     """
     words = [str(argument) for argument in arguments]
-    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True) for _ in range(2))
+    out, err = (
+        io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True)
+        for _ in range(2)
+    )
     to_out, to_err = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     with bounded_by(timeout), contextlib.chdir(cwd or Path.cwd()), to_out, to_err, logging_to(err):
         code = run_command(words)

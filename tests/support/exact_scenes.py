@@ -67,9 +67,16 @@ def flux_of(mag, sigma_px=USUAL):
 
 
 def sprites_of(x_px, y_px, mag, sigma_px=USUAL):
-    x, y = (np.concatenate([np.atleast_1d(part) for part in axis]).astype(float) for axis in (x_px, y_px))
-    light = np.concatenate([np.full(np.size(part), flux_of(m, sigma_px)) for part, m in zip(x_px, mag, strict=True)])
-    return pack_sprites(x, y, light, np.arange(len(x)), (SIDE, SIDE), GaussianPsf(sigma_px).footprint_px)
+    x, y = (
+        np.concatenate([np.atleast_1d(part) for part in axis]).astype(float)
+        for axis in (x_px, y_px)
+    )
+    light = np.concatenate(
+        [np.full(np.size(part), flux_of(m, sigma_px)) for part, m in zip(x_px, mag, strict=True)]
+    )
+    return pack_sprites(
+        x, y, light, np.arange(len(x)), (SIDE, SIDE), GaussianPsf(sigma_px).footprint_px
+    )
 
 
 def middles():
@@ -88,7 +95,9 @@ def tiles():
 
 def single(mag, response, sigma_px=USUAL, uniformity=None):
     x, y = middles()
-    return Scene(sprites_of([x], [y], [mag], sigma_px), tiles(), response, sigma_px, uniformity, lone=True)
+    return Scene(
+        sprites_of([x], [y], [mag], sigma_px), tiles(), response, sigma_px, uniformity, lone=True
+    )
 
 
 def pairs(mags, apart_px, response, sigma_px=USUAL):
@@ -96,14 +105,22 @@ def pairs(mags, apart_px, response, sigma_px=USUAL):
     x, y = middles()
     angle = np.linspace(0, 2 * np.pi, len(x), endpoint=False)
     beside = x + apart_px * np.cos(angle), y + apart_px * np.sin(angle)
-    return Scene(sprites_of([x, beside[0]], [y, beside[1]], mags, sigma_px), tiles(), response, sigma_px)
+    return Scene(
+        sprites_of([x, beside[0]], [y, beside[1]], mags, sigma_px), tiles(), response, sigma_px
+    )
 
 
 def at_edge(inside_px, mag, response, sigma_px=USUAL, uniformity=None):
     """Stars about so far within all four edges (negative: beyond), at every phase along and
     across, and at the corners.
     """
-    along = np.arange(1, COUNT - 1) * TILE + TILE / 2 - 0.5 + (np.arange(1, COUNT - 1) + 0.5) / COUNT - 0.5
+    along = (
+        np.arange(1, COUNT - 1) * TILE
+        + TILE / 2
+        - 0.5
+        + (np.arange(1, COUNT - 1) + 0.5) / COUNT
+        - 0.5
+    )
     near = inside_px - 0.5 + (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 0.5
     far, corner = SIDE - 1 - near, np.array([0.1, -0.3]) + inside_px - 0.5
     x = np.concatenate([near, far, along, along, corner, SIDE - 1 - corner])
@@ -112,7 +129,8 @@ def at_edge(inside_px, mag, response, sigma_px=USUAL, uniformity=None):
     keep = [*range(4 * len(along)), 4 * len(along), 4 * len(along) + 3]
     x, y = x[keep], y[keep]
     windows = [
-        tuple(slice(max(round(at) - 11, 0), min(round(at) + 12, SIDE)) for at in place) for place in zip(y, x, strict=True)
+        tuple(slice(max(round(at) - 11, 0), min(round(at) + 12, SIDE)) for at in place)
+        for place in zip(y, x, strict=True)
     ]
     return Scene(sprites_of([x], [y], [mag], sigma_px), windows, response, sigma_px, uniformity)
 
@@ -187,15 +205,23 @@ def streaks(mag, response, sigma_px=USUAL, uniformity=None, cut=False):
     others left out.
     """
     rng, side = np.random.default_rng(1), 2 * TILE
-    middle = [axis.ravel() for axis in np.meshgrid(*[np.arange(COUNT // 2) * side + side / 2 - 0.5] * 2)]
-    x, y = middle[0] + rng.uniform(-0.5, 0.5, len(middle[0])), middle[1] + rng.uniform(-0.5, 0.5, len(middle[1]))
+    middle = [
+        axis.ravel() for axis in np.meshgrid(*[np.arange(COUNT // 2) * side + side / 2 - 0.5] * 2)
+    ]
+    x, y = (
+        middle[0] + rng.uniform(-0.5, 0.5, len(middle[0])),
+        middle[1] + rng.uniform(-0.5, 0.5, len(middle[1])),
+    )
     parts = [slice(number * side, (number + 1) * side) for number in range(COUNT // 2)]
     windows = [(rows, columns) for rows in parts for columns in parts]
     if cut:
         x, y, windows = rng.uniform(-1, 3, COUNT // 2), y[:: COUNT // 2], windows[:: COUNT // 2]
     angle = rng.uniform(-0.6, 0.6, len(x)) if cut else rng.uniform(0, 2 * np.pi, len(x))
     along = LENGTH_PX * ((np.arange(NODES) + 0.5) / NODES - 0.5)
-    places = (x[:, None] + np.cos(angle)[:, None] * along).ravel(), (y[:, None] + np.sin(angle)[:, None] * along).ravel()
+    places = (
+        (x[:, None] + np.cos(angle)[:, None] * along).ravel(),
+        (y[:, None] + np.sin(angle)[:, None] * along).ravel(),
+    )
     sprites = sprites_of([places[0]], [places[1]], [mag + 2.5 * np.log10(NODES)], sigma_px)
     paths = replace(sprites, star=sprites.star // NODES, per_star=NODES)
     return Scene(paths, windows, response, sigma_px, uniformity)
@@ -218,7 +244,9 @@ STREAK_OF_ROUND = 0.3, 0.55
 
 def assert_streaks_are_right(levels, scene):
     """Light and middle of whole streaks, against `round`."""
-    rounded = np.array(errors_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene).rms())
+    rounded = np.array(
+        errors_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene).rms()
+    )
     assert levels.max() <= scene.response.white
     assert (np.array(errors_of(levels, scene).rms()) <= np.array(STREAK_OF_ROUND) * rounded).all()
 
@@ -244,9 +272,17 @@ def errors_of_light(shown, scene):
     wanted, found = scene.wanted, []
     for window in scene.windows:
         rows, columns = np.mgrid[window]
-        sums = [[float((image[window] * arm).sum()) for arm in (1, columns, rows)] for image in (shown, wanted)]
+        sums = [
+            [float((image[window] * arm).sum()) for arm in (1, columns, rows)]
+            for image in (shown, wanted)
+        ]
         (light, x, y), (true, true_x, true_y) = sums
-        found.append((-2.5 * np.log10(light / true), np.hypot(x / light - true_x / true, y / light - true_y / true)))
+        found.append(
+            (
+                -2.5 * np.log10(light / true),
+                np.hypot(x / light - true_x / true, y / light - true_y / true),
+            )
+        )
     return Errors(*(np.array(part) for part in zip(*found, strict=True)))
 
 
@@ -278,9 +314,13 @@ def over(refreshes, frames, scene):
     squares = []
     for begin in PHASES:
         number = np.arange(FRAMES)
-        weights = np.maximum(np.minimum(number + 1, begin + refreshes) - np.maximum(number, begin), 0.0)
+        weights = np.maximum(
+            np.minimum(number + 1, begin + refreshes) - np.maximum(number, begin), 0.0
+        )
         assert abs(weights.sum() - refreshes) < 1e-9
-        squares.append(np.square(errors_of_light(np.tensordot(weights, frames, 1) / refreshes, scene).rms()))
+        squares.append(
+            np.square(errors_of_light(np.tensordot(weights, frames, 1) / refreshes, scene).rms())
+        )
     return np.sqrt(np.mean(squares, axis=0))
 
 
@@ -289,7 +329,9 @@ def assert_right_over_frames(frames, scene):
     any phase.
     """
     frames = np.stack(frames)
-    rounded = np.array(errors_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene).rms())
+    rounded = np.array(
+        errors_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene).rms()
+    )
     whole, more = over(6.0, frames, scene), over(6.3, frames, scene)
     assert np.isfinite(whole).all() and np.isfinite(more).all()
     assert (whole <= np.array([OF_ROUND_MAG, OF_ROUND_PX]) * rounded + ROUNDING).all()

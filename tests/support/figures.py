@@ -61,8 +61,12 @@ def assert_legible(figure: Figure, *, drawn: bool = False) -> None:
     texts = [(text, box(text)) for text in seen(figure)]
     for text, extent in texts:
         words, inside = text.get_text(), Bbox.from_bounds(*figure.bbox.bounds).padded(TOUCH_PX)
-        assert inside.containsx(extent.x0) and inside.containsx(extent.x1), f"{words!r} leaves the canvas"
-        assert inside.containsy(extent.y0) and inside.containsy(extent.y1), f"{words!r} leaves the canvas"
+        assert inside.containsx(extent.x0) and inside.containsx(extent.x1), (
+            f"{words!r} leaves the canvas"
+        )
+        assert inside.containsy(extent.y0) and inside.containsy(extent.y1), (
+            f"{words!r} leaves the canvas"
+        )
         size_px = text.get_fontsize() / 72 * PAGE_PX / figure.get_figwidth()
         assert size_px >= MIN_TEXT_PX, f"{words!r} is {size_px:.1f} px high"
         assert not re.search(r"\de[+-]\d\d", words), f"{words!r} is a computer's figure"
@@ -88,7 +92,10 @@ def assert_title_is_drawn(figure: Figure, stem: str) -> None:
         if re.search(rf"(?<![\d.]){re.escape(figure_words)}(?!\d|\.\d)", words):
             continue
         half_digit = 0.505 * 10.0 ** -len(figure_words.partition(".")[2])
-        off = min(float(np.abs(values * scale - float(figure_words)).min(initial=np.inf)) for scale in DRAWN_AS)
+        off = min(
+            float(np.abs(values * scale - float(figure_words)).min(initial=np.inf))
+            for scale in DRAWN_AS
+        )
         assert off <= half_digit, f"{stem}: {figure_words} of the title {title!r} is not drawn"
 
 
@@ -97,8 +104,16 @@ def drawn_values(figure: Figure) -> np.ndarray:
     values: list[np.ndarray] = [np.zeros(0)]
     for axes in figure.axes:
         values += [np.asarray(line.get_xydata(), dtype=float).ravel() for line in axes.get_lines()]
-        values += [np.array([patch.get_height(), patch.get_width()]) for patch in axes.patches if hasattr(patch, "get_height")]
-        values += [path.vertices.ravel() for collection in axes.collections for path in collection.get_paths()]
+        values += [
+            np.array([patch.get_height(), patch.get_width()])
+            for patch in axes.patches
+            if hasattr(patch, "get_height")
+        ]
+        values += [
+            path.vertices.ravel()
+            for collection in axes.collections
+            for path in collection.get_paths()
+        ]
     every = np.concatenate(values)
     return every[np.isfinite(every)]
 
@@ -124,12 +139,20 @@ def box(text: Text) -> Bbox:
 
 def touch(a: Bbox, b: Bbox) -> bool:
     """Whether two boxes lie over each other."""
-    return min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH_PX and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH_PX
+    return (
+        min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH_PX
+        and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH_PX
+    )
 
 
 def assert_capital(axes: Axes) -> None:
     """Titles and labels begin alike."""
-    for words in (axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left"), axes.get_title()):
+    for words in (
+        axes.get_xlabel(),
+        axes.get_ylabel(),
+        axes.get_title(loc="left"),
+        axes.get_title(),
+    ):
         assert words == charts.capital(words), words
 
 
@@ -137,13 +160,18 @@ def named_colours(figure: Figure, texts: list[Text]) -> set[str]:
     """Colours that a text has, or a legend names."""
     found = {to_hex(text.get_color()) for text in texts}
     for legend in legends(figure):
-        found |= {to_hex(colour) for handle in legend.legend_handles for colour in handle_colours(handle)}
+        found |= {
+            to_hex(colour) for handle in legend.legend_handles for colour in handle_colours(handle)
+        }
     return found
 
 
 def legends(figure: Figure) -> list:
     """Every legend, of the figure and of its axes."""
-    return [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend() is not None)]
+    return [
+        *figure.legends,
+        *(axes.get_legend() for axes in figure.axes if axes.get_legend() is not None),
+    ]
 
 
 def handle_colours(handle) -> Iterator:
@@ -165,16 +193,24 @@ def assert_lines(axes: Axes, named: set[str]) -> None:
         if not len(drawn) or not line.get_visible():
             continue
         colour = to_hex(line.get_color())
-        assert colour in PLAIN or colour in named, f"nothing names the line {line.get_label()!r} in {colour}"
+        assert colour in PLAIN or colour in named, (
+            f"nothing names the line {line.get_label()!r} in {colour}"
+        )
         assert line.get_label() == "" or colour in charts.DARK, (
             f"{line.get_label()!r} has the colour {colour}, which has no dark one"
         )
         if x_is_data and y_is_data and line.get_gid() != "cut":
             low, high = axes.bbox.y0 - TOUCH_PX, axes.bbox.y1 + TOUCH_PX
-            assert (drawn[:, 1] >= low).all() and (drawn[:, 1] <= high).all(), f"{line.get_label()!r} leaves its axes"
+            assert (drawn[:, 1] >= low).all() and (drawn[:, 1] <= high).all(), (
+                f"{line.get_label()!r} leaves its axes"
+            )
         if over is not None:
             steps = np.linspace(0, 1, 50)[:, None]
             if line.get_linestyle() not in ("None", "none", "") and len(drawn) < 500:
-                drawn = np.concatenate([a + steps * (b - a) for a, b in itertools.pairwise(drawn)] or [drawn])
-            inside = (drawn > [over.x0, over.y0]).all(axis=1) & (drawn < [over.x1, over.y1]).all(axis=1)
+                drawn = np.concatenate(
+                    [a + steps * (b - a) for a, b in itertools.pairwise(drawn)] or [drawn]
+                )
+            inside = (drawn > [over.x0, over.y0]).all(axis=1) & (drawn < [over.x1, over.y1]).all(
+                axis=1
+            )
             assert not inside.any(), f"{line.get_label()!r} lies under the legend"

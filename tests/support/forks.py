@@ -46,7 +46,12 @@ MODULES = (
     "server.record.ledger",
     "server.serve",
 )
-COMMANDS = (["serve", "none.toml"], ["replay", "none.toml", "none.csv"], ["frame", "none.toml"], ["--version"])
+COMMANDS = (
+    ["serve", "none.toml"],
+    ["replay", "none.toml", "none.csv"],
+    ["frame", "none.toml"],
+    ["--version"],
+)
 # What these commands import as they go; each takes 0.2 s to a second.
 LATER = {
     "campaign": (
@@ -79,16 +84,31 @@ class Started(subprocess.Popen):
 
     def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any,
                        startupinfo: Any, creationflags: Any, shell: Any, *more: Any) -> None:  # fmt: skip
-        (p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite), new_session = more[:6], bool(more[11])
+        (p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite), new_session = (
+            more[:6],
+            bool(more[11]),
+        )
         environment = dict(os.environ if env is None else env)
-        is_plain = not (preexec_fn or pass_fds or shell) and python_of(environment) == python_of(os.environ)
+        is_plain = not (preexec_fn or pass_fds or shell) and python_of(environment) == python_of(
+            os.environ
+        )
         if not is_plain or args[0] != sys.executable or args[1] not in {"-m", "-c"}:
             super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags,
                                    shell, *more)  # fmt: skip
             return
-        request = {"words": list(map(str, args)), "folder": str(cwd or Path.cwd()), "new_session": new_session}
-        request |= {"environment": environment, "inherited": inherited_settings(), "ignored": self._ignored}
-        streams = [own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))]
+        request = {
+            "words": list(map(str, args)),
+            "folder": str(cwd or Path.cwd()),
+            "new_session": new_session,
+        }
+        request |= {
+            "environment": environment,
+            "inherited": inherited_settings(),
+            "ignored": self._ignored,
+        }
+        streams = [
+            own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))
+        ]
         self.pid = fork_server().fork(request, streams)
         self._child_created = True
         self._close_pipe_fds(p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite)
@@ -98,7 +118,9 @@ def python_of(environment: Mapping[str, str]) -> dict[str, str]:
     """What an environment says to Python itself and to its loader of libraries, which hear it as
     they start.
     """
-    return {name: value for name, value in environment.items() if name.startswith(("PYTHON", "LD_"))}
+    return {
+        name: value for name, value in environment.items() if name.startswith(("PYTHON", "LD_"))
+    }
 
 
 def inherited_settings() -> dict[str, Any]:
@@ -246,7 +268,9 @@ def show_command_line(command: list[str]) -> None:
     reads it).
     """
     begin, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[45:47])
-    text = b"".join(word.encode(errors="surrogateescape") + b"\0" for word in command)[: end - begin - 1]
+    text = b"".join(word.encode(errors="surrogateescape") + b"\0" for word in command)[
+        : end - begin - 1
+    ]
     ctypes.memmove(begin, text.ljust(end - begin, b"\0"), end - begin)
 
 

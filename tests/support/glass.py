@@ -36,11 +36,17 @@ def profile(x_px: float, y_px: float, nm: float, focus_um: float = 0.0):
 
 def illumination(x_px: float, y_px: float) -> float:
     """Light relative to the middle of the field."""
-    return 1 - 0.2 * ((x_px - (SIDE_PX - 1) / 2) ** 2 + (y_px - (SIDE_PX - 1) / 2) ** 2) / SIDE_PX**2
+    return (
+        1 - 0.2 * ((x_px - (SIDE_PX - 1) / 2) ** 2 + (y_px - (SIDE_PX - 1) / 2) ** 2) / SIDE_PX**2
+    )
 
 
 def stack(
-    points: int = 5, wavelengths_nm=WAVELENGTHS_NM, focuses_um=(0.0,), per_px: int = 4, integrated: bool = False
+    points: int = 5,
+    wavelengths_nm=WAVELENGTHS_NM,
+    focuses_um=(0.0,),
+    per_px: int = 4,
+    integrated: bool = False,
 ) -> Stack:
     """Its images at `points` squared places of the detector."""
     at = np.arange(-HALF_PX * per_px, HALF_PX * per_px + 1) / per_px
@@ -50,17 +56,29 @@ def stack(
             for nm in wavelengths_nm:
                 for focus in focuses_um:
                     light = profile(x, y, nm, focus)
-                    images.append(in_pixels(light, at, at, 4) if integrated else light(at[None], at[:, None]))
+                    images.append(
+                        in_pixels(light, at, at, 4) if integrated else light(at[None], at[:, None])
+                    )
                     places.append((x, y, nm, focus))
                     facts.append((illumination(x, y), *[0.0] * (len(FACTS) - 1)))
     return Stack(np.array(images), np.array(places), np.array(facts), per_px, integrated)
 
 
-def truth(x_px: float, y_px: float, shares, side_px: int, focus_um: float = 0.0, wavelengths_nm=WAVELENGTHS_NM) -> np.ndarray:
+def truth(
+    x_px: float,
+    y_px: float,
+    shares,
+    side_px: int,
+    focus_um: float = 0.0,
+    wavelengths_nm=WAVELENGTHS_NM,
+) -> np.ndarray:
     """A star's light (side, side) in the pixels about the nearest to it, by quadrature."""
     pixel = np.arange(side_px) - side_px // 2
     x, y = (np.floor(place + 0.5) + pixel - place for place in (x_px, y_px))
-    return sum(s * in_pixels(profile(x_px, y_px, nm, focus_um), x, y) for s, nm in zip(shares, wavelengths_nm, strict=True))
+    return sum(
+        s * in_pixels(profile(x_px, y_px, nm, focus_um), x, y)
+        for s, nm in zip(shares, wavelengths_nm, strict=True)
+    )
 
 
 def moments(light: np.ndarray) -> np.ndarray:

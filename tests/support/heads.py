@@ -6,7 +6,11 @@ from pathlib import Path
 
 from tests.support.benches import Tables, bench_text
 
-MOUNTINGS = {"a": (1.0, 0.0, 0.0, 0.0), "b": (0.7071067811865476, 0.0, 0.7071067811865476, 0.0), "c": (0.5, -0.5, -0.5, -0.5)}
+MOUNTINGS = {
+    "a": (1.0, 0.0, 0.0, 0.0),
+    "b": (0.7071067811865476, 0.0, 0.7071067811865476, 0.0),
+    "c": (0.5, -0.5, -0.5, -0.5),
+}
 
 
 def heads_file(folder: Path, port: int, *changes: Tables) -> Path:

@@ -5,7 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hilstar.server.record.ledger_records import FrameRecord, PacketTally, ProcessRecord, read_head, run_records
+from hilstar.server.record.ledger_records import (
+    FrameRecord,
+    PacketTally,
+    ProcessRecord,
+    read_head,
+    run_records,
+)
 
 
 @dataclass(slots=True)

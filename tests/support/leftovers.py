@@ -31,14 +31,19 @@ def living_children() -> dict[int, str]:
             state, parent = stat.read_text().rpartition(")")[2].split()[:2]
             if int(parent) == os.getpid() and state != "Z":
                 found[int(stat.parent.name)] = (
-                    (stat.parent / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                    (stat.parent / "cmdline")
+                    .read_bytes()
+                    .replace(b"\0", b" ")
+                    .decode(errors="replace")
                 )
     return found
 
 
 def end_hilstar_leftovers() -> list[str]:
     """Kill the children that are hilstar's commands; their command lines."""
-    left = {number: command for number, command in living_children().items() if COMMAND.search(command)}
+    left = {
+        number: command for number, command in living_children().items() if COMMAND.search(command)
+    }
     for number in left:
         with contextlib.suppress(ProcessLookupError):
             os.kill(number, signal.SIGKILL)

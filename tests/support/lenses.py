@@ -54,7 +54,9 @@ def zmx(
     return "\r\n".join(lines).encode()
 
 
-def seq(*system: str, surfaces=DOUBLET, more: dict[int, list[str]] | None = None, mm=1.0, far="0.1e14") -> bytes:
+def seq(
+    *system: str, surfaces=DOUBLET, more: dict[int, list[str]] | None = None, mm=1.0, far="0.1e14"
+) -> bytes:
     """The doublet as a .seq file. `system` lines come first; what they do not say is RDM, DIM M
     and EPD 20.
     """

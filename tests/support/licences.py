@@ -11,7 +11,9 @@ from packaging.requirements import Requirement
 # A package under the MIT licence pulls nothing that asks more of whoever passes it on. The LGPL is
 # refused as well: nothing is under it today, and a bench's frozen image would have to keep such a
 # library exchangeable.
-COPYLEFT = re.compile(r"\b[AL]?GPL|GNU (Affero |Lesser |Library (or Lesser )?)?General Public", re.IGNORECASE)
+COPYLEFT = re.compile(
+    r"\b[AL]?GPL|GNU (Affero |Lesser |Library (or Lesser )?)?General Public", re.IGNORECASE
+)
 UNKNOWN = "states no licence"
 # the field `License` holds a name, or the whole text, whose beginning names it
 MAX_NAME_CHARACTERS = 100
@@ -24,8 +26,16 @@ def licence_of(package: metadata.Distribution) -> str:
     said = package.metadata
     if expression := said.get("License-Expression"):
         return str(expression)
-    classifiers = [each for each in said.get_all("Classifier", []) if each.startswith("License :: OSI Approved ::")]
-    return "; ".join(classifiers) or (said.get("License") or "")[:MAX_NAME_CHARACTERS].strip() or UNKNOWN
+    classifiers = [
+        each
+        for each in said.get_all("Classifier", [])
+        if each.startswith("License :: OSI Approved ::")
+    ]
+    return (
+        "; ".join(classifiers)
+        or (said.get("License") or "")[:MAX_NAME_CHARACTERS].strip()
+        or UNKNOWN
+    )
 
 
 def is_copyleft(licence: str) -> bool:

@@ -23,7 +23,10 @@ LONGER_THAN_A_STALL = 60  # frames; their median is what the program does
 
 
 def serve_until(
-    bench: Bench, link: AnyLink, enough: Callable[[list[Shown], Running], object], outlet: Outlet | None = None
+    bench: Bench,
+    link: AnyLink,
+    enough: Callable[[list[Shown], Running], object],
+    outlet: Outlet | None = None,
 ) -> tuple[RunSummary, list[Shown]]:
     """Serve until `enough` is true of the frames so far and of the run's counts, PATIENCE_S at
     most; the frames.
@@ -37,7 +40,9 @@ def serve_until(
             runs[0].loop.stop.set()
 
     slots = PATIENCE_S * bench.config.monitor.refresh_hz
-    summary = serve(bench, link, Limit(slots=slots), sink, replace(outlet or Outlet(), follower=runs.append))
+    summary = serve(
+        bench, link, Limit(slots=slots), sink, replace(outlet or Outlet(), follower=runs.append)
+    )
     return summary, frames
 
 
@@ -58,5 +63,7 @@ def median_age_ns(frames: list[Shown]) -> int:
     """The median age of the newest frames' attitudes: one that a machine that stood still made
     old does not count.
     """
-    ages = sorted(each.attitude.age_ns for each in frames[-LONGER_THAN_A_STALL:] if each.attitude is not None)
+    ages = sorted(
+        each.attitude.age_ns for each in frames[-LONGER_THAN_A_STALL:] if each.attitude is not None
+    )
     return ages[len(ages) // 2]

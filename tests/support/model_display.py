@@ -51,7 +51,10 @@ def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Scree
     """
     clock = FakeClock(FIRST_NS + 123_456)
     model = ModelDisplay(clock, round(1e9 / hz), **display)
-    config = parse_config(folder / "bench.toml", SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"))
+    config = parse_config(
+        folder / "bench.toml",
+        SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"),
+    )
     bench = SimpleNamespace(
         config=config,
         scan=scan_of(config.monitor),
@@ -61,7 +64,9 @@ def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Scree
         draw=lambda q: None,
         view=View,
         light=lambda view, faults: clock.work(DRAW_NS),
-        draw_sprites=lambda sprites, number: SimpleNamespace(levels=None, star_count=0, clipped_hip=(), capped=0),
+        draw_sprites=lambda sprites, number: SimpleNamespace(
+            levels=None, star_count=0, clipped_hip=(), capped=0
+        ),
     )
     return Screen(model.window, bench), model
 
@@ -94,7 +99,13 @@ class ModelDisplay:
         self._held, self._stamp_ns, self._stampless = buffers - 2, stamp_ns, stampless
         sync = None if stamp_ns is None else SimpleNamespace(swap_ns=self._stamp)
         self._stamps = SwapStamps(sync, period_ns, clock.now_ns)
-        own = {"swap": self.swap, "look_at_events": lambda: None, "hidden": "", "closing": False, "keys": []}
+        own = {
+            "swap": self.swap,
+            "look_at_events": lambda: None,
+            "hidden": "",
+            "closing": False,
+            "keys": [],
+        }
         self.window = plain_window(round(1e9 / period_ns), **own | window)
 
     @property
@@ -104,10 +115,15 @@ class ModelDisplay:
     def swap(self, wait: Callable[[], None]) -> int:
         """Queue the frame, and wait as `Window.swap` does."""
         earliest = -(-(self.clock.ns + self.deadline_ns - FIRST_NS) // self.period_ns)
-        after_last = (self.flips_ns[-1] - FIRST_NS) // self.period_ns + 1 if self.flips_ns else earliest
+        after_last = (
+            (self.flips_ns[-1] - FIRST_NS) // self.period_ns + 1 if self.flips_ns else earliest
+        )
         flip_ns = FIRST_NS + max(earliest, after_last) * self.period_ns
         if self._variable:
-            flip_ns = max(self.clock.ns + self.deadline_ns, self.flips_ns[-1] + self.period_ns if self.flips_ns else 0)
+            flip_ns = max(
+                self.clock.ns + self.deadline_ns,
+                self.flips_ns[-1] + self.period_ns if self.flips_ns else 0,
+            )
         self.flips_ns.append(flip_ns)
         self.window.timestamp_source = self.timestamp_source
         swapped_ns = self._stamps.after_swap(wait)

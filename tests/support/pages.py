@@ -20,7 +20,15 @@ from typing import Any
 
 import numpy as np
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import AcceptConnection, BytesMessage, CloseConnection, Ping, RejectConnection, Request, TextMessage
+from wsproto.events import (
+    AcceptConnection,
+    BytesMessage,
+    CloseConnection,
+    Ping,
+    RejectConnection,
+    Request,
+    TextMessage,
+)
 
 from tests.support.servers import Served
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -37,7 +45,11 @@ class PageAddress:
     token: str
 
     def ask(
-        self, path: str, method: str = "GET", body: bytes | str | None = None, headers: dict[str, str] | None = None
+        self,
+        path: str,
+        method: str = "GET",
+        body: bytes | str | None = None,
+        headers: dict[str, str] | None = None,
     ) -> tuple[int, dict[str, str], bytes]:
         """Status, headers (lower case) and body of the answer; with the token unless `headers`
         says otherwise.
@@ -47,7 +59,11 @@ class PageAddress:
         try:
             connection.request(method, path, body, own | (headers or {}))
             answer = connection.getresponse()
-            return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+            return (
+                answer.status,
+                {name.lower(): value for name, value in answer.getheaders()},
+                answer.read(),
+            )
         finally:
             connection.close()
 
@@ -156,7 +172,9 @@ class Live:
 
 
 @contextmanager
-def live(page: PageAddress, headers: dict[str, str] | None = None, token: str | None = None) -> Iterator[Live]:
+def live(
+    page: PageAddress, headers: dict[str, str] | None = None, token: str | None = None
+) -> Iterator[Live]:
     """A WebSocket to a page that lets it in. Raises ConnectionRefusedError with the status where
     it does not.
     """
@@ -164,7 +182,11 @@ def live(page: PageAddress, headers: dict[str, str] | None = None, token: str | 
     with socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S) as connection:
         protocol = WSConnection(ConnectionType.CLIENT)
         names = ["hilstar", *([f"hilstar.token.{token}"] if token else [])]
-        extra = [(name.encode(), value.encode()) for name, value in (headers or {}).items() if name != "Host"]
+        extra = [
+            (name.encode(), value.encode())
+            for name, value in (headers or {}).items()
+            if name != "Host"
+        ]
         host = (headers or {}).get("Host", f"127.0.0.1:{page.port}")
         request = Request(host=host, target="/live", subprotocols=names, extra_headers=extra)
         connection.sendall(protocol.send(request))
@@ -194,7 +216,9 @@ def children(pid: int, words: str) -> list[int]:
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError, IndexError, ValueError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
-            line = (stat.parent / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            line = (
+                (stat.parent / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            )
             if parent == pid and words in line:
                 found.append(int(stat.parent.name))
     return found

@@ -48,8 +48,15 @@ def profiles(middle: float, lit: int) -> np.ndarray:
 def photographed(shown: np.ndarray, exposure_s: float) -> np.ndarray:
     """The tracker's image (400, 400), DN of 12 bits, of an sRGB screen."""
     rng = np.random.default_rng(zlib.crc32(shown.tobytes()))
-    light = np.where(shown > 0.04045, ((shown + 0.055) / 1.055) ** 2.4, shown / 12.92) * WHITE_DN_PER_S * exposure_s
-    image = rng.normal(FLOOR_DN, NOISE_DN, (400, 400)) + profiles(239.5, 480) @ light @ profiles(319.5, 640).T
+    light = (
+        np.where(shown > 0.04045, ((shown + 0.055) / 1.055) ** 2.4, shown / 12.92)
+        * WHITE_DN_PER_S
+        * exposure_s
+    )
+    image = (
+        rng.normal(FLOOR_DN, NOISE_DN, (400, 400))
+        + profiles(239.5, 480) @ light @ profiles(319.5, 640).T
+    )
     return np.clip(np.rint(image), 0, 4095).astype(np.uint16)
 
 
@@ -57,7 +64,9 @@ def take(words: list[str]) -> None:
     """One image, as the command line says."""
     screen, flags = signal(Path(words[0])), words[2:]
     seconds = float(flags[flags.index("--exposure") + 1]) if "--exposure" in flags else 0.1
-    Image.fromarray(photographed(screen[::-1] if "--reversed" in flags else screen, seconds)).save(words[1], compress_level=1)
+    Image.fromarray(photographed(screen[::-1] if "--reversed" in flags else screen, seconds)).save(
+        words[1], compress_level=1
+    )
 
 
 class _Request(socketserver.StreamRequestHandler):

@@ -105,18 +105,25 @@ def drawn(rng: np.random.Generator) -> Plant:
     )
 
 
-def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") -> tuple[Path, Path]:
+def plant(
+    folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = ""
+) -> tuple[Path, Path]:
     """Write BENCH.toml, which knows nothing of the plant, and TRUTH.toml with its files; their
     paths.
     """
     folder.mkdir(parents=True, exist_ok=True)
     codes = np.arange(256) / 255
-    light = codes**one.gamma * (1 + one.wave * np.sin(4 * codes)) / (1 + one.wave * np.sin(4.0)) + one.black
+    light = (
+        codes**one.gamma * (1 + one.wave * np.sin(4 * codes)) / (1 + one.wave * np.sin(4.0))
+        + one.black
+    )
     rows = "".join(f"{code},{value!r}\n" for code, value in enumerate(light.tolist()))
     (folder / "true-response.csv").write_text("code,w\n" + rows)
     y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in GRID)
     grid = 1 - one.fall * (x[None] ** 2 + 0.3 * y[:, None] ** 2) / 1.3
-    (folder / "true-even.csv").write_text("".join(",".join(map(repr, row)) + "\n" for row in grid.tolist()))
+    (folder / "true-even.csv").write_text(
+        "".join(",".join(map(repr, row)) + "\n" for row in grid.tolist())
+    )
     (folder / "true-light.toml").write_text(
         '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\n'
         'response = "true-response.csv"\n[uniformity]\nfile = "true-even.csv"\n'
@@ -131,7 +138,10 @@ def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") 
     )
     bench = BENCH.format(calibration="srgb", delay_ms=8.0, geometry="", white=2.6e6)
     truth = BENCH.format(
-        calibration="true-light.toml", delay_ms=one.delay_ms, geometry='geometry = "true-lens.toml"', white=one.white
+        calibration="true-light.toml",
+        delay_ms=one.delay_ms,
+        geometry='geometry = "true-lens.toml"',
+        white=one.white,
     )
     (folder / "bench.toml").write_text(bench + bench_keys)
     (folder / "truth.toml").write_text(
@@ -159,12 +169,22 @@ class Counted:
         """The stated uncertainty over the true error, by the median of their ratios: 1 where
         errors are as large as stated.
         """
-        return NORMAL_MEDIAN / float(np.median(np.abs(self.error) / np.maximum(self.standard, 1e-300)))
+        return NORMAL_MEDIAN / float(
+            np.median(np.abs(self.error) / np.maximum(self.standard, 1e-300))
+        )
 
 
 NORMAL_MEDIAN = 0.6745  # of the size of a normal error, in sigmas
 REGIONS = ("left third", "middle third", "right third")
-QUANTITIES = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")
+QUANTITIES = (
+    "flux",
+    "place_along",
+    "place_across",
+    "attitude_x",
+    "attitude_y",
+    "attitude_z",
+    "latency",
+)
 EXACT_LENS = "[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = 0.0\n"
 
 
@@ -173,17 +193,25 @@ def stated_lens() -> str:
     field, k = 2.
     """
     largest_arcsec = TRACKER_K1 * SEEN_TANGENT**3 * ARCSEC
-    return f"[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = {2 * largest_arcsec!r}\n"
+    return (
+        f"[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = {2 * largest_arcsec!r}\n"
+    )
 
 
 def coverage(
-    draw: Callable[[np.random.Generator], Truth], benches: int, seed: int, keys: str = "", tables: str = EXACT_LENS
+    draw: Callable[[np.random.Generator], Truth],
+    benches: int,
+    seed: int,
+    keys: str = "",
+    tables: str = EXACT_LENS,
 ) -> dict[tuple[str, str], Counted]:
     """Certify planted benches of a kind by their readings and count, by quantity and region."""
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         path = Path(folder) / "bench.toml"
-        bench = BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+        bench = BENCH.format(
+            calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S
+        )
         path.write_text(f"{bench}[certify]\nfields = 1\n{keys}{tables}")
         file = read_bench_file(path)
         # Every bench file is the same, so that its stars are; one batch of trials knows an end
@@ -215,20 +243,28 @@ def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted
                 # The virtual monitor warms up from its first image on: with a drift the truth file
                 # is not the first reading's.
                 one = replace(drawn(np.random.default_rng((seed, number))), drift_percent_per_h=0.0)
-                bench, truth = (read_bench_file(path) for path in plant(folder, one, keys, DETECTOR))
+                bench, truth = (
+                    read_bench_file(path) for path in plant(folder, one, keys, DETECTOR)
+                )
                 if stars is None:
                     stars = assembly.reference_stars(bench)
                     patch.setattr(assembly, "reference_stars", lambda file, stars=stars: stars)
                 images = folder / "images"
                 images.mkdir()
                 with closing(VirtualBench(bench, truth, number)) as source:
-                    certified, _ = certificate.certify(bench, ImageReader(bench, source, images, truth), NOW, quick=True)
+                    certified, _ = certificate.certify(
+                        bench, ImageReader(bench, source, images, truth), NOW, quick=True
+                    )
             figures = [each for each in certified.figures if each.truth is not None]
             count(certified, {(each.quantity, each.star): each.truth for each in figures}, found)
     return dict(found)
 
 
-def count(certified: Certificate, truth: dict[tuple[str, int | None], float], found: dict[tuple[str, str], Counted]) -> None:
+def count(
+    certified: Certificate,
+    truth: dict[tuple[str, int | None], float],
+    found: dict[tuple[str, str], Counted],
+) -> None:
     """Add one certificate to the counts."""
     stated = [each for each in certified.figures if each.quantity in QUANTITIES]
     for each in stated:
@@ -238,5 +274,9 @@ def count(certified: Certificate, truth: dict[tuple[str, int | None], float], fo
         one.error.append(each.value - true)
         one.standard.append(each.standard_uncertainty)
     for quantity in {name for name, _ in truth} - {each.quantity for each in stated}:
-        for region in REGIONS if quantity in QUANTITIES[:3] else ("screen" if quantity == "latency" else "field",):
+        for region in (
+            REGIONS
+            if quantity in QUANTITIES[:3]
+            else ("screen" if quantity == "latency" else "field",)
+        ):
             found[quantity, region].absent += 1

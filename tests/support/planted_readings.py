@@ -45,7 +45,10 @@ class SmoothField:
         self._size = rng.standard_normal(WAVES) * math.sqrt(2 / WAVES)
 
     def __call__(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
-        return np.cos(np.outer(x_px, self._wave[0]) + np.outer(y_px, self._wave[1]) + self._phase) @ self._size
+        return (
+            np.cos(np.outer(x_px, self._wave[0]) + np.outer(y_px, self._wave[1]) + self._phase)
+            @ self._size
+        )
 
 
 def nothing(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
@@ -77,12 +80,18 @@ class Truth:
 
     def even(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
         """Light at places relative to a screen that is even."""
-        u, v = ((at - (side - 1) / 2) / (side / 2) for at, side in zip((x_px, y_px), SIZE_PX, strict=True))
+        u, v = (
+            (at - (side - 1) / 2) / (side / 2)
+            for at, side in zip((x_px, y_px), SIZE_PX, strict=True)
+        )
         return (1 - self.fall[0] * u**2 - self.fall[1] * v**2) * (1 + self.uneven(x_px, y_px))
 
     def tangents(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
         """True directions (n, 2) of pixels, tangents in cam."""
-        u, v = ((at - (side - 1) / 2) / FOCAL_PX / (1 + self.focal) for at, side in zip((x_px, y_px), SIZE_PX, strict=True))
+        u, v = (
+            (at - (side - 1) / 2) / FOCAL_PX / (1 + self.focal)
+            for at, side in zip((x_px, y_px), SIZE_PX, strict=True)
+        )
         deep = 1 + self.tilt[0] * u + self.tilt[1] * v
         u, v = u / deep, v / deep
         round_ = u**2 + v**2
@@ -164,7 +173,9 @@ def own_response(rng: np.random.Generator) -> Truth:
     match rng.integers(3):
         case 0:  # a knee: another exponent above a code
             at = rng.uniform(0.15, 0.9)
-            light = np.where(code > at, light * (np.maximum(code, at) / at) ** rng.normal(0, 0.1), light)
+            light = np.where(
+                code > at, light * (np.maximum(code, at) / at) ** rng.normal(0, 0.1), light
+            )
         case 1:  # ripples of 6 to 60 codes
             size, period = _between(rng, 0.001, 0.01), _between(rng, 6, 60) / 255
             light = light * (1 + size * np.sin(2 * math.pi * code / period + rng.uniform(0, 6.3)))
@@ -214,7 +225,9 @@ class PlantedReader:
         """Light of the middle of the screen, a second a reading."""
         one, t_s = self.is_so, np.arange(len(codes), dtype=np.float64)
         here = one.even(*(np.array([side // 2]) for side in SIZE_PX))[0]
-        level = (one.light[codes] + one.black) * one.white * here * (1 + one.drift_per_h * t_s / 3600)
+        level = (
+            (one.light[codes] + one.black) * one.white * here * (1 + one.drift_per_h * t_s / 3600)
+        )
         return LightReadings(codes, level * (1 + one.reading_noise * self._series(len(codes))), t_s)
 
     def dots(self, x_px: np.ndarray, y_px: np.ndarray, images: int) -> DotReadings:
@@ -223,7 +236,9 @@ class PlantedReader:
         x, y = x_px.astype(float), y_px.astype(float)
         seen = one.tangents(x, y)
         seen = seen * (1 + one.tracker_k1 * (seen**2).sum(axis=1, keepdims=True))
-        off = np.stack([part(x, y) for part in one.dots_off], axis=1) + one.dot_noise_px * self._noise((len(x), 2))
+        off = np.stack(
+            [part(x, y) for part in one.dots_off], axis=1
+        ) + one.dot_noise_px * self._noise((len(x), 2))
         at = TRACKER_FOCAL_PX * seen + TRACKER_MIDDLE_PX + less * off
         light = one.even(x, y) * (1 + less * one.reading_noise * self._noise((len(x),)))
         return DotReadings(x, y, at[:, 0], at[:, 1], light, 0.55, 0.001)
@@ -242,15 +257,23 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
     found: dict[tuple[str, int | None], float] = {}
     rows, moved, rays = [], [], []
     for star in stars:
-        code = np.array([int(np.argmin(np.abs(expected - math.exp(light)))) for light in star.log_light])
+        code = np.array(
+            [int(np.argmin(np.abs(expected - math.exp(light)))) for light in star.log_light]
+        )
         x, y = np.array([star.x_px]), np.array([star.y_px])
         # Light of a star's pixels is even over it: a field of 30 px changes by 0.1 % of itself over
         # a star's sigma.
         here = one.white / WHITE_E_PER_S * one.even(np.rint(x), np.rint(y))[0]
-        found["flux", star.hip] = -2.5 * math.log10(here * float(star.share @ (one.light[code] / expected[code])))
-        wanted = np.array([(x[0] - (SIZE_PX[0] - 1) / 2) / FOCAL_PX, (y[0] - (SIZE_PX[1] - 1) / 2) / FOCAL_PX])
+        found["flux", star.hip] = -2.5 * math.log10(
+            here * float(star.share @ (one.light[code] / expected[code]))
+        )
+        wanted = np.array(
+            [(x[0] - (SIZE_PX[0] - 1) / 2) / FOCAL_PX, (y[0] - (SIZE_PX[1] - 1) / 2) / FOCAL_PX]
+        )
         seen = one.tangents(x, y)[0]
-        found["place_along", star.hip], found["place_across", star.hip] = ((seen - wanted) * ARCSEC).tolist()
+        found["place_along", star.hip], found["place_across", star.hip] = (
+            (seen - wanted) * ARCSEC
+        ).tolist()
         ray, true = np.append(wanted, 1.0), np.append(seen, 1.0)
         ray, true = ray / np.linalg.norm(ray), true / np.linalg.norm(true)
         a, b, c = ray
@@ -264,7 +287,9 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
         now = np.array(rays) @ turn.T
         rows = [np.array([[0, c, -b], [-c, 0, a], [b, -a, 0]]) for a, b, c in now]
         step = np.linalg.lstsq(
-            np.concatenate(rows), np.concatenate([t - n for t, n in zip(moved, now, strict=True)]), rcond=None
+            np.concatenate(rows),
+            np.concatenate([t - n for t, n in zip(moved, now, strict=True)]),
+            rcond=None,
         )[0]
         a, b, c = step
         axis = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])

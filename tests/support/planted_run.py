@@ -34,7 +34,11 @@ def write_ledger(
 
     The sender's clock is the host's; `records` are written among the frames by their host time.
     """
-    head = {"bench_text": bench, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
+    head = {
+        "bench_text": bench,
+        "bench_file": str(path.parent / "bench.toml"),
+        "bench_sha256": "of a test",
+    }
     with path.open("wb") as file:
         writer = McapWriter(file.fileno(), TOPICS, RUN_METADATA, head)
         waiting = sorted(records, key=lambda each: each.host_ns, reverse=True)
@@ -43,8 +47,15 @@ def write_ledger(
             q = None if frames_q is None else tuple(frames_q[number].tolist())
             while waiting and waiting[-1].host_ns <= t_ns:
                 one = waiting.pop()
-                writer.add("answer" if isinstance(one, AnswerRecord) else "fault", one.host_ns, msgspec.json.encode(one), 0)
-            record = FrameRecord(frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q)
+                writer.add(
+                    "answer" if isinstance(one, AnswerRecord) else "fault",
+                    one.host_ns,
+                    msgspec.json.encode(one),
+                    0,
+                )
+            record = FrameRecord(
+                frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q
+            )
             record.missed_before = missed_before[number] if missed_before else 0
             writer.add("frame", t_ns, msgspec.json.encode(record), number)
         writer.flush()
@@ -53,7 +64,9 @@ def write_ledger(
     return path
 
 
-def write_telemetry(path: Path, tau_s: FloatArray, reported: FloatArray, start_s: float = 5.0) -> Path:
+def write_telemetry(
+    path: Path, tau_s: FloatArray, reported: FloatArray, start_s: float = 5.0
+) -> Path:
     """Telemetry as CSV; its line k + 2 is answer k."""
     rows = [
         f"{start_s + t:.9f},{w!r},{x!r},{y!r},{z!r},1"

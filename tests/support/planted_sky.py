@@ -73,7 +73,10 @@ def rotation_of(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
 
 
 def photograph(
-    camera: Planted, pointing: tuple[float, float, float], rng: np.random.Generator, extras: Extras = NOTHING_WRONG
+    camera: Planted,
+    pointing: tuple[float, float, float],
+    rng: np.random.Generator,
+    extras: Extras = NOTHING_WRONG,
 ) -> np.ndarray:
     """One photograph, uint16 (height, width), DN."""
     catalog = load_catalog()
@@ -94,7 +97,10 @@ def photograph(
     front = z > 0.5
     u, v = x[front] / z[front], y[front] / z[front]
     gain = 1 + camera.k1 * (u * u + v * v)
-    px, py = camera.centre_px[0] + camera.focal_px * u * gain, camera.centre_px[1] + camera.focal_px * v * gain
+    px, py = (
+        camera.centre_px[0] + camera.focal_px * u * gain,
+        camera.centre_px[1] + camera.focal_px * v * gain,
+    )
     mag = (catalog.v_mag[bright] + camera.colour * catalog.bv_mag[bright] + extinct_mag)[front]
     near = (px > -10) & (px < WIDTH + 10) & (py > -10) & (py < HEIGHT + 10)
     px, py, mag = px[near], py[near], mag[near]
@@ -110,9 +116,17 @@ def photograph(
     if extras.trail_px is not None:
         (x0, y0), (x1, y1) = extras.trail_px
         for share in np.linspace(0, 1, 400):
-            _add(electrons, camera, (x0 + share * (x1 - x0), y0 + share * (y1 - y0)), 3.0e5 / 400, NOTHING_WRONG)
+            _add(
+                electrons,
+                camera,
+                (x0 + share * (x1 - x0), y0 + share * (y1 - y0)),
+                3.0e5 / 400,
+                NOTHING_WRONG,
+            )
     yy, xx = np.mgrid[:HEIGHT, :WIDTH]
-    r2 = ((xx - camera.centre_px[0]) ** 2 + (yy - camera.centre_px[1]) ** 2) / ((WIDTH**2 + HEIGHT**2) / 4)
+    r2 = ((xx - camera.centre_px[0]) ** 2 + (yy - camera.centre_px[1]) ** 2) / (
+        (WIDTH**2 + HEIGHT**2) / 4
+    )
     electrons *= 10 ** (-0.4 * camera.vignetting_mag * r2)
     counted = rng.poisson(electrons) + rng.normal(0, camera.read_e, electrons.shape)
     dn = counted / camera.gain_e_per_dn + camera.pedestal_dn
@@ -123,7 +137,9 @@ def photograph(
     return np.clip(np.rint(dn), 0, camera.full_dn).astype(np.uint16)
 
 
-def _add(image: np.ndarray, camera: Planted, place: tuple[float, float], electrons: float, extras: Extras) -> None:
+def _add(
+    image: np.ndarray, camera: Planted, place: tuple[float, float], electrons: float, extras: Extras
+) -> None:
     x, y = place
     half_diagonal2 = (WIDTH**2 + HEIGHT**2) / 4
     r2 = ((x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2) / half_diagonal2
@@ -141,7 +157,11 @@ def _add(image: np.ndarray, camera: Planted, place: tuple[float, float], electro
         edges = np.append(at - 0.5, at[-1] + 0.5) - middle
         return np.diff(erf(edges / (width * np.sqrt(2)))) / 2
 
-    steps = np.linspace(-0.5, 0.5, max(1, int(2 * extras.smear_px))) * extras.smear_px if extras.smear_px else [0.0]
+    steps = (
+        np.linspace(-0.5, 0.5, max(1, int(2 * extras.smear_px))) * extras.smear_px
+        if extras.smear_px
+        else [0.0]
+    )
     across = np.mean([shares(columns, x + step, sigma) for step in steps], axis=0)
     image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += electrons * np.outer(
         shares(rows, y, sigma * camera.stretch), across

@@ -111,7 +111,11 @@ def polynomial(place_px: FloatArray, side_px: float) -> FloatArray:
 def waves(place_px: FloatArray) -> FloatArray:
     """A pixel error (n, 3) of rms 1, with a second harmonic."""
     x, y = 2 * np.pi * place_px.T
-    parts = [np.sin(x) + 0.3 * np.sin(2 * x), np.sin(y) - 0.3 * np.sin(2 * y), 1.044 * np.cos(x + 1)]
+    parts = [
+        np.sin(x) + 0.3 * np.sin(2 * x),
+        np.sin(y) - 0.3 * np.sin(2 * y),
+        1.044 * np.cos(x + 1),
+    ]
     return np.sqrt(2 / 1.09) * np.stack(parts, axis=1)
 
 
@@ -137,11 +141,19 @@ def plant(
     error = (
         bias
         + of_field
-        + scale * (sizes.pixel * waves(pixel_place(true, first)) + sizes.noise * rng.normal(size=of_field.shape))
+        + scale
+        * (
+            sizes.pixel * waves(pixel_place(true, first))
+            + sizes.noise * rng.normal(size=of_field.shape)
+        )
     )
     reported = scalar_first(Rotation.from_rotvec(error / ARCSEC_PER_RAD) * true)
     wild = np.sort(rng.choice(len(t_s), sizes.wild, replace=False))
-    reported[wild] = scalar_first(Rotation.random(sizes.wild, random_state=rng)) if sizes.wild else reported[wild]
+    reported[wild] = (
+        scalar_first(Rotation.random(sizes.wild, random_state=rng))
+        if sizes.wild
+        else reported[wild]
+    )
     reported *= rng.choice([-1.0, 1.0], len(t_s))[:, None]
     tau_s = t_s * (1 + 1e-6 * sizes.drift_ppm) + sizes.offset_s
     frames_q = scalar_first(attitude(motion, frames_s))

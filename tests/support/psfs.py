@@ -21,7 +21,10 @@ def gaussian(sigma_x: float, sigma_y: float, x0: float = 0.0, y0: float = 0.0) -
 
 def coma(sigma: float = 0.45) -> Profile:
     """A core of 60 % at the chief ray and a tail to the right and down, in two Gaussians."""
-    core, near = gaussian(sigma, sigma), gaussian(1.5 * sigma, 1.2 * sigma, 1.2 * sigma, 0.5 * sigma)
+    core, near = (
+        gaussian(sigma, sigma),
+        gaussian(1.5 * sigma, 1.2 * sigma, 1.2 * sigma, 0.5 * sigma),
+    )
     far = gaussian(2.4 * sigma, 1.8 * sigma, 3.0 * sigma, 1.3 * sigma)
     return lambda x, y: 0.6 * core(x, y) + 0.28 * near(x, y) + 0.12 * far(x, y)
 
@@ -48,5 +51,8 @@ def in_pixels(profile: Profile, x_px: np.ndarray, y_px: np.ndarray, nodes: int =
     """
     place, weight = np.polynomial.legendre.leggauss(nodes)
     place, weight = np.concatenate([(place - 1) / 4, (place + 1) / 4]), np.tile(weight / 4, 2)
-    x, y = x_px[None, :, None, None] + place[None, None, None, :], y_px[:, None, None, None] + place[None, None, :, None]
+    x, y = (
+        x_px[None, :, None, None] + place[None, None, None, :],
+        y_px[:, None, None, None] + place[None, None, :, None],
+    )
     return np.einsum("a,b,ijab->ij", weight, weight, profile(x, y))

@@ -40,7 +40,9 @@ def write_bench(folder: Path, text: str = BENCH) -> Path:
     rng = np.random.default_rng(4)
     degree = np.add.outer(np.arange(6), np.arange(6))
     squares = [np.where(degree <= 5, rng.normal(0, 0.5, (6, 6)), 0).tolist() for _ in range(2)]
-    (folder / "geometry.toml").write_text(f"{LINES}\n[field]\nx_px = {squares[0]}\ny_px = {squares[1]}\n")
+    (folder / "geometry.toml").write_text(
+        f"{LINES}\n[field]\nx_px = {squares[0]}\ny_px = {squares[1]}\n"
+    )
     path = folder / "bench.toml"
     path.write_text(text)
     return path
@@ -67,8 +69,14 @@ def true_places_px(folder: Path, cam: FloatArray) -> tuple[FloatArray, FloatArra
     axes = about_y @ about_x
     rays = np.column_stack([bent_x, bent_y, np.ones_like(bent_x)])
     hits = rays * (axes[2, 2] / (rays @ axes[:, 2]))[:, None] - [0, 0, 1]
-    px, py = (lens["focal_length_px"] * (hits @ axes[:, k]) + lens["principal_point_px"][k] for k in (0, 1))
+    px, py = (
+        lens["focal_length_px"] * (hits @ axes[:, k]) + lens["principal_point_px"][k]
+        for k in (0, 1)
+    )
     s, t = ((2 * p - size + 1) / size for p, size in ((px, SIZE[0]), (py, SIZE[1])))
     s, t = np.clip(s, -1.1, 1.1), np.clip(t, -1.1, 1.1)
-    dx, dy = (np.polynomial.chebyshev.chebval2d(s, t, np.array(lens["field"][name])) for name in ("x_px", "y_px"))
+    dx, dy = (
+        np.polynomial.chebyshev.chebval2d(s, t, np.array(lens["field"][name]))
+        for name in ("x_px", "y_px")
+    )
     return px + dx, py + dy

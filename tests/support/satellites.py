@@ -20,7 +20,12 @@ def with_checksum(line: str) -> str:
     return f"{line}{sum(int(c) if c.isdigit() else c == '-' for c in line) % 10}"
 
 
-def element_set(number: int, angles_deg: tuple[float, float, float, float], eccentricity: float, turns_a_day: float) -> str:
+def element_set(
+    number: int,
+    angles_deg: tuple[float, float, float, float],
+    eccentricity: float,
+    turns_a_day: float,
+) -> str:
     """Two lines by inclination, right ascension of the node, argument of perigee, mean anomaly;
     the station's date.
     """
@@ -46,7 +51,9 @@ def some_orbits(rng: np.random.Generator, count: int) -> str:
     return "".join(sets)
 
 
-def satellite_sky(text: str, orbit: Orbit | None = None, table: str = "norad\n", utc: str = STATION_UTC) -> MovingSky:
+def satellite_sky(
+    text: str, orbit: Orbit | None = None, table: str = "norad\n", utc: str = STATION_UTC
+) -> MovingSky:
     """A sky with a list of satellites alone, by default seen from the station; V = 0 is
     V0_E_PER_S.
     """

@@ -25,7 +25,9 @@ def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.
     """An attitude as docs and firmware_protocol/protocol.toml lay it out; a rate of None is
     none.
     """
-    body = struct.pack("<BBHIq4d3f", 1, 1, rate is not None, sequence, t_ns, *q, *(rate or (0.0, 0.0, 0.0)))
+    body = struct.pack(
+        "<BBHIq4d3f", 1, 1, rate is not None, sequence, t_ns, *q, *(rate or (0.0, 0.0, 0.0))
+    )
     return body + struct.pack("<I", zlib.crc32(body))
 
 
@@ -111,7 +113,9 @@ def await_subscriber_of(port: int) -> None:
 
 
 @contextmanager
-def connected(port: int, kind: int = zmq.PUB, patience_s: float = PATIENCE_S) -> Iterator[zmq.Socket]:
+def connected(
+    port: int, kind: int = zmq.PUB, patience_s: float = PATIENCE_S
+) -> Iterator[zmq.Socket]:
     """A plain socket of that kind, connected."""
     context = zmq.Context()
     end = context.socket(kind)
@@ -129,5 +133,7 @@ def connected(port: int, kind: int = zmq.PUB, patience_s: float = PATIENCE_S) ->
 def talking(sender: zmq.Socket, rate_hz: float = 200.0, q=ORION, first: int = 0) -> Iterator[None]:
     """A sender of this process, stamped with its monotonic clock, that talks all the while."""
     sequences = itertools.count(first)
-    with repeating(lambda: sender.send(packet(next(sequences), time.monotonic_ns(), q)), 1 / rate_hz):
+    with repeating(
+        lambda: sender.send(packet(next(sequences), time.monotonic_ns(), q)), 1 / rate_hz
+    ):
         yield

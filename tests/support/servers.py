@@ -37,7 +37,9 @@ class Run(Started):
         address = "@" + self._told.getsockname()[1:].decode()
         own = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": str(round(2 * STATUS_EACH_S * 1e6))}
         self._counts = (0, 0, 0)
-        super().__init__(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | own)
+        super().__init__(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | own
+        )
 
     def counts(self) -> tuple[int, int, int]:
         """How many frames it has shown so far, how many packets it has received, and how many of
@@ -98,13 +100,17 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[Run]:
 
 
 @contextmanager
-def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[Run]:
+def serving(
+    tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = ""
+) -> Iterator[Run]:
     """`hilstar serve` of the small bench on a port, once it has subscribed to the publisher
     there, if there is one.
     """
     bench = tmp_path / "serve.toml"
     text = SMALL_BENCH if "[render]" in attitude else LIVE_BENCH
-    bench.write_text(text.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude))
+    bench.write_text(
+        text.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude)
+    )
     with listening(bench, f"127.0.0.1:{port}", *options) as process:
         await_subscriber_of(port)
         yield process
@@ -117,7 +123,11 @@ def children_of(process: int) -> list[int]:
 
 def workers_of(process: subprocess.Popen[str]) -> list[int]:
     """The workers of a command's pool, which a fork server of its own starts."""
-    servers = (child for child in children_of(process.pid) if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes())
+    servers = (
+        child
+        for child in children_of(process.pid)
+        if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes()
+    )
     return [worker for server in servers for worker in children_of(server)]
 
 
@@ -175,9 +185,18 @@ class Served:
         """The process and the one that reads the link for it, as Linux shows them."""
         own = Path(f"/proc/{self.process.pid}")
         children = [
-            Path(f"/proc/{each}") for task in (own / "task").iterdir() for each in (task / "children").read_text().split()
+            Path(f"/proc/{each}")
+            for task in (own / "task").iterdir()
+            for each in (task / "children").read_text().split()
         ]
-        return [own, *(each for each in children if b"attitude.wire.apart" in (each / "cmdline").read_bytes())]
+        return [
+            own,
+            *(
+                each
+                for each in children
+                if b"attitude.wire.apart" in (each / "cmdline").read_bytes()
+            ),
+        ]
 
     def summary(self) -> dict:
         """What it prints at its end, after Ctrl-C."""
@@ -189,7 +208,9 @@ class Served:
 
 
 @contextmanager
-def bound(tmp_path: Path, *options: str, attitude: str = "bind = true", files: int | None = None) -> Iterator[Served]:
+def bound(
+    tmp_path: Path, *options: str, attitude: str = "bind = true", files: int | None = None
+) -> Iterator[Served]:
     """`hilstar serve` that binds, once its port answers; it may open so many `files`."""
     port = free_port()
     bench = tmp_path / "serve.toml"

@@ -33,7 +33,9 @@ ISS (ZARYA)
 STATION_UTC = "2008-09-20T12:30:00Z"
 
 
-def moving_sky(utc: str | int, names: tuple[str, ...] = ALL_BODIES, orbit: Orbit | None = None) -> MovingSky:
+def moving_sky(
+    utc: str | int, names: tuple[str, ...] = ALL_BODIES, orbit: Orbit | None = None
+) -> MovingSky:
     """Bodies of 1 electron/s at V = 0, at a UTC (text, or ns since 1970)."""
     ones = np.ones(len(names))
     return MovingSky(_kernel(), orbit or Geocentre(), utc_ns(utc), BodyLight(names, ones, ones))
@@ -46,7 +48,9 @@ def _kernel() -> Kernel:
 
 def utc_ns(utc: str | int) -> int:
     """Nanoseconds since 1970 of a UTC."""
-    return utc if isinstance(utc, int) else int(np.datetime64(utc.rstrip("Z"), "ns").astype(np.int64))
+    return (
+        utc if isinstance(utc, int) else int(np.datetime64(utc.rstrip("Z"), "ns").astype(np.int64))
+    )
 
 
 def random_utcs_ns(rng: np.random.Generator, count: int) -> list[int]:

@@ -13,7 +13,11 @@ def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
     """Stars of 5000 K in the directions `vectors` (n, 3), ICRS."""
     n = len(vectors)
     zero = np.zeros(n)
-    catalog = plain_catalog("HIP", n, {"hip": np.arange(n, dtype=np.int32), "v_mag": zero, "ra_deg": zero, "dec_deg": zero})
+    catalog = plain_catalog(
+        "HIP",
+        n,
+        {"hip": np.arange(n, dtype=np.int32), "v_mag": zero, "ra_deg": zero, "dec_deg": zero},
+    )
     vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
 
@@ -25,4 +29,6 @@ def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) 
     data["pixel"] = whole
     data["fraction_px"] = pixels - whole
     data["electrons_per_s"] = electrons_per_s
-    return Sprites(data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy())
+    return Sprites(
+        data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy()
+    )

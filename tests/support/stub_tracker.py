@@ -49,18 +49,33 @@ class Stub:
 
     def q(self, t_s: float) -> np.ndarray:
         """The commanded q_icrs_to_cam, scalar first, at a time of the host's clock."""
-        turn = np.radians(self.swing_deg) * np.array([np.sin(1.3 * t_s), np.sin(0.9 * t_s + 1.0), 0.0])
-        return np.roll((Rotation.from_rotvec(turn) * Rotation.from_quat(np.roll(ORION, -1))).as_quat(), 1)
+        turn = np.radians(self.swing_deg) * np.array(
+            [np.sin(1.3 * t_s), np.sin(0.9 * t_s + 1.0), 0.0]
+        )
+        return np.roll(
+            (Rotation.from_rotvec(turn) * Rotation.from_quat(np.roll(ORION, -1))).as_quat(), 1
+        )
 
-    def answer(self, k: int, middle_s: float, begun_s: float, rng: np.random.Generator) -> tuple[str, bool]:
+    def answer(
+        self, k: int, middle_s: float, begun_s: float, rng: np.random.Generator
+    ) -> tuple[str, bool]:
         """Answer k, of an exposure's middle, as a line; and whether it is wild."""
-        error = Rotation.from_rotvec((np.array(self.bias_arcsec) + self.noise_arcsec * rng.standard_normal(3)) / ARCSEC_PER_RAD)
+        error = Rotation.from_rotvec(
+            (np.array(self.bias_arcsec) + self.noise_arcsec * rng.standard_normal(3))
+            / ARCSEC_PER_RAD
+        )
         is_wild = bool(rng.random() < self.wild)
         if is_wild:
             error = Rotation.random(random_state=rng)
         q = np.roll((error * Rotation.from_quat(np.roll(self.q(middle_s), -1))).as_quat(), 1)
         own_s = self.epoch_s + (middle_s - begun_s) * (1 + self.drift)
-        told = {"t_ns": round(own_s * 1e9), "q": q.tolist(), "valid": True, "mode": str(time.monotonic_ns()), "stars": 9}
+        told = {
+            "t_ns": round(own_s * 1e9),
+            "q": q.tolist(),
+            "valid": True,
+            "mode": str(time.monotonic_ns()),
+            "stars": 9,
+        }
         told["centroids"] = [[511.5, 511.5, 900.0, 26311], [300.0, 700.0, 400.0]] if k % 2 else []
         return json.dumps(told) + "\n", is_wild
 

@@ -68,7 +68,9 @@ def small(seed, *, turned):
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_the_truth_compared_with_itself_is_off_by_nothing_and_the_bench_file_by_what_was_planted(tmp_path, turned):
+def test_the_truth_compared_with_itself_is_off_by_nothing_and_the_bench_file_by_what_was_planted(
+    tmp_path, turned
+):
     bench = small(3, turned=turned)
     file, truth = map(read_bench_file, write_bench(bench, tmp_path))
     itself = SeenScreen.of(truth, truth)
@@ -105,7 +107,12 @@ def result(found=None, code=0, stderr="", memory_mb=500.0):
 
 
 def session(**verdicts):
-    return {"steps": [{"name": name, "verdict": verdict, "line": f"{name} said so"} for name, verdict in verdicts.items()]}
+    return {
+        "steps": [
+            {"name": name, "verdict": verdict, "line": f"{name} said so"}
+            for name, verdict in verdicts.items()
+        ]
+    }
 
 
 DONE = session(geometry="done", verify="done")
@@ -118,9 +125,28 @@ PASSED = {"passed": True, "reasons": []}
     ("results", "compared", "outcome", "words"),
     [
         ({FIRST_LIGHT: result(DONE), VERIFY: result(PASSED)}, {}, judge.VERIFIED, ""),
-        ({FIRST_LIGHT: result(code=2, stderr="hilstar: no such lens\n")}, {}, judge.REFUSED, "no such lens"),
-        ({FIRST_LIGHT: result(code=-9, stderr="hilstar: 3 s: begins\n")}, {}, judge.FAILED, "ended with -9"),
-        ({FIRST_LIGHT: result(code=1, stderr="Traceback (most recent call last):\nValueError: x\n")}, {}, judge.TRACEBACK, "x"),
+        (
+            {FIRST_LIGHT: result(code=2, stderr="hilstar: no such lens\n")},
+            {},
+            judge.REFUSED,
+            "no such lens",
+        ),
+        (
+            {FIRST_LIGHT: result(code=-9, stderr="hilstar: 3 s: begins\n")},
+            {},
+            judge.FAILED,
+            "ended with -9",
+        ),
+        (
+            {
+                FIRST_LIGHT: result(
+                    code=1, stderr="Traceback (most recent call last):\nValueError: x\n"
+                )
+            },
+            {},
+            judge.TRACEBACK,
+            "x",
+        ),
         ({FIRST_LIGHT: result(session(focus="failed"), 1)}, {}, judge.FAILED, "focus said so"),
         (
             {FIRST_LIGHT: result(session(verify="failed"), 1), VERIFY: result({"reasons": [WIDE]})},
@@ -129,12 +155,20 @@ PASSED = {"passed": True, "reasons": []}
             "star_sigma_ratio",
         ),
         (
-            {FIRST_LIGHT: result(session(verify="failed"), 1), VERIFY: result({"reasons": [WIDE, "flux is off"]})},
+            {
+                FIRST_LIGHT: result(session(verify="failed"), 1),
+                VERIFY: result({"reasons": [WIDE, "flux is off"]}),
+            },
             {},
             judge.FAILED,
             "verify said so",
         ),
-        ({FIRST_LIGHT: result(DONE), VERIFY: result({"reasons": ["flux is off"]})}, {}, judge.NOT_VERIFIED, "flux is off"),
+        (
+            {FIRST_LIGHT: result(DONE), VERIFY: result({"reasons": ["flux is off"]})},
+            {},
+            judge.NOT_VERIFIED,
+            "flux is off",
+        ),
         ({FIRST_LIGHT: result(DONE, memory_mb=2500)}, {}, judge.HEAVY, "2500 MB"),
         (
             {FIRST_LIGHT: result(DONE)},
@@ -143,7 +177,11 @@ PASSED = {"passed": True, "reasons": []}
             "focus 0.15, not 0.55: -40.0 sigmas",
         ),
         (
-            {FIRST_LIGHT: result(DONE), VERIFY: result(PASSED), SERVE: result(code=3, stderr="gone")},
+            {
+                FIRST_LIGHT: result(DONE),
+                VERIFY: result(PASSED),
+                SERVE: result(code=3, stderr="gone"),
+            },
             {},
             judge.LATER,
             "serve: gone",

@@ -135,7 +135,9 @@ def test_a_time_is_the_middle_of_the_exposure(cards, expected):
     assert not found.notes
 
 
-@pytest.mark.parametrize(("name", "scale"), [("TAI", "tai"), ("TT", "tt"), ("TDB", "tdb"), ("tai", "tai")])
+@pytest.mark.parametrize(
+    ("name", "scale"), [("TAI", "tai"), ("TT", "tt"), ("TDB", "tdb"), ("tai", "tai")]
+)
 def test_scales_are_turned_into_utc(name, scale):
     found = read({"DATE-OBS": EIGHT_PM, "TIMESYS": name, "EXPTIME": 0.0})
     assert found.t_ns == pytest.approx(astropy_ns(EIGHT_PM, scale), abs=UTC_TOLERANCE_NS)
@@ -220,7 +222,9 @@ def test_a_grey_image_is_one_plane(value):
     assert read({} if value is None else {"BAYERPAT": value}).bayer == ""
 
 
-@pytest.mark.parametrize("value", ["GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG", "TRUE", True, "X-TRANS", "CYGM", "RGBG"])
+@pytest.mark.parametrize(
+    "value", ["GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG", "TRUE", True, "X-TRANS", "CYGM", "RGBG"]
+)
 def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
     path = tmp_path / "mosaic.fits"
     path.write_bytes(file_of(image({"BAYERPAT": value})))
@@ -231,7 +235,9 @@ def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
         read_photographs(path, None)
 
 
-@pytest.mark.parametrize("cards", [{"XBAYROFF": 0.5}, {"YBAYROFF": "one"}, {"ROWORDER": "SIDEWAYS"}])
+@pytest.mark.parametrize(
+    "cards", [{"XBAYROFF": 0.5}, {"YBAYROFF": "one"}, {"ROWORDER": "SIDEWAYS"}]
+)
 def test_a_layout_that_is_none_is_refused(cards):
     with pytest.raises(InputError, match=next(iter(cards))):
         read({"BAYERPAT": "RGGB", **cards})
@@ -276,7 +282,9 @@ def test_the_first_of_several_images_is_taken_and_said():
     assert found.notes == ("holds 2 images, of which the first is taken",)
 
 
-@pytest.mark.parametrize("reader", [lambda path: read_photographs(path, None)[0].dn, lambda path: read_exposed(path)[0]])
+@pytest.mark.parametrize(
+    "reader", [lambda path: read_photographs(path, None)[0].dn, lambda path: read_exposed(path)[0]]
+)
 def test_a_packed_file_is_the_same_image(tmp_path: Path, reader):
     plain, packed = tmp_path / "a.fits", tmp_path / "a.fits.gz"
     plain.write_bytes(file_of(image({})))

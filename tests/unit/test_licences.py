@@ -18,7 +18,11 @@ def test_nothing_that_the_package_requires_is_under_the_gpl():
     required = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     licences = pulled_by(required)
     assert len(licences) > len(required)  # what those require is among them
-    assert {name: licence for name, licence in licences.items() if licence == UNKNOWN or is_copyleft(licence)} == {}
+    assert {
+        name: licence
+        for name, licence in licences.items()
+        if licence == UNKNOWN or is_copyleft(licence)
+    } == {}
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,13 @@ def place(tmp_path, monkeypatch):
 
 def test_a_folder_goes_with_its_process_and_after_a_kill_with_the_next_one(place):
     environment = {**os.environ, "TMPDIR": str(place)}
-    killed = subprocess.run([sys.executable, "-c", KILLED], env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
     assert killed.returncode == -signal.SIGKILL
     assert [str(path) for path in place.iterdir()] == [killed.stdout.strip()]
     with temporary_folder("test") as folder:
@@ -67,7 +73,11 @@ def test_no_link_is_followed_and_nothing_of_others_is_deleted(place, tmp_path):
     clear_left()
     assert not inner.exists()
     assert (victim / "file").read_text() == (mine / "file").read_text() == "kept"
-    assert linked_owner.is_dir() and (place / "hilstar-heads-file").exists() and (place / "hilstar-heads-link").is_symlink()
+    assert (
+        linked_owner.is_dir()
+        and (place / "hilstar-heads-file").exists()
+        and (place / "hilstar-heads-link").is_symlink()
+    )
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can make another user's folder")

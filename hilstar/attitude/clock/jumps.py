@@ -90,7 +90,10 @@ class _TimeSteps:
     def add(self, sample: AttitudeSample) -> None:
         if self._last is not None:
             packets = sample.sequence - self._last.sequence
-            self._newest_ns, self._packets = sample.t_ns - self._last.t_ns, packets if 1 <= packets <= MAX_MISSING else 1
+            self._newest_ns, self._packets = (
+                sample.t_ns - self._last.t_ns,
+                packets if 1 <= packets <= MAX_MISSING else 1,
+            )
             self._usual_ns.append(self._newest_ns / self._packets)
         self._last = sample
 
@@ -102,7 +105,10 @@ class _TimeSteps:
         period_ns = float(np.median(usual_ns))
         if np.median(np.abs(usual_ns - period_ns)) > abs(by_ns) / 4:
             return False
-        return min(abs(self._newest_ns - count * period_ns) for count in (self._packets, 1)) < abs(by_ns) / 2
+        return (
+            min(abs(self._newest_ns - count * period_ns) for count in (self._packets, 1))
+            < abs(by_ns) / 2
+        )
 
 
 class _Pace:
@@ -193,7 +199,11 @@ class JumpFilter:
                 behind = self.release()
                 self.correction_ns += round(late_ns)
                 return [*behind, self._accept(arrival)]
-        if -self._early_limit_ns(arrival.host_ns) <= late_ns <= self._late_limit_ns(arrival.host_ns) + arrival.waited_ns:
+        if (
+            -self._early_limit_ns(arrival.host_ns)
+            <= late_ns
+            <= self._late_limit_ns(arrival.host_ns) + arrival.waited_ns
+        ):
             # Nothing to doubt; so early ones in doubt were wrong.
             refused = [_too_early(each) for each in self._doubtful if each.late_ns < 0]
             self._doubtful = [each for each in self._doubtful if each.late_ns >= 0]
@@ -366,7 +376,11 @@ class KnownClockFilter:
             self._shared_since_ns = host_ns
         if self._told and host_ns - self._shared_since_ns >= SHARED_FOR_NS:
             self._told = False
-            self._notices.end(CLOCK, ENDS[CLOCK], f"t_ns agrees with {CLOCK_NAMES[self._clock.mode]} of this machine again")
+            self._notices.end(
+                CLOCK,
+                ENDS[CLOCK],
+                f"t_ns agrees with {CLOCK_NAMES[self._clock.mode]} of this machine again",
+            )
 
     def _look_behind(self, late_ns: int, host_ns: int) -> None:
         """Say where even the quickest packet of some seconds comes late: times alone do not tell
@@ -381,7 +395,9 @@ class KnownClockFilter:
             return
         self._quickest = host_ns, late_ns
         if quickest_ns < MIN_BEHIND_NS:
-            self._notices.end(BEHIND, "clock-behind-no-more", "packets come soon after their t_ns again")
+            self._notices.end(
+                BEHIND, "clock-behind-no-more", "packets come soon after their t_ns again"
+            )
             return
         self._notices.begin(
             BEHIND,
@@ -391,7 +407,11 @@ class KnownClockFilter:
 
     def _line(self, late_ns: int) -> str:
         mode = self._clock.mode
-        where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
+        where = (
+            f"{late_ns / NS_PER_S:.3f} s behind"
+            if late_ns > 0
+            else f"{-late_ns / NS_PER_S:.3f} s ahead of"
+        )
         looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"
         wrong = "" if late_ns > 0 else f"; the sky drawn is {-late_ns / NS_PER_S:.3f} s old"
         return (

@@ -62,7 +62,11 @@ class LossCount:
             self._begin(sequence)
             return
         step = (sequence - newest + U32 // 2) % U32 - U32 // 2
-        if step == 0 or (step < 0 and sequence in self._recent) or (sequence == 0 and not 0 < step <= RECENT):
+        if (
+            step == 0
+            or (step < 0 and sequence in self._recent)
+            or (sequence == 0 and not 0 < step <= RECENT)
+        ):
             return  # 0: a message that does not count, among others that do
         if not -RECENT * max(self._unit, 1) <= step <= MAX_GAP * max(self._unit, 1):
             self._closed = self.lost
@@ -104,7 +108,11 @@ class TimeUnit:
         self._last_ns = host_ns
         self._packets += 1
         passed_ns, ticks = host_ns - first[1], t_ns - first[0]
-        if passed_ns < MIN_PACE_NS or self._packets < MIN_PACE_PACKETS or (ticks < MIN_TICKS and passed_ns < PATIENCE_NS):
+        if (
+            passed_ns < MIN_PACE_NS
+            or self._packets < MIN_PACE_PACKETS
+            or (ticks < MIN_TICKS and passed_ns < PATIENCE_NS)
+        ):
             return
         self._first, self._packets = (t_ns, host_ns), 0
         if ticks > 1:

@@ -69,7 +69,13 @@ class ReadAs:
     stated_by: str = KEY
 
     @classmethod
-    def of(cls, conventions: Conventions, convention: Convention, mounting: Mounting, stated_by: str = KEY) -> "ReadAs":
+    def of(
+        cls,
+        conventions: Conventions,
+        convention: Convention,
+        mounting: Mounting,
+        stated_by: str = KEY,
+    ) -> "ReadAs":
         """How a source of these conventions is read, where `convention` and `mounting` are
         stated.
         """
@@ -107,8 +113,15 @@ def _scalar_last(q: FloatArray) -> FloatArray:
 
 def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
     """The other readings of quaternions that are read like this."""
-    found, scalar, direction, mounting = [], read_as.scalar, read_as.direction, read_as.q_body_to_cam
-    for other_scalar, other_direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
+    found, scalar, direction, mounting = (
+        [],
+        read_as.scalar,
+        read_as.direction,
+        read_as.q_body_to_cam,
+    )
+    for other_scalar, other_direction in itertools.product(
+        ("first", "last"), ("icrs_to_cam", "cam_to_icrs")
+    ):
         if (other_scalar, other_direction) == (scalar, direction):
             continue
         text = "quaternions" if other_direction == direction else "conjugate of the quaternions"
@@ -119,7 +132,9 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
         if mounting is not None:
             parts.append(("frame", "body"))
 
-        def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
+        def read(
+            q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar
+        ) -> FloatArray:
             own = q if mounting is None else multiply(conjugate(mounting), q)
             sent = conjugate(own) if direction == "cam_to_icrs" else own
             sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
@@ -169,7 +184,9 @@ class Stretch:
         if found is None:
             turned = np.cumsum(_turns_rad(reading.read(self.q))[self.whole], axis=0)
             weight = self.at_s - self.at_s.mean()
-            found = self._read[reading.text] = np.asarray(weight[1:] @ turned / float(weight @ weight))
+            found = self._read[reading.text] = np.asarray(
+                weight[1:] @ turned / float(weight @ weight)
+            )
         return found
 
 
@@ -227,16 +244,27 @@ def _causes() -> Iterator[Cause]:
     for unit, size in UNITS.items():
         yield Cause(f"they are in {unit}; send rad/s", SAME / size, 1 / size)
     for unit, size in DEGREES:
-        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", -SAME / size, 1 / size)
+        yield Cause(
+            f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s",
+            -SAME / size,
+            1 / size,
+        )
     for unit, size in (("", 1.0), (", in deg/s", UNITS["deg/s"])):
-        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", SAME / size, 1 / size, in_icrs=True)
+        yield Cause(
+            f"they have ICRS components{unit}; send the camera's, rad/s",
+            SAME / size,
+            1 / size,
+            in_icrs=True,
+        )
 
 
 def read_otherwise(others: Sequence[Reading]) -> Iterator[Cause]:
     """The causes by which rates fit another reading of the quaternions."""
     for unit, size in DEGREES:
         for reading in others:
-            yield Cause(f"they fit the {reading.text}{unit}", SAME / size, 1 / size, reading=reading)
+            yield Cause(
+                f"they fit the {reading.text}{unit}", SAME / size, 1 / size, reading=reading
+            )
 
 
 def _permutations() -> Iterator[Cause]:
@@ -247,10 +275,20 @@ def _permutations() -> Iterator[Cause]:
                 continue
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
-            sent = ", ".join(("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3))
-            what = "some of their axes have the wrong sign" if order == (0, 1, 2) else "their axes are in another order"
+            sent = ", ".join(
+                ("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3)
+            )
+            what = (
+                "some of their axes have the wrong sign"
+                if order == (0, 1, 2)
+                else "their axes are in another order"
+            )
             for unit, size in DEGREES:
-                yield Cause(f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)", matrix / size, 1 / size)
+                yield Cause(
+                    f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)",
+                    matrix / size,
+                    1 / size,
+                )
 
 
 CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
@@ -290,7 +328,9 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     turn = weight @ turned / spread_s2
     scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
     turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
-    rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
+    rate_sigma = WALK * math.sqrt(
+        float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count
+    )
     stretch = Stretch(
         turn,
         weight @ summed / spread_s2,
@@ -326,7 +366,9 @@ def cause_of(
     if sum(not stretch.is_off for stretch in stretches) > len(stretches) // MORE_STRETCHES:
         return None
     if not any(stretch.rate.any() for stretch in stretches):
-        coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
+        coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(
+            np.linalg.norm(s.turn) for s in stretches
+        )
         return Cause("they are zero; leave them out", SAME) if coherent else None
     sharp = all(FIT_SIGMA * _noise_of(s) < SHARP_SHARE * _turning(s) for s in stretches)
     read = next((cause for cause in others if _explains(stretches, cause, AXES_SHARE)), None)
@@ -341,8 +383,13 @@ def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
     """
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [cause.error(stretch) for stretch in stretches]
-    fitting = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
-    return fitting.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(np.median(errors))
+    fitting = [
+        error <= _limit(s, share, FIT_SIGMA, cause.scale)
+        for s, error in zip(stretches, errors, strict=True)
+    ]
+    return fitting.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(
+        np.median(errors)
+    )
 
 
 def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> Cause | None:
@@ -376,10 +423,14 @@ def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float)
     """
     if len(stretches) < MORE_STRETCHES:
         return None
-    turns, rates = (np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate"))
+    turns, rates = (
+        np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate")
+    )
     factor = float((rates * rates).sum()) / float((rates * turns).sum() or math.inf)
     if abs(factor) > 0:
-        times = Cause(f"they are {factor:.3g} times the quaternions' own turn", SAME / factor, 1 / abs(factor))
+        times = Cause(
+            f"they are {factor:.3g} times the quaternions' own turn", SAME / factor, 1 / abs(factor)
+        )
         if _explains(stretches, times, AXES_SHARE):
             return times
     # The rotation that turns rates best into turns (Kabsch 1976).
@@ -392,7 +443,10 @@ def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float)
     if len(stretches) >= MANY_STRETCHES and length_s >= LONGEST_S:
         return _constant(stretches, rates - turns)
     # While the turn changes, late rates are off as far: `lag_of` is to look first.
-    changes = np.linalg.norm(turns - turns.mean(axis=0), axis=1).max() > STEADY_SHARE * np.linalg.norm(turns, axis=1).max()
+    changes = (
+        np.linalg.norm(turns - turns.mean(axis=0), axis=1).max()
+        > STEADY_SHARE * np.linalg.norm(turns, axis=1).max()
+    )
     if changes and history_s < MIN_HISTORY_S:
         return None
     gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
@@ -405,7 +459,9 @@ def _constant(stretches: Sequence[Stretch], off: FloatArray) -> Cause | None:
     """
     constant = off.mean(axis=0)
     x, y, z = np.degrees(constant).tolist()
-    cause = Cause(f"a constant ({x:.3g}, {y:.3g}, {z:.3g}) deg/s is added to them", SAME, constant=constant)
+    cause = Cause(
+        f"a constant ({x:.3g}, {y:.3g}, {z:.3g}) deg/s is added to them", SAME, constant=constant
+    )
     return cause if _explains(stretches, cause, AXES_SHARE) else None
 
 
@@ -419,7 +475,9 @@ def fits(stretch: Stretch, was_off: float) -> bool:
     turn: noise hides no half.
     """
     limit = _limit(stretch, FIT_SHARE, FIT_SIGMA)
-    return stretch.turns and _error(stretch, stretch.rate) <= limit < MUCH_LESS * was_off * _turning(stretch)
+    return stretch.turns and _error(
+        stretch, stretch.rate
+    ) <= limit < MUCH_LESS * was_off * _turning(stretch)
 
 
 def _error(stretch: Stretch, rate: FloatArray) -> float:
@@ -467,13 +525,19 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     if not stretches or stretches[-1].to_ns - stretches[0].from_ns < MIN_HISTORY_S * NS_PER_S:
         return None
     # The stretches' own figures say at little cost that there is nothing to look for.
-    fast, off = _turning_median(stretches), float(np.median([stretch.error for stretch in stretches]))
+    fast, off = (
+        _turning_median(stretches),
+        float(np.median([stretch.error for stretch in stretches])),
+    )
     if off <= 0.5 * max(MIN_OFF_RAD_S, OFF_SHARE * fast):
         return LagFit(fast, off, 0.0)
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
-    turned, summed = (_joined([getattr(stretch, name) for stretch in stretches]) for name in ("turned_rad", "summed_rad"))
+    turned, summed = (
+        _joined([getattr(stretch, name) for stretch in stretches])
+        for name in ("turned_rad", "summed_rad")
+    )
     edges_s = np.arange(MAX_LAG_S, t_s[-1] - MAX_LAG_S, LAG_SPAN_S)
     if t_s[-1] < MIN_HISTORY_S or len(edges_s) <= MIN_TURNS:
         return None
@@ -497,7 +561,8 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     near_s = near_s[np.abs(near_s) <= MAX_LAG_S]
     left = off_by(near_s)
     explained = (
-        float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise)) and abs(lag_s) >= MIN_LAG_S
+        float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise))
+        and abs(lag_s) >= MIN_LAG_S
     )
     return LagFit(fast, off, float(near_s[left.argmin()]) if explained else 0.0)
 
@@ -522,7 +587,9 @@ def _joined(parts: Sequence[FloatArray]) -> FloatArray:
     """Sums (n, 3) that begin at 0 each, as one that goes on."""
     ends = np.cumsum([part[-1] for part in parts], axis=0)
     begins = np.vstack((np.zeros(3), ends[:-1]))
-    return np.vstack([np.zeros(3), *(part[1:] + begin for part, begin in zip(parts, begins, strict=True))])
+    return np.vstack(
+        [np.zeros(3), *(part[1:] + begin for part, begin in zip(parts, begins, strict=True))]
+    )
 
 
 def _between(t_s: FloatArray, summed: FloatArray, edges_s: FloatArray) -> FloatArray:

@@ -79,7 +79,11 @@ def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -
     """What the newest stretches of a length show, few of them first."""
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)
-        if newest and (cause := cause_of(newest, length.length_s or LONGEST_S, history_s, others)) is not None:
+        if (
+            newest
+            and (cause := cause_of(newest, length.length_s or LONGEST_S, history_s, others))
+            is not None
+        ):
             return cause
     return None
 
@@ -131,7 +135,9 @@ class _History:
 
     def add(self, stretch: Stretch) -> LagFit | None:
         """Take the next stretch; how rates and turn compare, twice a second."""
-        if not stretch.whole.all() or (self._stretches and self._stretches[-1].to_ns != stretch.from_ns):
+        if not stretch.whole.all() or (
+            self._stretches and self._stretches[-1].to_ns != stretch.from_ns
+        ):
             self.clear()
         if not stretch.whole.all():
             return None
@@ -231,7 +237,9 @@ class RateCheck:
             self._late = found
             late = "late" if found.lag_s > 0 else "early"
             text = f"they are {abs(found.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {late}: they fit the turn of another moment"
-            self._begin(Cause(text, SAME, lag_s=found.lag_s), stretch, self._history.from_ns, host_ns)
+            self._begin(
+                Cause(text, SAME, lag_s=found.lag_s), stretch, self._history.from_ns, host_ns
+            )
         elif self._late is not None and found.fast_rad_s > MUCH_LESS * self._late.fast_rad_s:
             was = self._late.off_rad_s / self._late.fast_rad_s
             fitting = not found.lag_s and found.off_rad_s < MUCH_LESS * was * found.fast_rad_s
@@ -245,13 +253,20 @@ class RateCheck:
         self._notices.begin(cause.kind, self._line(cause, stretch), since_ns)
 
     def _line(self, cause: Cause, stretch: Stretch) -> str:
-        turn_deg_s, rate_rad_s = np.degrees(np.linalg.norm(stretch.turn)), np.linalg.norm(stretch.rate)
+        turn_deg_s, rate_rad_s = (
+            np.degrees(np.linalg.norm(stretch.turn)),
+            np.linalg.norm(stretch.rate),
+        )
         if cause.reading is not None:
             return (
                 f"the packets' rates do not fit their quaternions as they are read; {cause.text}: the sky is drawn at another"
                 f" place; {cause.reading.advice} (both turn at {turn_deg_s:.3g} deg/s)"
             )
-        done = "the sky is drawn by the quaternions' own turn" if self.distrusts else "they are used all the same"
+        done = (
+            "the sky is drawn by the quaternions' own turn"
+            if self.distrusts
+            else "they are used all the same"
+        )
         if not self._used:
             done = "nothing is drawn by them"
         return (

@@ -29,7 +29,9 @@ class Resolution:
     def __init__(self, tell: Callable[[str, str], None]) -> None:
         self._say = tell
         self._left = LOOKED_AT
-        self._evidence = dict.fromkeys((step for step in STEPS if step * ARCSEC_PER_RAD >= MIN_ARCSEC), 0)
+        self._evidence = dict.fromkeys(
+            (step for step in STEPS if step * ARCSEC_PER_RAD >= MIN_ARCSEC), 0
+        )
         self._last: list[float] = []
 
     def see(self, sample: AttitudeSample) -> None:

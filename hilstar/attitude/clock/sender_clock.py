@@ -212,7 +212,9 @@ class Exchange:
         """
         known = self.delay_ns >= self.there_ns + self.back_ns  # a pty has a baud rate and no wire
         longer_ns = self.back_ns - self.there_ns if known else 0
-        return ((self.t1_ns - self.t2_ns - base_ns) + (self.t4_ns - self.t3_ns - base_ns) - longer_ns) / 2
+        return (
+            (self.t1_ns - self.t2_ns - base_ns) + (self.t4_ns - self.t3_ns - base_ns) - longer_ns
+        ) / 2
 
 
 class _MeasuredExchange(NamedTuple):
@@ -231,10 +233,16 @@ class _ExchangeFilter:
 
     def observe(self, exchange: Exchange, base_ns: int) -> None:
         """Take one exchange; the line's offsets are less `base_ns`."""
-        new = _MeasuredExchange((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
+        new = _MeasuredExchange(
+            (exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns
+        )
         self.count += 1
         if self.line is not None:
-            bound_ns = new.delay_ns / 2 + self.line.uncertainty_ns + MAX_DRIFT * (new.host_ns - self.line.host_ns)
+            bound_ns = (
+                new.delay_ns / 2
+                + self.line.uncertainty_ns
+                + MAX_DRIFT * (new.host_ns - self.line.host_ns)
+            )
             # no drift explains it: the clock was set
             if abs(new.offset_ns - self.line.at(new.host_ns)) > bound_ns:
                 self._measured.clear()
@@ -264,7 +272,10 @@ class _ExchangeFilter:
 
     def current_line(self, host_ns: int) -> _OffsetLine | None:
         """The line while enough exchanges are recent, else None."""
-        if len(self._measured) < MIN_EXCHANGES or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS:
+        if (
+            len(self._measured) < MIN_EXCHANGES
+            or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS
+        ):
             return None
         return self.line
 
@@ -311,7 +322,9 @@ class SenderClock:
         """Take the offset of a clock that is not estimated: a step of it is one of the next
         frame.
         """
-        self._line = _OffsetLine(0, known.offset_ns - self._base(known.offset_ns), uncertainty_ns=known.error_ns)
+        self._line = _OffsetLine(
+            0, known.offset_ns - self._base(known.offset_ns), uncertainty_ns=known.error_ns
+        )
 
     def observe(self, t_ns: int, host_ns: int) -> None:
         """Take one message: its time on the sender's clock and its arrival."""
@@ -376,12 +389,16 @@ class SenderClock:
         minimum; None before any.
         """
         line, base_ns = self._line, self._base_ns
-        return None if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
+        return (
+            None if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
+        )
 
     def late_ns(self, t_ns: int, host_ns: int) -> float:
         """A message's delay above the line of the arrivals alone; 0 before any message."""
         line, base_ns = self._one_way.line, self._base_ns
-        return 0.0 if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
+        return (
+            0.0 if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
+        )
 
     @property
     def unheard(self) -> bool:
@@ -406,6 +423,8 @@ class SenderClock:
             self.mode,
             offset_ms=(self._base_ns + line.offset_ns) / NS_PER_MS,
             drift_ppm=0.0 - line.drift * 1e6,
-            uncertainty_ms=(uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None,
+            uncertainty_ms=(uncertainty_ns + behind_ns) / NS_PER_MS
+            if math.isfinite(uncertainty_ns)
+            else None,
             exchanges=self._exchanges.count,
         )

@@ -83,7 +83,9 @@ class Repeats:
             what = f"the sender's clock has stopped at t_ns {sample.t_ns}"
             what = "the sender repeats one packet" if raw == self._last else what
             self._frozen = True
-            self._notices.begin(FROZEN, f"{what}: refused (time), and the attitude shown is getting old")
+            self._notices.begin(
+                FROZEN, f"{what}: refused (time), and the attitude shown is getting old"
+            )
         self._last_sample = sample
         return Refusal("time", f"t_ns {sample.t_ns} repeats that of the previous packet")
 
@@ -155,15 +157,29 @@ class _KnownSender:
     @classmethod
     def of(cls, arrival: SampleArrival) -> "_KnownSender":
         sample = arrival.event
-        made = cls(sample, arrival.host_ns, arrival.waited_ns, since_ns=arrival.host_ns, count=sample.sequence)
-        made.count_t_ns, made.q, made.turning_rad_s = sample.t_ns, sample.q_icrs_to_cam.tolist(), _rate_of(sample)
+        made = cls(
+            sample,
+            arrival.host_ns,
+            arrival.waited_ns,
+            since_ns=arrival.host_ns,
+            count=sample.sequence,
+        )
+        made.count_t_ns, made.q, made.turning_rad_s = (
+            sample.t_ns,
+            sample.q_icrs_to_cam.tolist(),
+            _rate_of(sample),
+        )
         return made
 
     def agrees(self, arrival: SampleArrival) -> _CourseAgreement:
         sample, period_ns = arrival.event, self.period_ns
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
         step = _steps(self.count, sample.sequence)
-        clock = -EARLY_NS <= later_ns <= max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (period_ns or 0.0))
+        clock = (
+            -EARLY_NS
+            <= later_ns
+            <= max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (period_ns or 0.0))
+        )
         # time and count may advance together, however late it is
         if not self.still and period_ns is not None and step:
             usual_ns = step * period_ns
@@ -171,7 +187,9 @@ class _KnownSender:
             clock = clock or off_ns <= 0.5 * period_ns + 0.05 * abs(usual_ns)
         counted_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, gap_ns)
         max_step = MAX_FIRST_LOSSES if period_ns is None else 2 + 2 * counted_ns / period_ns
-        steady = period_ns is not None and STEADY[0] < later_ns / (period_ns * max(step, 1)) < STEADY[1]
+        steady = (
+            period_ns is not None and STEADY[0] < later_ns / (period_ns * max(step, 1)) < STEADY[1]
+        )
         turned = _turn_rad(self.q, sample.q_icrs_to_cam.tolist())
         far_rad = self._far_rad(turned, later_ns if abs(later_ns) < MAX_STEP_NS else max(gap_ns, 0))
         if not clock:
@@ -203,7 +221,11 @@ class _KnownSender:
             counted_ns = sample.t_ns - self.count_t_ns
             if 0 < counted_ns < MAX_STEP_NS and (agreed.count or self.still):
                 period_ns = counted_ns / max(step, 1)
-                self.period_ns = period_ns if self.period_ns is None else self.period_ns + (period_ns - self.period_ns) / 8
+                self.period_ns = (
+                    period_ns
+                    if self.period_ns is None
+                    else self.period_ns + (period_ns - self.period_ns) / 8
+                )
             self.still = self.still and step == 0
             self.count, self.count_t_ns = sample.sequence, sample.t_ns
         if agreed.sky or (agreed.plausible and not self.still):
@@ -218,7 +240,12 @@ class _KnownSender:
             self.turning_rad_s = known
         self.silence_ns = max(arrival.host_ns - self.host_ns, FORGETS * self.silence_ns)
         self.heard += 1
-        self.sample, self.q, self.host_ns, self.waited_ns = sample, q, arrival.host_ns, arrival.waited_ns
+        self.sample, self.q, self.host_ns, self.waited_ns = (
+            sample,
+            q,
+            arrival.host_ns,
+            arrival.waited_ns,
+        )
 
     def patience_ns(self, silent_after_ns: int) -> float:
         if self.heard < MIN_KNOWN or self.host_ns - self.since_ns < MIN_KNOWN_NS:
@@ -260,13 +287,17 @@ class Senders:
         if main is None:
             self._main = _KnownSender.of(arrival)
             return [arrival]
-        self._strangers = [each for each in self._strangers if host_ns - each.host_ns < ANOTHER_COURSE_WITHIN_NS]
+        self._strangers = [
+            each for each in self._strangers if host_ns - each.host_ns < ANOTHER_COURSE_WITHIN_NS
+        ]
         if self._two and not self._strangers:
             self._part("the second sender is silent")
         agreed = main.agrees(arrival)
         rival = self._rival(arrival, agreed)
         own = rival is None and self._is_its_own(main, arrival.event, agreed)
-        comes_back = not agreed.sky and not arrival.event.discontinuity and self._comes_back(arrival, agreed)
+        comes_back = (
+            not agreed.sky and not arrival.event.discontinuity and self._comes_back(arrival, agreed)
+        )
         if own and not (comes_back and self._is_too_often(main, arrival.event)):
             self._courses = self._courses + comes_back if comes_back or agreed.sky else 0
             return self._speaks(main, arrival, agreed)
@@ -279,7 +310,11 @@ class Senders:
         is.
         """
         main = self._main
-        if main is None or not self._waiting or host_ns - main.host_ns <= main.patience_ns(self._silent_after_ns):
+        if (
+            main is None
+            or not self._waiting
+            or host_ns - main.host_ns <= main.patience_ns(self._silent_after_ns)
+        ):
             return []
         return self._give_way(main, self._waiting[-1].sender)
 
@@ -293,11 +328,15 @@ class Senders:
         score, far_rad = agreed.score, agreed.far_rad if agreed.sky else FAR_RATIO * agreed.far_rad
         for each in self._strangers:
             its = each.agrees(arrival)
-            if (its.clock or its.count) and (its.score > score or (its.score == score and FAR_RATIO * its.far_rad < far_rad)):
+            if (its.clock or its.count) and (
+                its.score > score or (its.score == score and FAR_RATIO * its.far_rad < far_rad)
+            ):
                 best, score, far_rad = each, its.score, its.far_rad
         return best
 
-    def _is_its_own(self, main: _KnownSender, sample: AttitudeSample, agreed: _CourseAgreement) -> bool:
+    def _is_its_own(
+        self, main: _KnownSender, sample: AttitudeSample, agreed: _CourseAgreement
+    ) -> bool:
         """Two of three agree; a turn to a new target is said, or could have been made, or comes
         by the usual step.
         """
@@ -309,16 +348,25 @@ class Senders:
         counts = agreed.count or (main.still and sample.sequence == main.count)
         return agreed.clock and (counts and turned)
 
-    def _speaks(self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement) -> list[SampleArrival]:
+    def _speaks(
+        self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement
+    ) -> list[SampleArrival]:
         """The sender shown has spoken: what strangers said meanwhile is refused, unless it
         continues in one count.
         """
         if not agreed.sky or not agreed.clock:
             self._left = replace(main)
-        elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
+        elif (
+            self._left is not None
+            and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns)
+        ):
             self._left = None
         waiting = self._emptied()
-        counts = [main.count, *(each.arrival.event.sequence for each in waiting), arrival.event.sequence]
+        counts = [
+            main.count,
+            *(each.arrival.event.sequence for each in waiting),
+            arrival.event.sequence,
+        ]
         main.move(arrival, agreed)
         if all(1 <= _steps(before, after) <= 2 for before, after in pairwise(counts)):
             return [*(each.arrival for each in waiting), arrival]
@@ -328,7 +376,9 @@ class Senders:
 
     def _tell_two(self) -> None:
         self._two = True
-        self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
+        self._notices.begin(
+            SECOND, "two senders on one link: showing the first, refusing the other (source)"
+        )
 
     def _is_too_often(self, main: _KnownSender, sample: AttitudeSample) -> bool:
         """True where one sender would hardly go to and fro like that: it has only begun to
@@ -343,7 +393,9 @@ class Senders:
         between.
         """
         left = self._left
-        if left is None or arrival.host_ns - left.host_ns > max(left.patience_ns(self._silent_after_ns), self._silent_after_ns):
+        if left is None or arrival.host_ns - left.host_ns > max(
+            left.patience_ns(self._silent_after_ns), self._silent_after_ns
+        ):
             return False
         its = left.agrees(arrival)
         return its.sky and its.score > agreed.score and (its.clock or its.count)
@@ -359,13 +411,17 @@ class Senders:
             self._tell_two()
         return self._speaks(left, arrival, left.agrees(arrival))
 
-    def _take_strange(self, main: _KnownSender, arrival: SampleArrival, rival: _KnownSender | None) -> list[SampleArrival]:
+    def _take_strange(
+        self, main: _KnownSender, arrival: SampleArrival, rival: _KnownSender | None
+    ) -> list[SampleArrival]:
         sender = rival or self._known(arrival)
         if sender is None:
             sender = _KnownSender.of(arrival)
             self._add_stranger(sender)
         elif arrival.event.t_ns == sender.sample.t_ns:
-            refusal = Refusal("time", f"t_ns {arrival.event.t_ns} repeats that of an earlier packet")
+            refusal = Refusal(
+                "time", f"t_ns {arrival.event.t_ns} repeats that of an earlier packet"
+            )
             return [replace(arrival, refusal=refusal)]
         else:
             sender.move(arrival, sender.agrees(arrival))
@@ -388,11 +444,17 @@ class Senders:
         """
         for each in self._strangers:
             its = each.agrees(arrival)
-            if its.score >= 2 or (its.clock and its.plausible) or arrival.event.t_ns == each.sample.t_ns:
+            if (
+                its.score >= 2
+                or (its.clock and its.plausible)
+                or arrival.event.t_ns == each.sample.t_ns
+            ):
                 return each
         return None
 
-    def _give_way(self, main: _KnownSender, sender: _KnownSender, *, for_good: bool = False) -> list[SampleArrival]:
+    def _give_way(
+        self, main: _KnownSender, sender: _KnownSender, *, for_good: bool = False
+    ) -> list[SampleArrival]:
         """The sender shown is silent: another one is shown, or the same one begun anew."""
         if self._two:
             self._part("the first sender is silent; showing the other one")
@@ -400,7 +462,10 @@ class Senders:
         self._strangers = [each for each in self._strangers if each is not sender]
         if for_good:
             self._add_stranger(main)
-        return [each.arrival if each.sender is sender else _refused(each.arrival) for each in self._emptied()]
+        return [
+            each.arrival if each.sender is sender else _refused(each.arrival)
+            for each in self._emptied()
+        ]
 
     def _emptied(self) -> list[_Waiting]:
         waiting, self._waiting = self._waiting, []

@@ -178,7 +178,9 @@ class Timeline:
     `joins` says how two of them join; the default suits a live stream.
     """
 
-    def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
+    def __init__(
+        self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None
+    ) -> None:
         self.policy = policy
         self._joins = joins
         self._capacity = capacity
@@ -202,7 +204,9 @@ class Timeline:
         damped = self._damp(sample)
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
-                return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]} of an earlier packet")
+                return Refusal(
+                    "time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]} of an earlier packet"
+                )
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
             self._received_ns, self._damped = received_ns, damped
@@ -227,10 +231,16 @@ class Timeline:
             near = self._samples[max(i - 1, 0) : i + 3]
             received_ns, damped = self._received_ns, self._damped
         place = max(min(i, 1), 0)
-        found = self._at(t_ns, near, place, received_ns, damped) if i >= 0 else _held(near[0], 0, False)
+        found = (
+            self._at(t_ns, near, place, received_ns, damped) if i >= 0 else _held(near[0], 0, False)
+        )
         if near[place].velocity_km_s is None:
             return found
-        return replace(found, velocity_km_s=near[place].velocity_km_s, place_km=self._place_km(near, place, t_ns))
+        return replace(
+            found,
+            velocity_km_s=near[place].velocity_km_s,
+            place_km=self._place_km(near, place, t_ns),
+        )
 
     def _place_km(self, near: list[AttitudeSample], place: int, t_ns: int) -> FloatArray | None:
         """Where the observer is: on the cubic through two samples, else straight on for as long
@@ -241,28 +251,48 @@ class Timeline:
             return None
         age_ns = max(t_ns - before.t_ns, 0)
         after = near[place + 1] if place + 1 < len(near) else before
-        if after is before or after.place_km is None or after.velocity_km_s is None or self._jumped(before, after):
-            return before.place_km + before.velocity_km_s * (min(age_ns, self.policy.max_extrapolation_ns) / NS_PER_S)
+        if (
+            after is before
+            or after.place_km is None
+            or after.velocity_km_s is None
+            or self._jumped(before, after)
+        ):
+            return before.place_km + before.velocity_km_s * (
+                min(age_ns, self.policy.max_extrapolation_ns) / NS_PER_S
+            )
         gap_s = (after.t_ns - before.t_ns) / NS_PER_S
         u = age_ns / (after.t_ns - before.t_ns)
         straight = after.place_km - before.place_km
-        bend = (1 - u) * (before.velocity_km_s * gap_s - straight) - u * (after.velocity_km_s * gap_s - straight)
+        bend = (1 - u) * (before.velocity_km_s * gap_s - straight) - u * (
+            after.velocity_km_s * gap_s - straight
+        )
         return before.place_km + u * straight + u * (1 - u) * bend
 
-    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None, damped: _Damped) -> Attitude:
+    def _at(
+        self,
+        t_ns: int,
+        near: list[AttitudeSample],
+        place: int,
+        received_ns: int | None,
+        damped: _Damped,
+    ) -> Attitude:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
             join = self._joined(newest, near[place + 1])
             if join == "hold":
-                gap = age_ns > self.policy.stale_after_ns and not self._jumped(newest, near[place + 1])
+                gap = age_ns > self.policy.stale_after_ns and not self._jumped(
+                    newest, near[place + 1]
+                )
                 return _held(newest, age_ns, gap)
             q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
         own = self._rate_of(near[place - 1] if place else None, newest)
         return replace(self._predict(newest, own, age_ns, damped), received_ns=received_ns)
 
-    def _between(self, near: list[AttitudeSample], place: int, age_ns: int, join: Join) -> tuple[FloatArray, FloatArray]:
+    def _between(
+        self, near: list[AttitudeSample], place: int, age_ns: int, join: Join
+    ) -> tuple[FloatArray, FloatArray]:
         """Attitude and rate between two samples; in a blend the rates are blended too."""
         before, after = near[place], near[place + 1]
         gap_ns = after.t_ns - before.t_ns
@@ -273,11 +303,15 @@ class Timeline:
         forward, backward = age_ns / NS_PER_S, (age_ns - gap_ns) / NS_PER_S
         bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
-        from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
+        from_after = propagate(
+            after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward
+        )
         u = age_ns / gap_ns
         # first and second derivatives 0 at both ends (Perlin 2002)
         share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
-        turning = (1 - share) * (rate + forward * bend) + share * (rate_after + backward * bend_after)
+        turning = (1 - share) * (rate + forward * bend) + share * (
+            rate_after + backward * bend_after
+        )
         return slerp(from_before, from_after, share), turning
 
     def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
@@ -299,7 +333,9 @@ class Timeline:
         # Rates say little about a long silence: propagated across it from both sides they
         # overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
-        return "blend" if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns else "slerp"
+        return (
+            "blend" if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns else "slerp"
+        )
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """True where the attitude jumps: the sample says so, or the turn would exceed the
@@ -308,9 +344,14 @@ class Timeline:
         if after.discontinuity:
             return True
         seconds = (after.t_ns - before.t_ns) / NS_PER_S
-        return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self.policy.max_rate_rad_s * seconds
+        return (
+            angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam)
+            > self.policy.max_rate_rad_s * seconds
+        )
 
-    def _rate_of(self, previous: AttitudeSample | None, newest: AttitudeSample) -> FloatArray | None:
+    def _rate_of(
+        self, previous: AttitudeSample | None, newest: AttitudeSample
+    ) -> FloatArray | None:
         """The rate for predicting past a sample: its own, else that of the turn to it; None
         where neither is known.
         """
@@ -332,12 +373,18 @@ class Timeline:
         if rate is None or sample.acceleration_cam_rad_s2 is not None:
             damping.restart()
             return UNDAMPED
-        if previous is None or sample.t_ns - previous.t_ns > self.policy.stale_after_ns or self._jumped(previous, sample):
+        if (
+            previous is None
+            or sample.t_ns - previous.t_ns > self.policy.stale_after_ns
+            or self._jumped(previous, sample)
+        ):
             return damping.add(sample.t_ns, tuple(rate.tolist()), None)
         turn = rate_between_rad_s(previous.q_icrs_to_cam, sample.q_icrs_to_cam, 1.0)
         return damping.add(sample.t_ns, tuple(rate.tolist()), tuple(turn.tolist()))
 
-    def _predict(self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: _Damped) -> Attitude:
+    def _predict(
+        self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: _Damped
+    ) -> Attitude:
         stale = age_ns > self.policy.stale_after_ns
         if rate is None:
             return _held(newest, age_ns, stale)
@@ -349,10 +396,14 @@ class Timeline:
             self._damping.asked(seconds)
             if damped is not UNDAMPED:
                 rate = rate - damped.by(seconds)
-        mean, last = (rate, rate) if bend is None else (rate + 0.5 * seconds * bend, rate + seconds * bend)
+        mean, last = (
+            (rate, rate) if bend is None else (rate + 0.5 * seconds * bend, rate + seconds * bend)
+        )
         q = propagate(newest.q_icrs_to_cam, mean, seconds)
         turning = last if prediction_ns == age_ns else None  # held past that
-        return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning)
+        return Attitude(
+            q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning
+        )
 
 
 def _held(sample: AttitudeSample, age_ns: int, stale: bool) -> Attitude:

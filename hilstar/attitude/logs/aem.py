@@ -49,7 +49,13 @@ import numpy.typing as npt
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs import aem_blocks as ccsds
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogEntry, LogReading, Stated, log_joins
+from hilstar.attitude.logs.entries import (
+    MAX_QUOTED_CHARACTERS,
+    LogEntry,
+    LogReading,
+    Stated,
+    log_joins,
+)
 from hilstar.attitude.logs.log_formats import LogFormat, LogHead, Writing
 from hilstar.attitude.logs.log_times import FIRST_DATE_NS
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
@@ -69,7 +75,8 @@ INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000
 # and CAM.
 CAMERA_FRAME = re.compile("(STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA)(_.*|[0-9]+)?")
 BODY_FRAME = re.compile(
-    "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|" + CAMERA_FRAME.pattern
+    "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|"
+    + CAMERA_FRAME.pattern
 )
 
 OF_DATE_FRAME = re.compile("MOD|TOD|TEME|ITRF-?([0-9]{2}|[0-9]{4})?")
@@ -127,7 +134,10 @@ def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     rate[:, 2] = spin_rate
     if kind == ccsds.SPIN_NUTATION:
         nutation, phase = np.radians(values[:, 4]), np.radians(values[:, 6])
-        momentum = np.stack((np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)), axis=1)
+        momentum = np.stack(
+            (np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)),
+            axis=1,
+        )
         rate += (2 * np.pi / values[:, 5])[:, None] * momentum
     elif kind == ccsds.SPIN_NUTATION_MOM:
         momentum = direction_of(values[:, 4], values[:, 5])
@@ -175,8 +185,16 @@ class _DatedBlock:
         """Where it is meant to be used; without keywords, all of it. Raises AemFaultError."""
         where, meta = self.block.where[0], self.block.meta
         first, last = self.times[0], self.times[-1]
-        start = ccsds.epoch_ns(where, meta["USEABLE_START_TIME"]) if "USEABLE_START_TIME" in meta else first
-        stop = ccsds.epoch_ns(where, meta["USEABLE_STOP_TIME"]) if "USEABLE_STOP_TIME" in meta else last
+        start = (
+            ccsds.epoch_ns(where, meta["USEABLE_START_TIME"])
+            if "USEABLE_START_TIME" in meta
+            else first
+        )
+        stop = (
+            ccsds.epoch_ns(where, meta["USEABLE_STOP_TIME"])
+            if "USEABLE_STOP_TIME" in meta
+            else last
+        )
         if stop < start:
             raise ccsds.AemFaultError(where, "USEABLE_STOP_TIME is before USEABLE_START_TIME")
         return min(max(start, first), last), max(min(stop, last), first)
@@ -189,7 +207,11 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
     groups: list[list[_DatedBlock]] = []
     end_ns = 0
     for segment in segments:
-        if groups and segment.times[0] < end_ns and all(each.is_whole for each in (segment, *groups[-1])):
+        if (
+            groups
+            and segment.times[0] < end_ns
+            and all(each.is_whole for each in (segment, *groups[-1]))
+        ):
             groups[-1].append(segment)
             end_ns = max(end_ns, segment.times[-1])
         else:
@@ -207,12 +229,25 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
 def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
     if len(group) > MAX_OVERLAPPING:
         where = group[0].block.where[0]
-        raise ccsds.AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
+        raise ccsds.AemFaultError(
+            where,
+            f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each",
+        )
     useable = [segment.useable_ns() for segment in group]
-    edges = sorted({edge for k, segment in enumerate(group) for edge in (segment.times[0], segment.times[-1], *useable[k])})
+    edges = sorted(
+        {
+            edge
+            for k, segment in enumerate(group)
+            for edge in (segment.times[0], segment.times[-1], *useable[k])
+        }
+    )
     pieces: list[tuple[int, int, int]] = []  # block number, from, to
     for start, stop in pairwise(edges):
-        having = [k for k, segment in enumerate(group) if segment.times[0] <= start and stop <= segment.times[-1]]
+        having = [
+            k
+            for k, segment in enumerate(group)
+            if segment.times[0] <= start and stop <= segment.times[-1]
+        ]
         meant = [k for k in having if useable[k][0] <= start and stop <= useable[k][1]]
         taken = max(meant or having)  # the later one: they come in the order of their first epochs
         if pieces and pieces[-1][0] == taken:
@@ -232,8 +267,14 @@ def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     """The attitudes of a segment from `start_ns` to `stop_ns`; an end where it has none is
     interpolated.
     """
-    piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
-    own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
+    piece = segment.entries[
+        bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)
+    ]
+    own = {
+        entry.event.t_ns
+        for entry in (piece[:1] + piece[-1:])
+        if isinstance(entry.event, AttitudeSample)
+    }
     if start_ns not in own:
         piece.insert(0, segment.at(start_ns))
     if stop_ns not in own and stop_ns > start_ns:
@@ -262,18 +303,32 @@ def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
     do, as `read_aem` gives them.
     """
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
-        raise ccsds.AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
+        raise ccsds.AemFaultError(
+            "", "TIME_SYSTEM changes from block to block; write one file for each time system"
+        )
     frames = [_frames(block.meta) for block in blocks]
     if len({body for _, body in frames}) > 1:
-        raise ccsds.AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
-    timed = [([ccsds.epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
+        raise ccsds.AemFaultError(
+            "", "the spacecraft's frame changes from block to block; write one file for each"
+        )
+    timed = [
+        ([ccsds.epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b)
+        for b in blocks
+    ]
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
     told: dict[str, str] = {}
-    segments = [_DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed]
+    segments = [
+        _DatedBlock(block, times, list(_entries(block, times, of_date, told)))
+        for times, block in timed
+    ]
     for following in _resolved(segments, told):
         first, end = following[0], entries[-1] if entries else None
-        if end is not None and isinstance(end.event, AttitudeSample) and isinstance(first.event, AttitudeSample):
+        if (
+            end is not None
+            and isinstance(end.event, AttitudeSample)
+            and isinstance(first.event, AttitudeSample)
+        ):
             # 504.0-B-1 allows it: the earlier block then ends 1 ns before
             if end.event.t_ns == first.event.t_ns:
                 entries[-1] = LogEntry(end.where, replace(end.event, t_ns=end.event.t_ns - 1))
@@ -290,7 +345,11 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
     block has it at its first epoch.
     """
     meta = block.meta
-    (reference, body), scale, to_body = _frames(meta), meta["TIME_SYSTEM"], _second_frame_is_cam(meta)
+    (reference, body), scale, to_body = (
+        _frames(meta),
+        meta["TIME_SYSTEM"],
+        _second_frame_is_cam(meta),
+    )
     scalar_first = meta.get("QUATERNION_TYPE") == "FIRST"
     names = "QC Q1 Q2 Q3" if scalar_first else "Q1 Q2 Q3 QC"
     first, second = (reference, body) if to_body else (body, reference)
@@ -298,7 +357,9 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
 
     def written(q: FloatArray) -> str:
         if not inertial:
-            q = multiply(q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0]))
+            q = multiply(
+                q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0])
+            )
         own = conjugate(q) if to_body else q
         when = "" if inertial else f" at {block.epochs[0]}"
         return f"{names} = {components(own if scalar_first else np.roll(own, -1))}{when}"
@@ -317,7 +378,9 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
     )
 
 
-def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
+def _entries(
+    block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[str, str]
+) -> Iterator[LogEntry]:
     q, rate = _attitudes(block)
     if block.meta["ATTITUDE_TYPE"] == ccsds.SPIN:
         # Only the rate says how often a body spins between attitudes that are more than a quarter
@@ -330,9 +393,12 @@ def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[s
     if reference not in INERTIAL_FRAMES:
         if any(t_ns not in INT64 for t_ns in times):
             raise ccsds.AemFaultError(
-                block.where[-1], f"the times of the block do not fit 64 bits, so {reference} has no place there"
+                block.where[-1],
+                f"the times of the block do not fit 64 bits, so {reference} has no place there",
             )
-        q_icrs_to_frame, frame_rate, notice = of_date(reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64))
+        q_icrs_to_frame, frame_rate, notice = of_date(
+            reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64)
+        )
         if rate is not None:
             with np.errstate(all="ignore"):
                 unit = q / np.linalg.norm(q, axis=1, keepdims=True)
@@ -342,7 +408,9 @@ def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[s
             told["earth-orientation"] = notice
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
-        yield LogEntry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
+        yield LogEntry(
+            where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning))
+        )
 
 
 def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
@@ -353,11 +421,17 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
         if kind not in ccsds.QUATERNIONS:
-            q, rate = _spin(block.values, kind) if kind in ccsds.SPINS else _euler(block.values, meta)
+            q, rate = (
+                _spin(block.values, kind) if kind in ccsds.SPINS else _euler(block.values, meta)
+            )
             if kind == ccsds.EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
                 return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))
-            return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
+            return (
+                (q, rate)
+                if to_cam
+                else (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
+            )
         q, more = block.values[:, :4], block.values[:, 4:]
         if to_cam:
             q = conjugate(q)
@@ -365,7 +439,9 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
             return q, None
         if kind == ccsds.DERIVATIVE:
             q_dot = conjugate(more) if to_cam else more
-            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / (q * q).sum(axis=1, keepdims=True)
+            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / (q * q).sum(
+                axis=1, keepdims=True
+            )
         return q, _rate_in_cam(meta, q, np.radians(more))
 
 
@@ -376,7 +452,8 @@ def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> Float
     key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == ccsds.RATE else "ANGVEL_FRAME"
     if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == ccsds.RATE:
         raise ccsds.AemFaultError(
-            "", f"{ccsds.RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {ccsds.DERIVATIVE}"
+            "",
+            f"{ccsds.RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {ccsds.DERIVATIVE}",
         )
     a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
     frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
@@ -392,8 +469,12 @@ def _frames(meta: dict[str, str]) -> tuple[str, str]:
     reference, body = (a, b) if _is_reference(a) else (b, a)
     if not _is_reference(reference) or not BODY_FRAME.fullmatch(body):
         wanted = "one must be ICRF, EME2000, MOD, TOD, TEME or ITRF"
-        body_wanted = "the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
-        raise ccsds.AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}")
+        body_wanted = (
+            "the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
+        )
+        raise ccsds.AemFaultError(
+            "", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}"
+        )
     return reference, body
 
 
@@ -417,9 +498,14 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = N
     """
     starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity]
     blocks = [samples[i:j] for i, j in zip(starts, [*starts[1:], len(samples)], strict=True)]
-    header = {"CREATION_DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "ORIGINATOR": "HILSTAR"}
+    header = {
+        "CREATION_DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+        "ORIGINATOR": "HILSTAR",
+    }
     time_system = _time_system(samples, scale)
-    lines = (_xml if xml else _kvn)(header, [_written_block(block, time_system) for block in blocks])
+    lines = (_xml if xml else _kvn)(
+        header, [_written_block(block, time_system) for block in blocks]
+    )
     return "\n".join(lines) + "\n"
 
 
@@ -457,7 +543,11 @@ def _written_block(samples: Sequence[AttitudeSample], scale: str) -> ccsds.Block
 
 
 def _kvn(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
-    yield from (f"{ccsds.VERSION_KEY:25}= 1.0", "", *(f"{key:25}= {value}" for key, value in header.items()))
+    yield from (
+        f"{ccsds.VERSION_KEY:25}= 1.0",
+        "",
+        *(f"{key:25}= {value}" for key, value in header.items()),
+    )
     for segment in segments:
         yield from ("", "META_START", *(f"COMMENT {line}" for line in COMMENTS))
         yield from (f"{key:25}= {value}" for key, value in segment.meta.items())
@@ -469,18 +559,40 @@ def _kvn(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
 
 
 def _xml(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
-    yield from ('<?xml version="1.0" encoding="UTF-8"?>', f'<aem id="{ccsds.VERSION_KEY}" version="1.0">')
+    yield from (
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<aem id="{ccsds.VERSION_KEY}" version="1.0">',
+    )
     yield from ("  <header>", *_elements(4, header), "  </header>", "  <body>")
     for segment in segments:
-        yield from ("    <segment>", "      <metadata>", *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS))
+        yield from (
+            "    <segment>",
+            "      <metadata>",
+            *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS),
+        )
         yield from (*_elements(8, segment.meta), "      </metadata>", "      <data>")
-        name = "quaternionState" if segment.meta["ATTITUDE_TYPE"] == ccsds.QUATERNION else "quaternionDerivative"
+        name = (
+            "quaternionState"
+            if segment.meta["ATTITUDE_TYPE"] == ccsds.QUATERNION
+            else "quaternionDerivative"
+        )
         for epoch, values in zip(segment.epochs, segment.values.tolist(), strict=True):
-            yield from ("        <attitudeState>", f"          <{name}>", f"            <EPOCH>{epoch}</EPOCH>")
-            for kind, ending, q in (("quaternion", "", values[:4]), ("quaternionRate", "_DOT", values[4:])):
+            yield from (
+                "        <attitudeState>",
+                f"          <{name}>",
+                f"            <EPOCH>{epoch}</EPOCH>",
+            )
+            for kind, ending, q in (
+                ("quaternion", "", values[:4]),
+                ("quaternionRate", "_DOT", values[4:]),
+            ):
                 if q:
                     own = {key + ending: repr(value) for key, value in zip(ORDER, q, strict=True)}
-                    yield from (f"            <{kind}>", *_elements(14, own), f"            </{kind}>")
+                    yield from (
+                        f"            <{kind}>",
+                        *_elements(14, own),
+                        f"            </{kind}>",
+                    )
             yield from (f"          </{name}>", "        </attitudeState>")
         yield from ("      </data>", "    </segment>")
     yield from ("  </body>", "</aem>")
@@ -511,7 +623,9 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
 
 def _refuse_other(path: Path, stated: Stated) -> NoReturn:
     word = LogHead(path, b"").word[:MAX_QUOTED_CHARACTERS]
-    raise InputError(f"{path}: starts with {word}; of the CCSDS messages, only {ccsds.VERSION_KEY} is read")
+    raise InputError(
+        f"{path}: starts with {word}; of the CCSDS messages, only {ccsds.VERSION_KEY} is read"
+    )
 
 
 def _is_aem(beginning: LogHead) -> bool:

@@ -27,9 +27,30 @@ from hilstar.basics.units import NS_PER_S
 VERSION_KEY = "CCSDS_AEM_VERS"
 HEADER = (VERSION_KEY, "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 METADATA = (
-    *("OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME_A", "REF_FRAME_B", "ATTITUDE_DIR", "TIME_SYSTEM"),
-    *("START_TIME", "USEABLE_START_TIME", "USEABLE_STOP_TIME", "STOP_TIME", "ATTITUDE_TYPE", "QUATERNION_TYPE"),
-    *("EULER_ROT_SEQ", "RATE_FRAME", "ANGVEL_FRAME", "INTERPOLATION_METHOD", "INTERPOLATION_DEGREE"),
+    *(
+        "OBJECT_NAME",
+        "OBJECT_ID",
+        "CENTER_NAME",
+        "REF_FRAME_A",
+        "REF_FRAME_B",
+        "ATTITUDE_DIR",
+        "TIME_SYSTEM",
+    ),
+    *(
+        "START_TIME",
+        "USEABLE_START_TIME",
+        "USEABLE_STOP_TIME",
+        "STOP_TIME",
+        "ATTITUDE_TYPE",
+        "QUATERNION_TYPE",
+    ),
+    *(
+        "EULER_ROT_SEQ",
+        "RATE_FRAME",
+        "ANGVEL_FRAME",
+        "INTERPOLATION_METHOD",
+        "INTERPOLATION_DEGREE",
+    ),
 )
 SECTIONS = {"header": HEADER, "metadata": METADATA}
 # Keywords that one version alone has (504.0-B-2 annex J), and what the other has in their place.
@@ -40,7 +61,12 @@ ONLY_IN = {
     "ANGVEL_FRAME": ("2.0", "1.0 has RATE_FRAME"),
 }
 
-QUATERNION, DERIVATIVE, RATE, ANGVEL = "QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATERNION/ANGVEL"
+QUATERNION, DERIVATIVE, RATE, ANGVEL = (
+    "QUATERNION",
+    "QUATERNION/DERIVATIVE",
+    "QUATERNION/RATE",
+    "QUATERNION/ANGVEL",
+)
 EULER, EULER_RATE = "EULER_ANGLE", "EULER_ANGLE/RATE"
 EULER_DERIVATIVE, EULER_ANGVEL = "EULER_ANGLE/DERIVATIVE", "EULER_ANGLE/ANGVEL"
 SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM = "SPIN", "SPIN/NUTATION", "SPIN/NUTATION_MOM"
@@ -50,7 +76,10 @@ AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}
 DAY_NS = 86_400 * NS_PER_S
 UNIX_DAY = date(1970, 1, 1).toordinal()
 # A leap second stands at 23:59:60 alone.
-EPOCH = re.compile(r"(\d{4}-(?:\d\d-\d\d|\d{3}))T([01]\d|2[0-3]):([0-5]\d):([0-5]\d|(?<=23:59:)60)(?:\.(\d+))?Z?", re.ASCII)
+EPOCH = re.compile(
+    r"(\d{4}-(?:\d\d-\d\d|\d{3}))T([01]\d|2[0-3]):([0-5]\d):([0-5]\d|(?<=23:59:)60)(?:\.(\d+))?Z?",
+    re.ASCII,
+)
 MARKERS = {  # the section that a marker ends, and the one that it begins
     "META_START": ("header", "metadata"),
     "META_STOP": ("metadata", "gap before DATA_START"),
@@ -76,9 +105,15 @@ STATES = {
     "1.0": {
         QUATERNION: ("quaternionState", Q),
         DERIVATIVE: ("quaternionDerivative", Q + Q_RATE),
-        RATE: ("quaternionEulerRate", f"{Q} rotationRates/X_RATE rotationRates/Y_RATE rotationRates/Z_RATE"),
+        RATE: (
+            "quaternionEulerRate",
+            f"{Q} rotationRates/X_RATE rotationRates/Y_RATE rotationRates/Z_RATE",
+        ),
         EULER: ("eulerAngle", TURNS),
-        EULER_RATE: ("eulerAngleRate", f"{TURNS} {TURNS.replace('rotationAngles', 'rotationRates')}"),
+        EULER_RATE: (
+            "eulerAngleRate",
+            f"{TURNS} {TURNS.replace('rotationAngles', 'rotationRates')}",
+        ),
         **SPIN_STATES,
     },
     "2.0": {
@@ -89,7 +124,10 @@ STATES = {
         EULER_DERIVATIVE: ("eulerAngleDerivative", f"{ANGLES} ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT"),
         EULER_ANGVEL: ("eulerAngleAngVel", f"{ANGLES} ANGVEL_X ANGVEL_Y ANGVEL_Z"),
         **SPIN_STATES,
-        SPIN_NUTATION_MOM: ("spinNutationMom", f"{SPIN_PARTS} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL"),
+        SPIN_NUTATION_MOM: (
+            "spinNutationMom",
+            f"{SPIN_PARTS} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL",
+        ),
     },
 }
 
@@ -129,7 +167,9 @@ def _fault_of(key: str, section: str, version: str) -> str | None:
     if key in SECTIONS[other]:
         return f"{key} is in the {section}; it belongs in the {other}"
     near = difflib.get_close_matches(key.upper()[:40], SECTIONS[section], n=1)
-    advice = f"did you mean {near[0]}?" if near else f"the keywords are {', '.join(SECTIONS[section])}"
+    advice = (
+        f"did you mean {near[0]}?" if near else f"the keywords are {', '.join(SECTIONS[section])}"
+    )
     return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"
 
 
@@ -147,11 +187,14 @@ def _check_metadata(meta: dict[str, str], where: str) -> None:
             raise AemFaultError(where, f"{key} is missing in the metadata of a block")
     order = meta.get("QUATERNION_TYPE", "LAST")
     if order not in {"FIRST", "LAST"}:
-        raise AemFaultError(where, f"QUATERNION_TYPE is {order[:40]}; write FIRST or LAST, where the scalar is")
+        raise AemFaultError(
+            where, f"QUATERNION_TYPE is {order[:40]}; write FIRST or LAST, where the scalar is"
+        )
     if meta["ATTITUDE_TYPE"] not in STATES[version]:
         types = ", ".join(STATES[version])
         raise AemFaultError(
-            where, f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one of {types}"
+            where,
+            f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one of {types}",
         )
 
 
@@ -167,7 +210,10 @@ def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
     text = meta.get("EULER_ROT_SEQ", "missing")
     axes = [AXES.get(letter, -1) for letter in text]
     if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
-        raise AemFaultError("", f"EULER_ROT_SEQ is {text[:40]}; write three axes such as 321 or ZYX, no two alike side by side")
+        raise AemFaultError(
+            "",
+            f"EULER_ROT_SEQ is {text[:40]}; write three axes such as 321 or ZYX, no two alike side by side",
+        )
     return axes[0], axes[1], axes[2]
 
 
@@ -180,7 +226,9 @@ def epoch_ns(where: str, text: str) -> int:
     match = EPOCH.fullmatch(text)
     day = _day(match[1]) if match else None
     if match is None or day is None:
-        raise AemFaultError(where, f"the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f")
+        raise AemFaultError(
+            where, f"the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f"
+        )
     digits = (match[5] or "").ljust(10, "0")
     seconds = 3600 * int(match[2]) + 60 * int(match[3]) + int(match[4])
     return day * DAY_NS + seconds * NS_PER_S + int(digits[:9]) + (digits[9] >= "5")
@@ -191,7 +239,9 @@ def _day(text: str) -> int | None:
     """Days from 1970-01-01 to YYYY-MM-DD or YYYY-DDD, or None when the calendar has no such day."""
     year, first, *second = map(int, text.split("-"))
     try:
-        day = date(year, first, second[0]) if second else date(year, 1, 1) + timedelta(days=first - 1)
+        day = (
+            date(year, first, second[0]) if second else date(year, 1, 1) + timedelta(days=first - 1)
+        )
     except (ValueError, OverflowError):
         return None
     return day.toordinal() - UNIX_DAY if day.year == year else None
@@ -219,7 +269,8 @@ def kvn_blocks(text: str) -> list[Block]:
         if line in MARKERS:
             if section != MARKERS[line][0]:
                 raise AemFaultError(
-                    where, f"{line} in the {section}; the order is META_START, META_STOP, DATA_START, DATA_STOP"
+                    where,
+                    f"{line} in the {section}; the order is META_START, META_STOP, DATA_START, DATA_STOP",
                 )
             section = MARKERS[line][1]
             if line == "META_START":
@@ -236,7 +287,8 @@ def kvn_blocks(text: str) -> list[Block]:
             keywords[key] = value
     if section != "header" or not blocks:
         raise AemFaultError(
-            f":{number}", f"the file ends in the {section}, with {len(blocks)} complete blocks of data; is it cut off?"
+            f":{number}",
+            f"the file ends in the {section}, with {len(blocks)} complete blocks of data; is it cut off?",
         )
     return blocks
 
@@ -244,7 +296,10 @@ def kvn_blocks(text: str) -> list[Block]:
 def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, str]:
     key, equals, value = line.partition("=")
     if not equals or section not in {"header", "metadata"}:
-        raise AemFaultError(where, f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START")
+        raise AemFaultError(
+            where,
+            f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START",
+        )
     fault = _fault_of(key.strip(), section, version)
     if fault is not None:
         raise AemFaultError(where, fault)
@@ -259,7 +314,9 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
     order = meta.get("QUATERNION_TYPE", "LAST" if meta[VERSION_KEY] == "2.0" else "missing")
     has_quaternion = meta["ATTITUDE_TYPE"] in QUATERNIONS
     if has_quaternion and order not in {"FIRST", "LAST"}:
-        raise AemFaultError(where, f"QUATERNION_TYPE is {order}; write FIRST or LAST, where the scalar is")
+        raise AemFaultError(
+            where, f"QUATERNION_TYPE is {order}; write FIRST or LAST, where the scalar is"
+        )
     values = []
     for place, words in rows:
         try:
@@ -296,7 +353,9 @@ class _Element:
             if child.name not in names:
                 raise child.unlike(f"<{child.name[:40]}> where <{'> or <'.join(names)}> belongs")
         if self.text.strip():
-            raise self.unlike(f"{self.text.strip()[:40]!r} stands in <{self.name}>, where elements belong")
+            raise self.unlike(
+                f"{self.text.strip()[:40]!r} stands in <{self.name}>, where elements belong"
+            )
         return self.children
 
 
@@ -314,16 +373,25 @@ def xml_blocks(text: str) -> list[Block]:
     long = LONG_ELEMENT.search(text)
     if long is not None:
         line = text.count("\n", 0, long.start()) + 1
-        raise AemFaultError(f":{line}", "is not an AEM in XML (an element has a million characters)")
+        raise AemFaultError(
+            f":{line}", "is not an AEM in XML (an element has a million characters)"
+        )
     reading = _XmlReading()
     try:
         reading.parser.Parse(text.encode(), True)
     except expat.ExpatError as error:
-        raise AemFaultError(f":{error.lineno}", f"is not well-formed XML ({expat.ErrorString(error.code)})") from error
+        raise AemFaultError(
+            f":{error.lineno}", f"is not well-formed XML ({expat.ErrorString(error.code)})"
+        ) from error
     if reading.messages != 1:
         raise AemFaultError("", f"the <ndm> contains {reading.messages} <aem>; write one")
     return [
-        Block(each.meta, [f", {epoch[:40]}" for epoch in each.epochs], each.epochs, np.array(each.rows, dtype=np.float64))
+        Block(
+            each.meta,
+            [f", {epoch[:40]}" for epoch in each.epochs],
+            each.epochs,
+            np.array(each.rows, dtype=np.float64),
+        )
         for each in reading.segments
     ]
 
@@ -399,7 +467,9 @@ class _XmlReading:
     def _check_segment(self, element: _Element) -> None:
         names = [part.name for part in element.parts("metadata", "data")]
         if names != ["metadata", "data"]:
-            raise element.unlike("a <segment> is one <metadata>, then one <data>; is the file cut off?")
+            raise element.unlike(
+                "a <segment> is one <metadata>, then one <data>; is the file cut off?"
+            )
         element.children[1].parts("COMMENT")
         if not self.segments[-1].rows:
             raise element.unlike("a <segment> contains no attitude")
@@ -409,8 +479,14 @@ class _XmlReading:
         parts = {part.name: part for part in element.parts("header", "body")}
         if "header" in parts:
             _keywords(parts["header"], element.attributes["version"])
-        if "body" not in parts or not parts["body"].parts("segment") or len(parts) != len(element.children):
-            raise element.unlike("an <aem> is one <header>, then one <body> of <segment>; is the file cut off?")
+        if (
+            "body" not in parts
+            or not parts["body"].parts("segment")
+            or len(parts) != len(element.children)
+        ):
+            raise element.unlike(
+                "an <aem> is one <header>, then one <body> of <segment>; is the file cut off?"
+            )
 
 
 def _keywords(element: _Element, version: str) -> dict[str, str]:
@@ -428,7 +504,9 @@ def _keywords(element: _Element, version: str) -> dict[str, str]:
             raise AemFaultError(f":{child.line}", fault)
         given[child.name] = plain(child.text.strip())
     if element.text.strip():
-        raise element.unlike(f"{element.text.strip()[:40]!r} stands in <{element.name}>, where elements belong")
+        raise element.unlike(
+            f"{element.text.strip()[:40]!r} stands in <{element.name}>, where elements belong"
+        )
     return given
 
 
@@ -439,7 +517,8 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
     name, paths = STATES[meta[VERSION_KEY]][meta["ATTITUDE_TYPE"]]
     if [child.name for child in holder.children] != [name]:
         raise AemFaultError(
-            f":{holder.line}", f"the state is not the {meta['ATTITUDE_TYPE']} that the metadata state: <{name}>"
+            f":{holder.line}",
+            f"the state is not the {meta['ATTITUDE_TYPE']} that the metadata state: <{name}>",
         )
     holder.parts(name)
     wanted = paths.split()
@@ -451,7 +530,9 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
             continue
         key = _key(path, leaf, wanted, meta)
         if key not in wanted or key in found:
-            raise leaf.unlike(f"<{leaf.name[:40]}> {'appears twice' if key in found else 'has no place'} in a <{name}>")
+            raise leaf.unlike(
+                f"<{leaf.name[:40]}> {'appears twice' if key in found else 'has no place'} in a <{name}>"
+            )
         found[key] = _number(leaf, key)
     missing = [path for path in wanted if path not in found]
     if missing or len(epochs) != 1:
@@ -477,9 +558,13 @@ def _key(path: str, leaf: _Element, wanted: list[str], meta: dict[str, str]) -> 
         axis, place = leaf.attributes.get("angle", "missing").upper(), int(leaf.name[-1]) - 1
         needed = "XYZ"[sequence(meta)[place]] + "_ANGLE"
         if axis != needed:
-            raise leaf.unlike(f"{leaf.name} is the {axis[:40]}, and EULER_ROT_SEQ has {needed} there")
+            raise leaf.unlike(
+                f"{leaf.name} is the {axis[:40]}, and EULER_ROT_SEQ has {needed} there"
+            )
         return path
-    return path if path in wanted else f"{container}/{leaf.attributes.get('rate', 'missing').upper()}"
+    return (
+        path if path in wanted else f"{container}/{leaf.attributes.get('rate', 'missing').upper()}"
+    )
 
 
 def _number(leaf: _Element, key: str) -> float:
@@ -505,4 +590,8 @@ def _unit(key: str) -> str:
         return "1/s"
     if name == "NUTATION_PER":
         return "s"
-    return "deg/s" if container == "rotationRates" or name.endswith(("_VEL", "_DOT")) or "ANGVEL" in name else "deg"
+    return (
+        "deg/s"
+        if container == "rotationRates" or name.endswith(("_VEL", "_DOT")) or "ANGVEL" in name
+        else "deg"
+    )

@@ -50,11 +50,19 @@ def _kernels_beside(path: Path) -> list[Path]:
     Versions are numbers: clock_10 comes after clock_9.
     """
     try:
-        files = [file for file in path.resolve().parent.iterdir() if file.suffix.lower() in BESIDE and file.is_file()]
+        files = [
+            file
+            for file in path.resolve().parent.iterdir()
+            if file.suffix.lower() in BESIDE and file.is_file()
+        ]
     except OSError as error:
-        raise InputError(f"{path}: its folder cannot be searched for kernels ({error.strerror}); give --kernel FILE") from error
+        raise InputError(
+            f"{path}: its folder cannot be searched for kernels ({error.strerror}); give --kernel FILE"
+        ) from error
     if len(files) > MAX_BESIDE:
-        raise InputError(f"{path}: {len(files)} kernels lie beside it; name those that it needs: --kernel FILE")
+        raise InputError(
+            f"{path}: {len(files)} kernels lie beside it; name those that it needs: --kernel FILE"
+        )
     return sorted(files, key=lambda file: (BESIDE.index(file.suffix.lower()), by_number(file)))
 
 
@@ -89,16 +97,29 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
     if said["step_s"] is not None:
         error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
         told.append(
-            ("ck-step", f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between")
+            (
+                "ck-step",
+                f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between",
+            )
         )
     gaps_s = said["gaps_s"]
     if gaps_s:
         count = "1 gap" if len(gaps_s) == 1 else f"{len(gaps_s)} gaps"
-        told.append(("log-gap", f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there"))
+        told.append(
+            (
+                "log-gap",
+                f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there",
+            )
+        )
     known: list[bool] = (~np.isnan(arrays["rate"][:, 0])).tolist()
-    rows = zip(*(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True)
+    rows = zip(
+        *(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True
+    )
     entries = (
-        LogEntry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
+        LogEntry(
+            f", tick {tick:.17g}",
+            checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks),
+        )
         for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True)
     )
     return LogReading(entries, _conventions(said), "give a CK whose times differ", told)
@@ -106,7 +127,9 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
 
 def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
     """Ask the process that runs SPICE: its arrays, and the rest of its answer."""
-    request = json.dumps({"path": str(path), "kernels": [str(kernel) for kernel in kernels], "body": body})
+    request = json.dumps(
+        {"path": str(path), "kernels": [str(kernel) for kernel in kernels], "body": body}
+    )
     places = os.pathsep.join(place or str(Path.cwd()) for place in sys.path)
     try:
         done = subprocess.run(
@@ -118,10 +141,14 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
             check=False,
         )
     except subprocess.TimeoutExpired as error:
-        raise InputError(f"{path}: SPICE did not read it within {LONGEST_S:g} s; cut it into several (ckslicer)") from error
+        raise InputError(
+            f"{path}: SPICE did not read it within {LONGEST_S:g} s; cut it into several (ckslicer)"
+        ) from error
     if done.returncode:
         last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no word"]
-        raise InputError(f"{path}: SPICE broke off with it ({last[0]}); is it, or a kernel, damaged?")
+        raise InputError(
+            f"{path}: SPICE broke off with it ({last[0]}); is it, or a kernel, damaged?"
+        )
     with np.load(io.BytesIO(done.stdout)) as archive:
         arrays = dict(archive)
     said = json.loads(str(arrays.pop("said")))

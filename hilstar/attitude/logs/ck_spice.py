@@ -129,8 +129,12 @@ def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray
     while spice.daffna():
         count += 1
         if count > MAX_SUMMARIES:
-            raise InputError(f"{path}: has more than {MAX_SUMMARIES} segments; split it, or copy it again if it is damaged")
-        summary_doubles, summary_integers = spice.dafus(spice.dafgs(MAX_SUMMARY_WORDS), doubles, integers)
+            raise InputError(
+                f"{path}: has more than {MAX_SUMMARIES} segments; split it, or copy it again if it is damaged"
+            )
+        summary_doubles, summary_integers = spice.dafus(
+            spice.dafgs(MAX_SUMMARY_WORDS), doubles, integers
+        )
         yield summary_doubles, [int(number) for number in summary_integers]
 
 
@@ -146,13 +150,19 @@ def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
         body, reference, kind, has_rate, first_word, last_word = integers
         start, stop = float(ticks[0]), float(ticks[1])
         if not (math.isfinite(start) and math.isfinite(stop) and 0 <= start <= stop):
-            raise InputError(f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?")
+            raise InputError(
+                f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?"
+            )
         if kind not in TYPES:
             raise InputError(f"{path}: segment {number} is of type {kind}; types 1 to 6 are read")
         if not 0 < first_word <= last_word <= size_words:
             place = f"the words {first_word} to {last_word} of {size_words}"
             raise InputError(f"{path}: segment {number} has {place}; is the file cut off?")
-        segments.append(Segment(number, start, stop, body, reference, kind, has_rate != 0, first_word, last_word))
+        segments.append(
+            Segment(
+                number, start, stop, body, reference, kind, has_rate != 0, first_word, last_word
+            )
+        )
     if not segments:
         raise InputError(f"{path}: contains no segment; is the file cut off?")
     return segments
@@ -170,16 +180,22 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
     """
     if segment.kind in {4, 6}:
         return np.empty(0)
-    words = np.asarray(spice.dafgda(handle, segment.first_word, segment.last_word), dtype=np.float64)
+    words = np.asarray(
+        spice.dafgda(handle, segment.first_word, segment.last_word), dtype=np.float64
+    )
     where = f"{path}: segment {segment.number}"
     count, packet_words = _packets(words, segment)
     if count < 1 or packet_words < QUATERNION_WORDS or (packet_words + 1) * count > len(words):
-        raise InputError(f"{where}: its counts do not fit its {len(words)} words; is the file damaged?")
+        raise InputError(
+            f"{where}: its counts do not fit its {len(words)} words; is the file damaged?"
+        )
     quaternions = words[: packet_words * count].reshape(count, packet_words)[:, :QUATERNION_WORDS]
     norms = np.sqrt((quaternions * quaternions).sum(axis=1))
     bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if len(bad):
-        raise InputError(f"{where}: the norm of its quaternion {bad[0] + 1} is {norms[bad[0]]:.6g}; it must be 1")
+        raise InputError(
+            f"{where}: the norm of its quaternion {bad[0] + 1} is {norms[bad[0]]:.6g}; it must be 1"
+        )
     if segment.kind in SMOOTH:
         return np.empty(0)
     epochs = words[packet_words * count : (packet_words + 1) * count]
@@ -221,7 +237,9 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
         # to the next.
         spans = own_epochs[[0, -1]].reshape(1, 2) if segment.kind == 1 else own_intervals
         if not np.isfinite(spans).all() or (np.diff(spans.ravel()) < 0).any():
-            raise InputError(f"{path}: segment {segment.number}: its intervals do not increase; is the file damaged?")
+            raise InputError(
+                f"{path}: segment {segment.number}: its intervals do not increase; is the file damaged?"
+            )
         within = np.clip(spans, segment.start, segment.stop)
         is_covered = (within[:, 1] > within[:, 0]) | (spans[:, 1] == spans[:, 0])
         coverages.append(Coverage(within[is_covered], own_epochs))
@@ -274,14 +292,23 @@ class _Piece:
         if self.stop <= self.start:
             return np.array([self.start])
         if self.segment.kind in SMOOTH:
-            return np.linspace(self.start, self.stop, max(math.ceil((self.stop - self.start) / step), 2) + 1)
+            return np.linspace(
+                self.start, self.stop, max(math.ceil((self.stop - self.start) / step), 2) + 1
+            )
         ticks = np.concatenate(([self.start], self.epochs, [self.stop]))
         spacing = np.diff(ticks)
         longest = (GAP_INTERVALS - 1) * float(np.median(spacing))
-        if self.segment.kind != 3 or not (spacing > longest).any() or (self.stop - self.start) / longest > MAX_STEPS:
+        if (
+            self.segment.kind != 3
+            or not (spacing > longest).any()
+            or (self.stop - self.start) / longest > MAX_STEPS
+        ):
             return ticks
         parts = np.ceil(spacing / longest).astype(int).tolist()
-        inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True)]
+        inner = [
+            np.linspace(a, b, n, endpoint=False)
+            for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True)
+        ]
         return np.concatenate([*inner, ticks[-1:]])
 
 
@@ -289,7 +316,11 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
     """The pieces of the segments of one structure, in order of time; segments come in the file's
     order.
     """
-    owners = [(segment, cover.epochs, *span) for segment, cover in covered for span in cover.intervals.tolist()]
+    owners = [
+        (segment, cover.epochs, *span)
+        for segment, cover in covered
+        for span in cover.intervals.tolist()
+    ]
     if not owners:
         return []
     bounds = np.unique(np.array([owner[2:] for owner in owners]))
@@ -304,14 +335,24 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
     begins = np.flatnonzero(np.diff(owner_of_cell, prepend=-1))
     # none begins where a CK has instants alone
     ends = np.append(begins[1:], len(bounds) - 1)[: len(begins)]
-    spans = [(owner_of_cell[k], k, end) for k, end in zip(begins.tolist(), ends.tolist(), strict=True) if owner_of_cell[k] >= 0]
+    spans = [
+        (owner_of_cell[k], k, end)
+        for k, end in zip(begins.tolist(), ends.tolist(), strict=True)
+        if owner_of_cell[k] >= 0
+    ]
     for k in np.flatnonzero(owner_of_point >= 0).tolist():
         if owner_of_cell[k] < 0 and (k == 0 or owner_of_cell[k - 1] < 0):
             spans.append((owner_of_point[k], k, k))
     found = []
     for owner, first, last in spans:
-        (segment, epochs, *_), start, stop = owners[owner], float(bounds[first]), float(bounds[last])
-        within = slice(int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left")))
+        (segment, epochs, *_), start, stop = (
+            owners[owner],
+            float(bounds[first]),
+            float(bounds[last]),
+        )
+        within = slice(
+            int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left"))
+        )
         found.append(_Piece(segment, start, stop, epochs[within]))
     return sorted(found, key=lambda piece: piece.start)
 
@@ -348,7 +389,9 @@ class _Structure:
         """
         matrix, _, found = self.spice.ckgp(self.body, tick, 0, FRAME)
         if not found:
-            raise InputError(f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its segments cover")
+            raise InputError(
+                f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its segments cover"
+            )
         return np.asarray(matrix, dtype=np.float64)
 
     def q_icrs_to_body(self, tick: float) -> FloatArray:
@@ -379,7 +422,11 @@ class _Structure:
 
         def mean_rate(one: float, other: float) -> FloatArray:
             before, after = sorted((one, other))
-            return rate_between_rad_s(self.q_icrs_to_body(before), self.q_icrs_to_body(after), (after - before) * s_per_tick)
+            return rate_between_rad_s(
+                self.q_icrs_to_body(before),
+                self.q_icrs_to_body(after),
+                (after - before) * s_per_tick,
+            )
 
         if start + step <= tick <= stop - step:
             return mean_rate(tick - step, tick + step)
@@ -411,15 +458,21 @@ def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
     """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of
     them.
     """
-    smooth = [piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start]
+    smooth = [
+        piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start
+    ]
     step = error_rad = 0.0
     if smooth:
         step, error_rad = _step_of(structure, smooth)
     ticks = [piece.ticks(step) for piece in pieces]
     if sum(map(len, ticks)) > MAX_SAMPLES:
-        raise InputError(f"{structure.path}: contains more than {MAX_SAMPLES} attitudes; cut it into several (ckslicer)")
+        raise InputError(
+            f"{structure.path}: contains more than {MAX_SAMPLES} attitudes; cut it into several (ckslicer)"
+        )
     broken, gaps_s = _parted(structure, pieces, ticks)
-    step_s = structure.t_s(smooth[0].start + step) - structure.t_s(smooth[0].start) if smooth else None
+    step_s = (
+        structure.t_s(smooth[0].start + step) - structure.t_s(smooth[0].start) if smooth else None
+    )
     parts = [_attitudes(structure, *pair) for pair in zip(pieces, ticks, strict=True)]
     t_ns, q, rate = (np.concatenate(each) for each in zip(*parts, strict=True))
     breaks = np.zeros(len(t_ns), dtype=np.bool_)
@@ -442,13 +495,18 @@ def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, fl
             k = int(np.searchsorted(counts, place, "right"))
             within = place - (int(counts[k - 1]) if k else 0)
             found_rad, clock_rad = _error_rad(structure, smooth[k], ticks[k], within)
-            error_rad, excess_rad = max(error_rad, found_rad), max(excess_rad, found_rad - clock_rad)
+            error_rad, excess_rad = (
+                max(error_rad, found_rad),
+                max(excess_rad, found_rad - clock_rad),
+            )
         if excess_rad <= TARGET_RAD or 2 * steps > MAX_STEPS:
             return step, error_rad
         steps *= 2
 
 
-def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
+def _error_rad(
+    structure: _Structure, piece: _Piece, ticks: FloatArray, k: int
+) -> tuple[float, float]:
     """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece,
     rad.
 
@@ -457,7 +515,9 @@ def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) 
     """
     near = [
         AttitudeSample(t_ns, q, rate)
-        for t_ns, q, rate in zip(*_attitudes(structure, piece, ticks[max(k - 1, 0) : k + 3]), strict=True)
+        for t_ns, q, rate in zip(
+            *_attitudes(structure, piece, ticks[max(k - 1, 0) : k + 3]), strict=True
+        )
     ]
     timeline = Timeline(ALL, len(near), log_joins(near))
     for event in near:
@@ -466,11 +526,15 @@ def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) 
     shown = timeline.at(structure.t_ns(tick))
     if shown is None or shown.rate_cam_rad_s is None:
         raise AssertionError("a tick between two samples of a piece has an attitude")
-    clock_rad = 2.0 * float(np.spacing(abs(structure.t_s(tick))) * np.linalg.norm(shown.rate_cam_rad_s))
+    clock_rad = 2.0 * float(
+        np.spacing(abs(structure.t_s(tick))) * np.linalg.norm(shown.rate_cam_rad_s)
+    )
     return angle_between_rad(shown.q_icrs_to_cam, structure.q_icrs_to_body(tick)), clock_rad
 
 
-def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+def _attitudes(
+    structure: _Structure, piece: _Piece, ticks: FloatArray
+) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates
     has them by difference.
     """
@@ -488,7 +552,9 @@ def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple
     return t_ns, q, rates
 
 
-def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
+def _parted(
+    structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]
+) -> tuple[list[bool], list[float]]:
     """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps,
     s.
 
@@ -502,7 +568,9 @@ def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatAr
             gaps_s.append(structure.t_s(after.start) - structure.t_s(before.stop))
             broken.append(True)
             continue
-        s_per_tick = (structure.t_s(after.stop) - structure.t_s(before.start)) / (after.stop - before.start)
+        s_per_tick = (structure.t_s(after.stop) - structure.t_s(before.start)) / (
+            after.stop - before.start
+        )
         shortest = min(before.stop - before.start, after.stop - after.start)
         beside = max(min(BESIDE_S / s_per_tick, shortest / 8), 2 * float(np.spacing(before.stop)))
         q = [structure.q_icrs_to_body(before.stop + n * beside) for n in (-3, -1, 1)]
@@ -557,7 +625,9 @@ def _named(spice: Any, meta: Path) -> list[Path]:
     for name in names:
         spice.dvpool(name)
     if not files or len(symbols) != len(values):
-        raise InputError(f"{meta}: names no kernels; write KERNELS_TO_LOAD, and as many PATH_VALUES as PATH_SYMBOLS")
+        raise InputError(
+            f"{meta}: names no kernels; write KERNELS_TO_LOAD, and as many PATH_VALUES as PATH_SYMBOLS"
+        )
     for symbol, value in sorted(zip(symbols, values, strict=True), key=lambda pair: -len(pair[0])):
         files = [file.replace(f"${symbol}", value) for file in files]
     return [Path(file) for file in files]
@@ -602,8 +672,13 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
             if not pieces:
                 raise InputError(f"{path}: its segments of {body} cover no time")
             structure = _Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
-            references = sorted({spiceypy.frmnam(segment.reference) or str(segment.reference) for segment in own})
-            return sample(structure, pieces), {"structure": _name(spiceypy, body), "references": references}
+            references = sorted(
+                {spiceypy.frmnam(segment.reference) or str(segment.reference) for segment in own}
+            )
+            return sample(structure, pieces), {
+                "structure": _name(spiceypy, body),
+                "references": references,
+            }
     except spiceypy.utils.exceptions.SpiceyError as error:
         raise InputError(f"{path}: {_in_words(error)}") from error
 
@@ -613,7 +688,9 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
     or a body's.
     """
     bodies = sorted({segment.body for segment in segments})
-    named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))
+    named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (
+        ", ..." * (len(bodies) > MAX_NAMED_BODIES)
+    )
     if stated is None:
         if len(bodies) > 1:
             raise InputError(f"{path}: contains several structures, {named}; choose one: --body ID")
@@ -628,7 +705,9 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
             body, found = spice.bods2c(stated)
             body = body if found else None
     if body is None or body not in bodies:
-        raise InputError(f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel")
+        raise InputError(
+            f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel"
+        )
     return body
 
 
@@ -642,8 +721,16 @@ def main() -> None:
     request = json.loads(sys.stdin.read())
     arrays: dict[str, Any] = {}
     try:
-        found, said = answer(Path(request["path"]), [Path(name) for name in request["kernels"]], request["body"])
-        arrays = {"t_ns": found.t_ns, "q": found.q, "rate": found.rate, "breaks": found.breaks, "tick": found.tick}
+        found, said = answer(
+            Path(request["path"]), [Path(name) for name in request["kernels"]], request["body"]
+        )
+        arrays = {
+            "t_ns": found.t_ns,
+            "q": found.q,
+            "rate": found.rate,
+            "breaks": found.breaks,
+            "tick": found.tick,
+        }
         said |= {"step_s": found.step_s, "error_rad": found.error_rad, "gaps_s": found.gaps_s}
     except InputError as error:
         said = {"error": str(error)}

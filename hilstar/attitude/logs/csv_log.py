@@ -21,7 +21,15 @@ from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import HILSTARS
 from hilstar.basics.errors import InputError
-from hilstar.basics.text_tables import CUT, Chosen, TextTable, is_valid, number_fault, open_table, plain_name
+from hilstar.basics.text_tables import (
+    CUT,
+    Chosen,
+    TextTable,
+    is_valid,
+    number_fault,
+    open_table,
+    plain_name,
+)
 from hilstar.basics.units import NS_PER_S
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
@@ -34,7 +42,18 @@ DISCONTINUITY = {"": False, "0": False, "1": True}
 TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
 # Columns by which other programs mark rows, in words or numbers of their own.
 MARKS = frozenset(
-    ["status", "quality", "quality_flag", "flag", "flags", "state", "mode", "health", "fix", "tracking"],
+    [
+        "status",
+        "quality",
+        "quality_flag",
+        "flag",
+        "flags",
+        "state",
+        "mode",
+        "health",
+        "fix",
+        "tracking",
+    ],
 )
 MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
 UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"

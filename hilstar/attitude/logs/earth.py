@@ -80,7 +80,9 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     """The rotations (n, 4) from ICRS to the Earth's axes (ITRS) at UTCs (n,), ns since 1970
     where every day has 86400 s.
     """
-    hours, place = np.unique(np.concatenate((utc_ns // HOUR_NS, utc_ns // HOUR_NS + 1)), return_inverse=True)
+    hours, place = np.unique(
+        np.concatenate((utc_ns // HOUR_NS, utc_ns // HOUR_NS + 1)), return_inverse=True
+    )
     before, after = place[: len(utc_ns)], place[len(utc_ns) :]
     share = (utc_ns % HOUR_NS) / HOUR_NS
 
@@ -94,25 +96,36 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     # days.
     x, y, s = (between(values) for values in erfa.xys06a(MJD_ZERO_JD, mjd + tt_days))
     ut1_tai_s, pole_x, pole_y = (
-        between(np.interp(mjd, table.mjd, column)) for column in (table.ut1_tai_s, table.x_rad, table.y_rad)
+        between(np.interp(mjd, table.mjd, column))
+        for column in (table.ut1_tai_s, table.x_rad, table.y_rad)
     )
-    ut1_days = (utc_ns % (24 * HOUR_NS)) / (24 * HOUR_NS) + (ut1_tai_s + tai_utc_s[before]) / 86400.0
+    ut1_days = (utc_ns % (24 * HOUR_NS)) / (24 * HOUR_NS) + (
+        ut1_tai_s + tai_utc_s[before]
+    ) / 86400.0
     era = erfa.era00(MJD_ZERO_JD + UNIX_MJD + utc_ns // (24 * HOUR_NS), ut1_days)
     node, tilt = np.arctan2(y, x), np.arcsin(np.hypot(x, y))
     to_cirs = _chain(frame_turns(2, node), frame_turns(1, tilt), frame_turns(2, -node - s))
     return _chain(to_cirs, frame_turns(2, era), frame_turns(1, -pole_x), frame_turns(0, -pole_y))
 
 
-def q_icrs_to_ned(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
+def q_icrs_to_ned(
+    utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray
+) -> FloatArray:
     """The rotations (n, 4) from ICRS to north, east, down at UTCs (n,) and geodetic places (n,)
     or ().
     """
     zeros = np.zeros(len(utc_ns))
     to_meridian = frame_turns(2, zeros + np.radians(longitude_deg))
-    return _chain(q_icrs_to_itrs(utc_ns), to_meridian, frame_turns(1, zeros - np.radians(latitude_deg) - np.pi / 2))
+    return _chain(
+        q_icrs_to_itrs(utc_ns),
+        to_meridian,
+        frame_turns(1, zeros - np.radians(latitude_deg) - np.pi / 2),
+    )
 
 
-def q_icrs_to_enu(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
+def q_icrs_to_enu(
+    utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray
+) -> FloatArray:
     """The rotations (n, 4) from ICRS to east, north, up, as `q_icrs_to_ned`."""
     return multiply(np.array(Q_NED_TO_ENU), q_icrs_to_ned(utc_ns, latitude_deg, longitude_deg))
 
@@ -134,7 +147,9 @@ def beyond_table(first_ns: int, last_ns: int) -> str | None:
     beyond_days = max(table.mjd[0] - first, last - table.mjd[-1])
     if beyond_days <= 0:
         return None
-    begin, end = (f"{np.datetime64(int(mjd) - UNIX_MJD, 'D')}" for mjd in (table.mjd[0], table.mjd[-1]))
+    begin, end = (
+        f"{np.datetime64(int(mjd) - UNIX_MJD, 'D')}" for mjd in (table.mjd[0], table.mjd[-1])
+    )
     off = UT1_ARCSEC_PER_S * UT1_S_A_YEAR * max(1.0, beyond_days / 365.25)
     return (
         f"the table of the Earth's orientation goes from {begin} to {end}; beyond it UT1 is guessed, and the sky may be turned"
@@ -162,7 +177,11 @@ def _table() -> _EarthTable:
     # UT1, pole
     a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
-        lines = [(line, b_columns if line[154:165].strip() else a_columns) for line in file if line[58:68].strip()]
+        lines = [
+            (line, b_columns if line[154:165].strip() else a_columns)
+            for line in file
+            if line[58:68].strip()
+        ]
     rows = [(line[7:15], *(line[begin:end] for begin, end in columns)) for line, columns in lines]
     mjd, ut1_utc_s, x_arcsec, y_arcsec = np.array(rows, dtype=np.float64).T
     ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
@@ -171,7 +190,9 @@ def _table() -> _EarthTable:
 
 def _tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
     """TAI-UTC in seconds at the beginnings of days since 1970."""
-    year, month, day, _ = erfa.jd2cal(MJD_ZERO_JD + UNIX_MJD, np.asarray(unix_days, dtype=np.float64))
+    year, month, day, _ = erfa.jd2cal(
+        MJD_ZERO_JD + UNIX_MJD, np.asarray(unix_days, dtype=np.float64)
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)  # a year after the last known leap second
         return np.asarray(erfa.dat(year, month, day, 0.0))
@@ -184,7 +205,9 @@ def _chain(*turns: FloatArray) -> FloatArray:
     return q
 
 
-def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, FloatArray, str | None]:
+def q_icrs_to_date(
+    frame: str, scale: str, t_ns: IntArray
+) -> tuple[FloatArray, FloatArray, str | None]:
     """The rotations (n, 4) from ICRS to a frame at times (n,), its own rate (3,), rad/s, in its
     components, and a notice.
 
@@ -202,7 +225,8 @@ def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, 
         utc_ns = tai_ns - np.round(_tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
     else:
         raise AemFaultError(
-            "", f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS"
+            "",
+            f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS",
         )
     turning = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
     return q_icrs_to_itrs(utc_ns), turning, beyond_table(int(utc_ns.min()), int(utc_ns.max()))
@@ -212,7 +236,9 @@ def _of_hours(frame: str, t_ns: IntArray) -> FloatArray:
     """Linear over an hour, which is within 5 microarcsec; a scale's offset from TT, 69 s, is 0.1
     mas of precession.
     """
-    hours, place = np.unique(np.concatenate((t_ns // HOUR_NS, t_ns // HOUR_NS + 1)), return_inverse=True)
+    hours, place = np.unique(
+        np.concatenate((t_ns // HOUR_NS, t_ns // HOUR_NS + 1)), return_inverse=True
+    )
     q = np.array([from_matrix(_matrix(frame, hour / 24.0)) for hour in hours.tolist()])
     before, after = q[place[: len(t_ns)]], q[place[len(t_ns) :]]
     return normalise(before + ((t_ns % HOUR_NS) / HOUR_NS)[:, None] * (after - before))
@@ -261,7 +287,9 @@ class Reference(NamedTuple):
         if self.kind == "icrs":
             return AXES["icrs"]
         latitude_deg, longitude_deg = self.place
-        return f"{AXES[self.kind]} at latitude {latitude_deg:g}, longitude {longitude_deg:g}, {TURNED}"
+        return (
+            f"{AXES[self.kind]} at latitude {latitude_deg:g}, longitude {longitude_deg:g}, {TURNED}"
+        )
 
 
 def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:
@@ -280,10 +308,14 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
                 )
         return Reference(kind)
     if stated.place is None:
-        raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
+        raise InputError(
+            f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT"
+        )
     dated, utc_ns = first_ns >= FIRST_DATE_NS, 0
     if dated and stated.epoch_utc is not None:
-        raise InputError(f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc")
+        raise InputError(
+            f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc"
+        )
     if not dated:
         if stated.epoch_utc is None:
             raise InputError(
@@ -303,7 +335,9 @@ def reference_kind(path: Path, stated: Stated, told: list[tuple[str, str]]) -> K
         return "icrs"
     kind = KINDS.get(stated.reference.lower())
     if kind is None:
-        raise InputError(f"{path}: --reference {shortened(stated.reference)}: the log names no frame; write icrs, enu or ned")
+        raise InputError(
+            f"{path}: --reference {shortened(stated.reference)}: the log names no frame; write icrs, enu or ned"
+        )
     if stated.reference.lower() in LOOSE:
         told.append(("reference", loosely_icrs(stated.reference)))
     return kind
@@ -314,7 +348,9 @@ def loosely_icrs(frame: str) -> str:
     return f"the frame {frame!r} is taken as the ICRS; a frame of date is 0.4 deg off by now"
 
 
-def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[LogEntry]:
+def to_icrs(
+    entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]
+) -> Iterator[LogEntry]:
     """Attitudes from the reference to the body become those from ICRS; rates too, unless a
     gyroscope measured them.
 
@@ -332,13 +368,19 @@ def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told:
             first_ns = samples[0].t_ns if first_ns is None else min(first_ns, samples[0].t_ns)
             last_ns = max(last_ns, samples[-1].t_ns)
         for entry in batch:
-            yield LogEntry(entry.where, next(turned)) if isinstance(entry.event, AttitudeSample) else entry
+            yield (
+                LogEntry(entry.where, next(turned))
+                if isinstance(entry.event, AttitudeSample)
+                else entry
+            )
     if first_ns is not None:
         beyond = beyond_table(first_ns + reference.utc_ns, last_ns + reference.utc_ns)
         told += [] if beyond is None else [("log-earth", beyond)]
 
 
-def _from_icrs(samples: list[AttitudeSample], reference: Reference, gyro: bool) -> list[AttitudeSample]:
+def _from_icrs(
+    samples: list[AttitudeSample], reference: Reference, gyro: bool
+) -> list[AttitudeSample]:
     if not samples:
         return []
     q_ref_to_body = np.array([sample.q_icrs_to_cam for sample in samples])
@@ -346,6 +388,10 @@ def _from_icrs(samples: list[AttitudeSample], reference: Reference, gyro: bool) 
     earths = rotate(q_ref_to_body, np.tile(reference.earth_rate_rad_s, (len(samples), 1)))
     turned = []
     for sample, attitude, earth_rate in zip(samples, q, earths, strict=True):
-        rate = sample.rate_cam_rad_s if sample.rate_cam_rad_s is None or gyro else sample.rate_cam_rad_s + earth_rate
+        rate = (
+            sample.rate_cam_rad_s
+            if sample.rate_cam_rad_s is None or gyro
+            else sample.rate_cam_rad_s + earth_rate
+        )
         turned.append(replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate))
     return turned

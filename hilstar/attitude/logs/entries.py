@@ -163,7 +163,11 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
                 late, latest_ns = late + 1, max(latest_ns, newest_ns - t_ns)
             newest_ns = t_ns if newest_ns is None else max(newest_ns, t_ns)
             heapq.heappush(waiting, (t_ns, number, entry))
-        while waiting and newest_ns is not None and (entry is None or waiting[0][0] <= newest_ns - REORDER_NS):
+        while (
+            waiting
+            and newest_ns is not None
+            and (entry is None or waiting[0][0] <= newest_ns - REORDER_NS)
+        ):
             first = heapq.heappop(waiting)[2]
             sample = first.event
             assert isinstance(sample, AttitudeSample)
@@ -173,13 +177,27 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
             last = sample
             yield first
     if late:
-        told.append(("log-order", f"{late} attitudes came out of order, by up to {latest_ns / NS_PER_S:.3g} s, and are sorted"))
+        told.append(
+            (
+                "log-order",
+                f"{late} attitudes came out of order, by up to {latest_ns / NS_PER_S:.3g} s, and are sorted",
+            )
+        )
     if repeats:
-        told.append(("log-repeats", f"{repeats} attitudes are exact repeats of the one before, and are dropped"))
+        told.append(
+            (
+                "log-repeats",
+                f"{repeats} attitudes are exact repeats of the one before, and are dropped",
+            )
+        )
 
 
 def _repeats(last: AttitudeSample, sample: AttitudeSample) -> bool:
-    if last.t_ns != sample.t_ns or sample.discontinuity or not np.array_equal(last.q_icrs_to_cam, sample.q_icrs_to_cam):
+    if (
+        last.t_ns != sample.t_ns
+        or sample.discontinuity
+        or not np.array_equal(last.q_icrs_to_cam, sample.q_icrs_to_cam)
+    ):
         return False
     one, other = last.rate_cam_rad_s, sample.rate_cam_rad_s
     return one is other if one is None or other is None else np.array_equal(one, other)
@@ -217,13 +235,20 @@ class LogJoins:
             why = f"; probably {self.cause.text}" if self.cause is not None else ""
             if self.cause is not None and self.cause.reading is not None:
                 advice = self.cause.reading.advice
-                lines.append((self.cause.kind, f"{misfits}{why}: the sky is drawn at another place; {advice}"))
+                lines.append(
+                    (
+                        self.cause.kind,
+                        f"{misfits}{why}: the sky is drawn at another place; {advice}",
+                    )
+                )
             lines.append(("log-rates", f"{misfits}, and are ignored there{why}"))
         return lines
 
 
 def log_joins(
-    samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = (), read_as: ReadAs = AS_PACKETS
+    samples: Sequence[AttitudeSample],
+    told: Iterable[tuple[str, str]] = (),
+    read_as: ReadAs = AS_PACKETS,
 ) -> LogJoins:
     """How the samples of a log join; their times must increase. `told` are notices that may explain
     rates that do not fit, `read_as` is how quaternions have become the camera's.
@@ -242,7 +267,11 @@ def log_joins(
     # what is probably wrong from the first rate on that does not fit
     if misfit.any() and TIMES not in dict(told):
         first = int(misfit.argmax())
-        with_rates = [sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None]
+        with_rates = [
+            sample
+            for sample in samples[first : first + LOOKED_AT]
+            if sample.rate_cam_rad_s is not None
+        ]
         cause = cause_in(with_rates, read_as)
     return LogJoins(
         frozenset(t_ns[:-1][fits & ~broken].tolist()),
@@ -265,7 +294,9 @@ def _fits(
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     mean = (rate[1:] + rate[:-1]) / 2
     known = np.isfinite(mean).all(axis=1)
-    turned_rad = seconds * (np.linalg.norm(rate[1:], axis=1) + np.linalg.norm(rate[:-1], axis=1)) / 2
+    turned_rad = (
+        seconds * (np.linalg.norm(rate[1:], axis=1) + np.linalg.norm(rate[:-1], axis=1)) / 2
+    )
     vector = -0.5 * seconds[:, None] * mean
     half = np.linalg.norm(vector, axis=1)
     step = np.column_stack((np.cos(half), np.sinc(half / np.pi)[:, None] * vector))

@@ -131,12 +131,16 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
         write(file, samples, Writing(ending, scale))
 
 
-def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
+def log_timeline(
+    samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None
+) -> Timeline:
     """A timeline of every sample of a log, joined as the log's own samples require (see
     `entries`).
     """
     policy = replace(policy, prediction="rate")  # nothing is predicted of a log
-    timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
+    timeline = Timeline(
+        policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins
+    )
     for sample in samples:
         timeline.add(sample)
     return timeline
@@ -164,7 +168,9 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
     if not first_ns <= t_ns <= last_ns:
         span = f"{(last_ns - first_ns) / NS_PER_S:.9g} s long"
         if first_ns < YEAR_NS:
-            raise InputError(f"--at {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}")
+            raise InputError(
+                f"--at {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}"
+            )
         span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
         raise InputError(f"--at {text}: {path} is {span}; {TIME_FORM}")
     return t_ns

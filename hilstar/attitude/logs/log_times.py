@@ -27,7 +27,15 @@ MAX_OFF = 0.1  # of the ratio: rates and quaternions of one motion agree better
 MIN_COSINE = 0.98  # between the two axes
 MIN_STEP_S, MAX_STEP_S = 1e-4, 10.0
 # How many seconds a log's second is, for units that people write instead; of ns, how many ns.
-SECONDS = {"ns": 1e-9, "100 ns": 1e-7, "us": 1e-6, "ms": 1e-3, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+SECONDS = {
+    "ns": 1e-9,
+    "100 ns": 1e-7,
+    "us": 1e-6,
+    "ms": 1e-3,
+    "minutes": 60.0,
+    "hours": 3600.0,
+    "days": 86400.0,
+}
 OF_NS = {"100 ns": 100.0, "us": 1e3, "ms": 1e6, "s": 1e9}
 # What rates of another unit look like, by the same factor.
 RATES_LIKE = {1e-3: "mrad/s", 1e3: "rad/ms"}
@@ -36,7 +44,11 @@ RATES_LIKE = {1e-3: "mrad/s", 1e3: "rad/ms"}
 def median_step_s(samples: Sequence[AttitudeSample]) -> float:
     """The median interval of a log, s; NaN of a single sample."""
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
-    return float(np.median(np.asarray(np.diff(t_ns) / NS_PER_S, dtype=np.float64))) if len(samples) > 1 else float("nan")
+    return (
+        float(np.median(np.asarray(np.diff(t_ns) / NS_PER_S, dtype=np.float64)))
+        if len(samples) > 1
+        else float("nan")
+    )
 
 
 def span_line(samples: Sequence[AttitudeSample]) -> str:
@@ -56,11 +68,18 @@ def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str
     step_s = median_step_s(samples)
     unit_line = _named(samples, unit, step_s)
     if unit_line:
-        return [(TIMES, f"the rates do not fit the times: probably {unit_line}; the format has {unit}")]
+        return [
+            (TIMES, f"the rates do not fit the times: probably {unit_line}; the format has {unit}")
+        ]
     if MIN_STEP_S <= step_s <= MAX_STEP_S:
         return []
     limit = f"over {MAX_STEP_S:g} s" if step_s > MAX_STEP_S else f"under {MIN_STEP_S * 1e3:g} ms"
-    return [(TIMES, f"{span_line(samples)}, which is {limit}: are its times in {unit}, as the format has them?")]
+    return [
+        (
+            TIMES,
+            f"{span_line(samples)}, which is {limit}: are its times in {unit}, as the format has them?",
+        )
+    ]
 
 
 def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:

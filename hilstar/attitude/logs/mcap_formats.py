@@ -52,7 +52,9 @@ def _refuse_other_topics(path: Path) -> None:
     if topics and ATTITUDE_TOPIC not in topics:
         named = [topic[:MAX_QUOTED_CHARACTERS] for topic in topics[:MAX_NAMED_TOPICS]]
         names = ", ".join([*named, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])])
-        raise InputError(f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is read")
+        raise InputError(
+            f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is read"
+        )
 
 
 def _begins_as_ledger(beginning: LogHead) -> bool:

@@ -58,10 +58,14 @@ ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
 MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # limits for a whole file; logs pack to a tenth
-_record_head, _message_head, _chunk_head = (struct.Struct(form) for form in ("<BQ", "<HIQQ", "<QQQI8sQ"))
+_record_head, _message_head, _chunk_head = (
+    struct.Struct(form) for form in ("<BQ", "<HIQQ", "<QQQI8sQ")
+)
 _message_record, _footer_head = struct.Struct("<BQHIQQ"), struct.Struct("<BQQQ")
 _message_start, ZSTD = struct.Struct("<BQH").unpack_from, b"\4\0\0\0zstd"
-MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = map(int, (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX))
+MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = map(
+    int, (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX)
+)
 HEAD_BYTES = 31  # a message's opcode, length, channel, sequence and two times
 PIECE_BYTES = 1 << 18
 MAX_INDEX_BYTES = 16_000_000  # about six hours at five chunks a second
@@ -75,15 +79,38 @@ ATTITUDE_SCHEMA = msgspec.json.encode(
         "title": ATTITUDE_SCHEMA_NAME,
         "type": "object",
         "properties": {
-            "t_ns": {"type": "integer", "description": "sender's clock, ns; null in a refused message"},
-            "sequence": {"type": "integer", "description": "sender's counter; null in a refused message"},
-            "q": {"type": "array", "items": {"type": "number"}, "description": "q_icrs_to_cam: w, x, y, z; null when refused"},
-            "rate": {"type": "array", "items": {"type": "number"}, "description": "of cam in icrs, cam axes, rad/s; or null"},
-            "discontinuity": {"type": "boolean", "description": "do not interpolate from the previous attitude"},
-            "receive_ns": {"type": "integer", "description": "receiver's clock at arrival, ns; null when not received"},
+            "t_ns": {
+                "type": "integer",
+                "description": "sender's clock, ns; null in a refused message",
+            },
+            "sequence": {
+                "type": "integer",
+                "description": "sender's counter; null in a refused message",
+            },
+            "q": {
+                "type": "array",
+                "items": {"type": "number"},
+                "description": "q_icrs_to_cam: w, x, y, z; null when refused",
+            },
+            "rate": {
+                "type": "array",
+                "items": {"type": "number"},
+                "description": "of cam in icrs, cam axes, rad/s; or null",
+            },
+            "discontinuity": {
+                "type": "boolean",
+                "description": "do not interpolate from the previous attitude",
+            },
+            "receive_ns": {
+                "type": "integer",
+                "description": "receiver's clock at arrival, ns; null when not received",
+            },
             "accepted": {"type": "boolean"},
             "reason": {"type": "string", "description": "why it was refused; or null"},
-            "raw": {"type": "string", "description": "the packet as received, in hexadecimal; or null"},
+            "raw": {
+                "type": "string",
+                "description": "the packet as received, in hexadecimal; or null",
+            },
         },
     }
 )
@@ -159,19 +186,30 @@ def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[byte
 
 def topics_of(path: Path) -> list[str]:
     """The topics that a file has channels for. Raises InputError for damage."""
-    return sorted({record.topic for record in records_of(path) if isinstance(record, kinds.Channel)})
+    return sorted(
+        {record.topic for record in records_of(path) if isinstance(record, kinds.Channel)}
+    )
 
 
 def read_metadata(path: Path, name: str) -> dict[str, str]:
     """The first metadata of that name, {} where there is none. Raises InputError for damage."""
-    return next((dict(r.metadata) for r in records_of(path) if isinstance(r, kinds.Metadata) and r.name == name), {})
+    return next(
+        (
+            dict(r.metadata)
+            for r in records_of(path)
+            if isinstance(r, kinds.Metadata) and r.name == name
+        ),
+        {},
+    )
 
 
 def begins_as_ledger(path: Path) -> bool:
     """Whether a file has the head of a run's ledger, which stands before its topics. Raises
     InputError for damage before it.
     """
-    heads = takewhile(lambda record: isinstance(record, kinds.Header | kinds.Metadata), records_of(path))
+    heads = takewhile(
+        lambda record: isinstance(record, kinds.Header | kinds.Metadata), records_of(path)
+    )
     return any(isinstance(head, kinds.Metadata) and head.name == RUN_METADATA for head in heads)
 
 
@@ -189,8 +227,14 @@ def holds_ros(path: Path) -> bool:
     damage before it.
     """
     channels = (record for record in records_of(path) if isinstance(record, kinds.Channel))
-    encodings = (one.message_encoding for one in channels if one.message_encoding != "json" or one.topic in OWN_TOPICS)
-    return next((one in ROS_ENCODINGS for one in encodings if one in {*ROS_ENCODINGS, "json"}), False)
+    encodings = (
+        one.message_encoding
+        for one in channels
+        if one.message_encoding != "json" or one.topic in OWN_TOPICS
+    )
+    return next(
+        (one in ROS_ENCODINGS for one in encodings if one in {*ROS_ENCODINGS, "json"}), False
+    )
 
 
 def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[Any]:
@@ -254,7 +298,9 @@ class _Reader(StreamReader):
         """
         left = self._size - self.place
         if MAX_RECORD_BYTES < length <= left:
-            raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
+            raise TooLargeError(
+                f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read"
+            )
         data = self._file.read(min(length, left))
         self.place += len(data)
         self._crcs = (*self._crcs[1:], zlib.crc32(data, self._crcs[-1]))
@@ -281,14 +327,23 @@ class _Reader(StreamReader):
                 if end > len(piece):
                     break
                 if opcode == CHUNK and length >= _chunk_head.size:
-                    first_ns, last_ns, size, crc, packing, packed = _chunk_head.unpack_from(piece, body)
+                    first_ns, last_ns, size, crc, packing, packed = _chunk_head.unpack_from(
+                        piece, body
+                    )
                     if packing != ZSTD or packed != length - _chunk_head.size:
                         break
                     self.place = begin + end
-                    yield kinds.Chunk("zstd", piece[end - packed : end], last_ns, first_ns, crc, size)
+                    yield kinds.Chunk(
+                        "zstd", piece[end - packed : end], last_ns, first_ns, crc, size
+                    )
                 elif opcode == CHUNK_INDEX and length >= 68:
-                    offsets = (length - 68).to_bytes(4, "little") if (length - 68) % 10 == 0 else b""
-                    if piece[body + 32 : body + 36] != offsets or piece[end - 24 : end - 16] != ZSTD:
+                    offsets = (
+                        (length - 68).to_bytes(4, "little") if (length - 68) % 10 == 0 else b""
+                    )
+                    if (
+                        piece[body + 32 : body + 36] != offsets
+                        or piece[end - 24 : end - 16] != ZSTD
+                    ):
                         break
                 elif opcode != MESSAGE_INDEX:
                     break
@@ -313,11 +368,15 @@ def _is_finished(file: IO[bytes]) -> bool:
 def _refused(path: Path, place: int, error: Exception) -> InputError:
     if isinstance(error, TooLargeError):
         return InputError(f"{path}: {error}; {ADVICE}")
-    detail = str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
+    detail = (
+        str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
+    )
     return InputError(f"{path}: is damaged before byte {place} ({detail}); record the log again")
 
 
-def unpacked(data: bytes, compression: str, limit: int, exact: bool = True, zstd: Zstd | None = None) -> bytes:
+def unpacked(
+    data: bytes, compression: str, limit: int, exact: bool = True, zstd: Zstd | None = None
+) -> bytes:
     """What was packed: `limit` bytes, or if not `exact` at most so many. Raises DamageError, and
     what the unpackers raise.
     """
@@ -325,19 +384,25 @@ def unpacked(data: bytes, compression: str, limit: int, exact: bool = True, zstd
         with (zstd or Zstd()).stream_reader(data) as stream:
             whole = stream.read(limit + 1)
     elif compression in {"bz2", "lz4"}:
-        unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
+        unpacker = (
+            bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
+        )
         whole = unpacker.decompress(data, max_length=limit + 1)
     else:
         whole = data
     if len(whole) > limit or (exact and len(whole) != limit):
-        raise DamageError(f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states")
+        raise DamageError(
+            f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states"
+        )
     return whole
 
 
 def _unpacked(chunk: kinds.Chunk, room: int, zstd: Zstd) -> bytes:
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
-        raise TooLargeError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
+        raise TooLargeError(
+            f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked"
+        )
     if size > room:
         raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
     if chunk.compression not in {"", "zstd", "lz4"}:
@@ -370,7 +435,13 @@ def _inside(data: bytes) -> Iterator[kinds.McapRecord]:
             if length < _message_head.size:
                 raise DamageError("a message is shorter than its head")
             channel, sequence, log_ns, publish_ns = _message_head.unpack_from(data, place)
-            yield kinds.Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
+            yield kinds.Message(
+                channel,
+                log_ns,
+                data[place + _message_head.size : place + length],
+                publish_ns,
+                sequence,
+            )
         elif opcode in {Opcode.CHANNEL, Opcode.SCHEMA}:
             kind = kinds.Channel if opcode == Opcode.CHANNEL else kinds.Schema
             yield kind.read(ReadDataStream(io.BytesIO(data[place : place + length])))
@@ -397,14 +468,24 @@ class McapWriter:
     caller's. Raises OSError.
     """
 
-    def __init__(self, fd: int, topics: Mapping[str, JsonTopic], metadata_name: str, metadata: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        fd: int,
+        topics: Mapping[str, JsonTopic],
+        metadata_name: str,
+        metadata: Mapping[str, str],
+    ) -> None:
         self.size_bytes = 0
         self._fd = fd
         self._ids = {key: number for number, key in enumerate(topics, start=1)}
         self._schemas = [
-            kinds.Schema(i, topic.schema, "jsonschema", topic.schema_name) for i, topic in enumerate(topics.values(), 1)
+            kinds.Schema(i, topic.schema, "jsonschema", topic.schema_name)
+            for i, topic in enumerate(topics.values(), 1)
         ]
-        self._channels = [kinds.Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
+        self._channels = [
+            kinds.Channel(i, topic.name, "json", {}, i)
+            for i, topic in enumerate(topics.values(), 1)
+        ]
         self._pending: list[_Pending] = []
         self.pending_bytes = 0
         self.crc = 0  # CRC-32 of all that is written
@@ -424,7 +505,12 @@ class McapWriter:
 
     def add(self, key: str, time_ns: int, data: bytes, sequence: int) -> None:
         """Take a message of the topic named `key`; it is written at the next flush."""
-        record = _message_record.pack(Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns) + data
+        record = (
+            _message_record.pack(
+                Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns
+            )
+            + data
+        )
         self._pending.append(_Pending(self._ids[key], time_ns, record))
         self.pending_bytes += len(record)
 
@@ -442,7 +528,11 @@ class McapWriter:
         """Forget the messages of a topic (None: of all) that are not written yet; returns their
         number.
         """
-        kept = [] if key is None else [entry for entry in self._pending if entry.channel != self._ids[key]]
+        kept = (
+            []
+            if key is None
+            else [entry for entry in self._pending if entry.channel != self._ids[key]]
+        )
         dropped = len(self._pending) - len(kept)
         self._pending, self.pending_bytes = kept, sum(len(entry.record) for entry in kept)
         return dropped
@@ -455,7 +545,9 @@ class McapWriter:
         times_ns = [entry.time_ns for entry in self._pending]
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
-        chunk = _bytes_of(kinds.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
+        chunk = _bytes_of(
+            kinds.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data))
+        )
         # by channel: the times of its messages and where they begin
         entries: dict[int, list[tuple[int, int]]] = {}
         offset = 0
@@ -474,7 +566,15 @@ class McapWriter:
         self._times_ns = [min(self._times_ns), max(self._times_ns)]
         if self._indexed:
             entry = kinds.ChunkIndex(
-                len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data)
+                len(chunk),
+                place,
+                "zstd",
+                len(packed),
+                last_ns,
+                len(indexes),
+                offsets,
+                first_ns,
+                len(data),
             )
             self._index += _bytes_of(entry)
         if len(self._index) > MAX_INDEX_BYTES:
@@ -489,7 +589,9 @@ class McapWriter:
         start = self.size_bytes + len(end)
         first_ns, last_ns = self._times_ns or (0, 0)
         totals = (self.written, last_ns, first_ns)
-        statistics = kinds.Statistics(0, len(self._channels), dict(self._counts), self._chunks, *totals, 1, len(self._schemas))
+        statistics = kinds.Statistics(
+            0, len(self._channels), dict(self._counts), self._chunks, *totals, 1, len(self._schemas)
+        )
         groups = {
             Opcode.SCHEMA: _bytes_of(*self._schemas),
             Opcode.CHANNEL: _bytes_of(*self._channels),
@@ -504,7 +606,9 @@ class McapWriter:
             summary += group
         offset_start = start + len(summary)
         summary += offsets
-        crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
+        crc = zlib.crc32(
+            _footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary)
+        )
         self._append(end + summary + _bytes_of(kinds.Footer(start, offset_start, crc)) + MCAP_MAGIC)
 
     def _append(self, data: bytes) -> None:
@@ -546,19 +650,30 @@ _decoder = msgspec.json.Decoder(_Form)
 _encoder = msgspec.json.Encoder()
 
 
-def attitude_message(sample: AttitudeSample, receive_ns: int | None = None, raw: bytes | None = None) -> bytes:
+def attitude_message(
+    sample: AttitudeSample, receive_ns: int | None = None, raw: bytes | None = None
+) -> bytes:
     """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the
     packet as received.
     """
     q, rate = tuple(sample.q_icrs_to_cam.tolist()), sample.rate_cam_rad_s
-    turning, packet = None if rate is None else tuple(rate.tolist()), None if raw is None else raw.hex()
-    return _encoder.encode(_Form(sample.t_ns, sample.sequence, q, turning, sample.discontinuity, receive_ns, raw=packet))
+    turning, packet = (
+        None if rate is None else tuple(rate.tolist()),
+        None if raw is None else raw.hex(),
+    )
+    return _encoder.encode(
+        _Form(
+            sample.t_ns, sample.sequence, q, turning, sample.discontinuity, receive_ns, raw=packet
+        )
+    )
 
 
 def refused_message(reason: str, detail: str, receive_ns: int | None, raw: bytes | None) -> bytes:
     """The JSON of a refused packet, with "reason: detail"."""
     packet, why = None if raw is None else raw.hex(), f"{reason}: {detail}"
-    return _encoder.encode(_Form(None, None, receive_ns=receive_ns, accepted=False, reason=why, raw=packet))
+    return _encoder.encode(
+        _Form(None, None, receive_ns=receive_ns, accepted=False, reason=why, raw=packet)
+    )
 
 
 def register_attitudes(writer: Writer) -> int:
@@ -582,7 +697,13 @@ def write_attitudes(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     for sample in samples:
         time_ns = log_time_ns(sample.t_ns)
         message = attitude_message(sample)
-        writer.add_message(channel_id, log_time=time_ns, data=message, publish_time=time_ns, sequence=sample.sequence % 2**32)
+        writer.add_message(
+            channel_id,
+            log_time=time_ns,
+            data=message,
+            publish_time=time_ns,
+            sequence=sample.sequence % 2**32,
+        )
     writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -612,4 +733,7 @@ def read_events(path: Path) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
             continue
         if form.t_ns is None or form.q is None:
             raise InputError(f"{where} is accepted, but lacks t_ns or q")
-        yield place, checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
+        yield (
+            place,
+            checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity),
+        )

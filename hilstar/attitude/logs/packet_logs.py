@@ -63,7 +63,9 @@ def of_packets(
         return LogReading(begin, conventions, advice, notices)
     reference = stated_reference(path, kind, stated, first.t_ns)
     turned = to_icrs(itertools.chain(begin, entries), reference, False, notices)
-    return LogReading(turned, _referred(conventions, convention, reference, first.t_ns), advice, notices)
+    return LogReading(
+        turned, _referred(conventions, convention, reference, first.t_ns), advice, notices
+    )
 
 
 def _up_to_first(entries: Iterator[LogEntry]) -> tuple[list[LogEntry], AttitudeSample | None]:
@@ -81,10 +83,16 @@ def _up_to_first(entries: Iterator[LogEntry]) -> tuple[list[LogEntry], AttitudeS
 def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Iterator[LogEntry]:
     for entry in entries:
         event = entry.event
-        yield (LogEntry(entry.where, convention.sample(event)) if isinstance(event, AttitudeSample) else entry)
+        yield (
+            LogEntry(entry.where, convention.sample(event))
+            if isinstance(event, AttitudeSample)
+            else entry
+        )
 
 
-def _referred(conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int) -> Conventions:
+def _referred(
+    conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int
+) -> Conventions:
     """The conventions of a log whose attitudes refer to a reference; the self-check is for its
     first time.
     """
@@ -96,4 +104,6 @@ def _referred(conventions: Conventions, convention: Convention, reference: "Refe
         return f"q = {components(convention.as_sent(q))} at {first_ns / NS_PER_S:.9f} s"
 
     turns = packet_conventions(convention, reference="reference").turns
-    return replace(conventions, turns=f"{turns}; the reference is {reference.words}", written=written)
+    return replace(
+        conventions, turns=f"{turns}; the reference is {reference.words}", written=written
+    )

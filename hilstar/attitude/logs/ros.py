@@ -52,11 +52,21 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, shortened
-from hilstar.basics.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vectors,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
 from hilstar.basics.units import NS_PER_S
 
 TF_TYPES = frozenset({TF, OLD_TF})
-TRANSFORM, IMU, ODOMETRY = "geometry_msgs/msg/TransformStamped", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
+TRANSFORM, IMU, ODOMETRY = (
+    "geometry_msgs/msg/TransformStamped",
+    "sensor_msgs/msg/Imu",
+    "nav_msgs/msg/Odometry",
+)
 # Where each message has its quaternion.
 QUATERNIONS: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/Quaternion": lambda message: message,
@@ -113,14 +123,21 @@ def turns(type_name: str, message: Any) -> Iterator[_RosTurn]:
     q, header = QUATERNIONS[type_name](message), getattr(message, "header", None)
     stamp_ns = reference = body = rate = fault = None
     if header is not None:
-        stamp_ns, reference = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec), frame(header.frame_id)
+        stamp_ns, reference = (
+            int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec),
+            frame(header.frame_id),
+        )
     if type_name in {TRANSFORM, ODOMETRY}:
         body = frame(message.child_frame_id)
     if type_name == ODOMETRY:
         rate = _vector(message.twist.twist.angular)
     elif type_name == IMU:
         reference, body = None, reference
-        rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
+        rate = (
+            None
+            if message.angular_velocity_covariance[0] == -1
+            else _vector(message.angular_velocity)
+        )
         if message.orientation_covariance[0] == -1:
             fault = "orientation_covariance[0] is -1: the IMU gives no orientation"
     yield _RosTurn(stamp_ns, reference, body, (q.w, q.x, q.y, q.z), rate, type_name == IMU, fault)
@@ -201,14 +218,25 @@ class _FrameChain(NamedTuple):
             # numbers of the timed part that are not finite are refused where they are checked
             with np.errstate(all="ignore"):
                 whole = multiply(part, whole)
-        others, name = [edge for edge in self.edges if edge.moves and edge is not self.timed], _edge_names([self.timed])
+        others, name = (
+            [edge for edge in self.edges if edge.moves and edge is not self.timed],
+            _edge_names([self.timed]),
+        )
         if others:
-            told.append(("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {name}"))
+            told.append(
+                ("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {name}")
+            )
         if not known.all():
             told.append(
-                ("log-tf", f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out")
+                (
+                    "log-tf",
+                    f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out",
+                )
             )
-        received_ns, stamps_ns = np.array(self.timed.received_ns)[known], np.array(self.timed.stamps_ns)[known]
+        received_ns, stamps_ns = (
+            np.array(self.timed.received_ns)[known],
+            np.array(self.timed.stamps_ns)[known],
+        )
         rows = zip(received_ns.tolist(), stamps_ns.tolist(), whole[known].tolist(), strict=True)
         for number, (received, stamp_ns, (w, x, y, z)) in enumerate(rows, start=1):
             turn = _RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
@@ -227,7 +255,9 @@ class _Tree:
                 parents[reference] = _Edge(reference, body)
                 count += 1
                 if count > MAX_EDGES:
-                    raise InputError(f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted")
+                    raise InputError(
+                        f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted"
+                    )
             parents[reference].add(turn, received_ns)
 
     def _all(self) -> list[_Edge]:
@@ -269,11 +299,19 @@ class _Tree:
             found.append(parents[0])
             frame = parents[0].parent
             if frame in seen:
-                raise InputError(f"{self._path}: tf goes in a circle at {frame!r}: {_edge_names(found)}")
+                raise InputError(
+                    f"{self._path}: tf goes in a circle at {frame!r}: {_edge_names(found)}"
+                )
             seen.add(frame)
         if not found or (reference is not None and frame != reference):
-            wanted = f"from {body!r} up to {reference!r}" if reference is not None and found else f"of {body!r}"
-            raise InputError(f"{self._path}: tf has no transform {wanted}; it has {_edge_names(self._all())}")
+            wanted = (
+                f"from {body!r} up to {reference!r}"
+                if reference is not None and found
+                else f"of {body!r}"
+            )
+            raise InputError(
+                f"{self._path}: tf has no transform {wanted}; it has {_edge_names(self._all())}"
+            )
         return tuple(found)
 
 
@@ -300,7 +338,9 @@ def named(reference: str | None) -> tuple[str | None, Kind | None]:
     return (reference, None) if kind is None else (frame or None, kind)
 
 
-def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
+def _kind_of_frame(
+    path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]
+) -> Kind:
     """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not
     name it.
 
@@ -341,12 +381,19 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     topic = _chosen(bag, stated.topic)
     if not bag.has_own_fields(topic):
         where = f"{bag.path}: {topic.name}"
-        raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
+        raise InputError(
+            f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it"
+        )
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
     first, stamped, heard = _begin(bag, topic, every, stated.body)
     if not stamped:
-        told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
+        told.append(
+            (
+                "log-stamp",
+                f"the messages of {topic.name} have no time of their own; when they were recorded is taken",
+            )
+        )
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
@@ -357,11 +404,20 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would
     # turn it twice.
     if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
-        told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
-    return LogReading(in_order(entries, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told)
+        told.append(
+            (
+                "mounting",
+                f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same",
+            )
+        )
+    return LogReading(
+        in_order(entries, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told
+    )
 
 
-def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Heard, bool, Iterator[_Heard]]:
+def _begin(
+    bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None
+) -> tuple[_Heard, bool, Iterator[_Heard]]:
     """The first orientation of the stated body that is set, whether the messages have times of
     their own, and all of its orientations.
 
@@ -369,9 +425,13 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None)
     """
     first = next(heard, None)
     if first is None:
-        raise InputError(f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic")
+        raise InputError(
+            f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic"
+        )
     if first.turn.body is None and body is not None:
-        raise InputError(f"{bag.path}: the messages of {topic.name} name no body; leave out --body {body}")
+        raise InputError(
+            f"{bag.path}: the messages of {topic.name} name no body; leave out --body {body}"
+        )
     heard = chain([first], heard)
     if body is not None:
         wanted = frame(body)
@@ -386,7 +446,9 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None)
         unset.append(each)
     begin = list(islice(heard, 2))
     if not begin and not unset:
-        raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
+        raise InputError(
+            f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has"
+        )
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
     return [*begin, *unset][0], stamped, chain(unset, begin, heard)
@@ -397,18 +459,24 @@ def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
     topics = bag.topics()
     readable = [topic for topic in topics if topic.type in TYPES]
     if wanted is not None:
-        found = next((topic for topic in topics if topic.name.lstrip("/") == wanted.lstrip("/")), None)
+        found = next(
+            (topic for topic in topics if topic.name.lstrip("/") == wanted.lstrip("/")), None
+        )
         if found is None:
             raise InputError(f"{bag.path}: has no topic {wanted}; it has {_topic_names(topics)}")
         if found not in readable:
             types = ", ".join(sorted({kind.rpartition("/")[2] for kind in TYPES}))
-            raise InputError(f"{bag.path}: {found.name} is of {found.type}, which says no attitude; read are {types}")
+            raise InputError(
+                f"{bag.path}: {found.name} is of {found.type}, which says no attitude; read are {types}"
+            )
         return found
     choice = [topic for topic in readable if not topic.name.endswith(STATIC_TF)] or readable
     if not choice:
         raise InputError(f"{bag.path}: has no topic with attitudes; it has {_topic_names(topics)}")
     if len(choice) > 1:
-        raise InputError(f"{bag.path}: has several topics with attitudes: {_topic_names(choice)}; choose one with --topic NAME")
+        raise InputError(
+            f"{bag.path}: has several topics with attitudes: {_topic_names(choice)}; choose one with --topic NAME"
+        )
     return choice[0]
 
 
@@ -423,14 +491,22 @@ def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[_Heard]:
         try:
             found = list(turns(topic.type, bag.decoded(topic, message.data)))
         except Exception as error:  # rosbags's generated code raises what its bytes lead to
-            raise InputError(f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again") from error
+            raise InputError(
+                f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again"
+            ) from error
         yield from (_Heard(where, message.receive_ns, turn) for turn in found)
 
 
-def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[_Heard]:
+def _of_tf(
+    bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]
+) -> Iterator[_Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
-    statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
+    statics = [
+        other
+        for other in bag.topics()
+        if other.type in TF_TYPES and other.name == beside and other != topic
+    ]
     tree = _Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
     body = None if stated.body is None else frame(stated.body)
     yield from tree.chain(body, named(stated.reference)[0]).heard(told)
@@ -441,22 +517,33 @@ def _entries(heard: Iterator[_Heard], first: _RosTurn, stamped: bool) -> Iterato
     for each in heard:
         w, x, y, z = each.turn.q
         fault = None if is_unset(each.turn.q) else _fault(each.turn, first, stamped)
-        yield LogEntry(each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate))
+        yield LogEntry(
+            each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate)
+        )
 
 
 def _fault(turn: _RosTurn, first: _RosTurn, stamped: bool) -> Refusal | None:
     if turn.fault is not None:
         return Refusal("format", turn.fault)
     if turn.reference != first.reference:
-        return Refusal("format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}")
+        return Refusal(
+            "format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}"
+        )
     if turn.body != first.body:
-        return Refusal("format", f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body")
+        return Refusal(
+            "format",
+            f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body",
+        )
     if turn.stamp_ns and not stamped:
-        return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
+        return Refusal(
+            "time", "some messages have a stamp and some have none (0); set it in all of them"
+        )
     return None
 
 
-def _conventions(topic: BagTopic, first: _Heard, stamped: bool, reference: Reference) -> Conventions:
+def _conventions(
+    topic: BagTopic, first: _Heard, stamped: bool, reference: Reference
+) -> Conventions:
     turn, t_ns = first.turn, first.t_ns(stamped)
     if not stamped:
         time = "when each message was recorded, ns since 1970"
@@ -464,9 +551,15 @@ def _conventions(topic: BagTopic, first: _Heard, stamped: bool, reference: Refer
         time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"
     else:
         time = "header.stamp: seconds of a simulated clock"
-    rates = "; the gyroscope's rate, with respect to the stars" if turn.gyro and turn.rate is not None else ""
+    rates = (
+        "; the gyroscope's rate, with respect to the stars"
+        if turn.gyro and turn.rate is not None
+        else ""
+    )
     body = f"'{turn.body}'" if turn.body else "the body"
-    frames = f"{body} into those of " + (f"'{turn.reference}'" if turn.reference else "the reference")
+    frames = f"{body} into those of " + (
+        f"'{turn.reference}'" if turn.reference else "the reference"
+    )
 
     def written(q: FloatArray) -> str:
         of_body = multiply(reference.q_icrs_to_reference([t_ns])[0], conjugate(q))

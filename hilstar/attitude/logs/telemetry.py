@@ -55,7 +55,9 @@ def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
         valid = np.ones(len(samples), dtype=np.bool_)
         telemetry = Telemetry(path, t_ns, q, valid, np.arange(1, len(samples) + 1), of_lines=False)
     if not telemetry.valid.any():
-        rows = f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
+        rows = (
+            f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
+        )
         raise InputError(f"{path}: has {rows}; {ADVICE}")
     return telemetry
 
@@ -69,14 +71,20 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
         t_ns.append(_time(path, number, cells[0]))
         if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
-            raise InputError(f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording")
+            raise InputError(
+                f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording"
+            )
         valid.append(is_valid(path, number, cells[5]))
         own = [math.nan] * 4
         if valid[-1]:
-            own = finite_numbers(path, number, COLUMNS[1:], cells[1:5], "write valid = 0 where there is no answer")
+            own = finite_numbers(
+                path, number, COLUMNS[1:], cells[1:5], "write valid = 0 where there is no answer"
+            )
             if abs(math.hypot(*own) - 1) > NORM_TOLERANCE:
                 said = f"the norm of qw,qx,qy,qz is {math.hypot(*own):.6g}"
-                raise InputError(f"{path}:{number}: {said}; write unit quaternions, within {NORM_TOLERANCE:g}")
+                raise InputError(
+                    f"{path}:{number}: {said}; write unit quaternions, within {NORM_TOLERANCE:g}"
+                )
         q.append(own)
         line.append(number)
         if len(t_ns) > MAX_ROWS:
@@ -84,7 +92,9 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
     attitudes = np.array(q).reshape(len(q), 4)
     flags = np.array(valid, dtype=np.bool_)
     attitudes[flags] = normalise(attitudes[flags])
-    return Telemetry(path, np.array(t_ns, dtype=np.int64), attitudes, flags, np.array(line, dtype=np.intp))
+    return Telemetry(
+        path, np.array(t_ns, dtype=np.int64), attitudes, flags, np.array(line, dtype=np.intp)
+    )
 
 
 def _time(path: Path, line: int, cell: str) -> int:
@@ -93,5 +103,7 @@ def _time(path: Path, line: int, cell: str) -> int:
     except (ArithmeticError, ValueError):
         t_ns = None
     if t_ns is None or abs(t_ns) > MAX_T_NS:
-        raise InputError(f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly")
+        raise InputError(
+            f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly"
+        )
     return t_ns

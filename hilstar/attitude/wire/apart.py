@@ -153,7 +153,11 @@ class ReaderProcess:
     """
 
     def __init__(
-        self, notices: Notices, module: str = CHILD, clock: HostClock = HOST_CLOCK, name: str = "the attitude receiver"
+        self,
+        notices: Notices,
+        module: str = CHILD,
+        clock: HostClock = HOST_CLOCK,
+        name: str = "the attitude receiver",
     ) -> None:
         self.generation, self._name = 0, name
         self._notices, self._module, self._clock = notices, module, clock
@@ -199,7 +203,13 @@ class ReaderProcess:
             with contextlib.suppress(OSError):
                 socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
 
-    def read(self, stream: OpenStream | None = None, device: int | None = None, *, runs_user_code: bool = False) -> None:
+    def read(
+        self,
+        stream: OpenStream | None = None,
+        device: int | None = None,
+        *,
+        runs_user_code: bool = False,
+    ) -> None:
         """Order a stream to be opened, or a device, whose descriptor this process keeps; with
         neither, the device is let go.
         """
@@ -221,7 +231,9 @@ class ReaderProcess:
         said = bool(poll.poll(timeout_ms))
         now_ns = self._clock.now_ns()
         passed_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
-        self._silent_s = 0.0 if said else self._silent_s + min(passed_s, max(timeout_ms / 1000, MAX_LOOK_S))
+        self._silent_s = (
+            0.0 if said else self._silent_s + min(passed_s, max(timeout_ms / 1000, MAX_LOOK_S))
+        )
         if self._silent_s > (STARTS_S if self._starting else HUNG_S):
             self._look_closely()
         else:
@@ -246,7 +258,9 @@ class ReaderProcess:
         """
         with contextlib.suppress(OSError, IndexError, ValueError):
             if self._process is not None:
-                fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+                fields = (
+                    Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+                )
                 return fields[0], (int(fields[11]) + int(fields[12])) / TICKS_PER_S
         return "", 0.0
 
@@ -255,7 +269,9 @@ class ReaderProcess:
         """Whether it still imports what it needs: its own modules, or a user's, which its order
         names.
         """
-        return not self._ready or (self._order.runs_user_code and self._opened != self._order.number)
+        return not self._ready or (
+            self._order.runs_user_code and self._opened != self._order.number
+        )
 
     @property
     def trouble(self) -> str:

@@ -105,7 +105,15 @@ class _ForwardedNotices(Notices):
         if grown != LinkCounts():
             self._wire.put(Record(self._order, counts=grown))
 
-    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None, *, lasting: bool = True) -> None:
+    def tell(
+        self,
+        kind: str,
+        detail: str,
+        who: str = "",
+        since_ns: int | None = None,
+        *,
+        lasting: bool = True,
+    ) -> None:
         with contextlib.suppress(EOFError):
             self.count()
             self._wire.put(Record(self._order, notice=(kind, detail, who), lasting=lasting))
@@ -117,7 +125,9 @@ class _ForwardedNotices(Notices):
 class _Reading:
     """An order that is carried out. Raises InputError where its socket cannot be opened."""
 
-    def __init__(self, wire: Wire, order: ReadOrder, file: int | None, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self, wire: Wire, order: ReadOrder, file: int | None, clock: HostClock = HOST_CLOCK
+    ) -> None:
         self._wire, self._number, self._clock = wire, order.number, clock
         self._notices = _ForwardedNotices(wire, order.number)
         self._empty_ns = clock.now_ns()
@@ -148,7 +158,9 @@ class _Reading:
             # The newest of those that arrived while this process slept woke it; the others had to
             # wait.
             timely = not waits and k == len(taken) - 1
-            self._wire.put(Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely)))
+            self._wire.put(
+                Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely))
+            )
 
     def close(self) -> None:
         if self.link is not None:

@@ -63,7 +63,10 @@ class ByteLink(Closing):
 
     def _lose(self, why: str) -> None:
         self.link_counts.lost += 1
-        self._notices.tell("answers-lost", f"{self.endpoint}: the tracker's line is lost ({one_line(why)}); waiting for it")
+        self._notices.tell(
+            "answers-lost",
+            f"{self.endpoint}: the tracker's line is lost ({one_line(why)}); waiting for it",
+        )
         self._retry.put_off(anew=True)
 
     def _opened(self) -> None:
@@ -85,7 +88,9 @@ class ByteLink(Closing):
 class SerialBytes(ByteLink):
     """A serial port. Raises InputError where it cannot be opened at the start."""
 
-    def __init__(self, port: str, baud: int, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self, port: str, baud: int, notices: Notices, clock: HostClock = HOST_CLOCK
+    ) -> None:
         super().__init__(f"serial:{port}@{baud}", notices, clock)
         self._port, self._baud = port, baud
         try:
@@ -143,14 +148,28 @@ class UdpBytes(ByteLink):
     messages = True
 
     def __init__(
-        self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
+        self,
+        place: UdpPlace | Place,
+        allowed: AllowedSenders,
+        notices: Notices,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
-        super().__init__(str(place) if isinstance(place, UdpPlace) else f"udp://{place[0]}:{place[1]}", notices, clock)
+        super().__init__(
+            str(place) if isinstance(place, UdpPlace) else f"udp://{place[0]}:{place[1]}",
+            notices,
+            clock,
+        )
         self._allowed = allowed if isinstance(place, UdpPlace) else None
         try:
-            self._datagrams = Datagrams.bound(place, clock) if isinstance(place, UdpPlace) else Datagrams.connected(*place)
+            self._datagrams = (
+                Datagrams.bound(place, clock)
+                if isinstance(place, UdpPlace)
+                else Datagrams.connected(*place)
+            )
         except OSError as error:
-            raise InputError(f"[answers] {self.endpoint}: {error.strerror}; write the tracker's address") from error
+            raise InputError(
+                f"[answers] {self.endpoint}: {error.strerror}; write the tracker's address"
+            ) from error
         except InputError as error:
             raise InputError(f"[answers] {error}") from error
 
@@ -188,7 +207,11 @@ class TcpBytes(ByteLink):
     """
 
     def __init__(
-        self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
+        self,
+        place: UdpPlace | Place,
+        allowed: AllowedSenders,
+        notices: Notices,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
         host, port = (str(place.host), place.port) if isinstance(place, UdpPlace) else place
         super().__init__(f"tcp://{f'[{host}]' if ':' in host else host}:{port}", notices, clock)
@@ -264,7 +287,10 @@ class TcpBytes(ByteLink):
         peer = f"{host}:{port}"
         if not self._allowed.admits(host):
             self.link_counts.rejected += 1
-            self._notices.begin("sender-not-allowed", f"a connection from {host} is refused: it is not in [answers] allow")
+            self._notices.begin(
+                "sender-not-allowed",
+                f"a connection from {host} is refused: it is not in [answers] allow",
+            )
             made.close()
             return
         if self._connection is not None and not self._holds.over:
@@ -308,13 +334,18 @@ class ZmqBytes(ByteLink):
 
     messages = True
 
-    def __init__(self, receiver: ZmqReceiver, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self, receiver: ZmqReceiver, notices: Notices, clock: HostClock = HOST_CLOCK
+    ) -> None:
         super().__init__(receiver.endpoint, notices, clock)
         self._receiver, self.link_counts = receiver, receiver.link_counts
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """See `ByteLink.taken`."""
-        return [message._replace(parts=message.parts[-1:]) for message in self._receiver.taken(timeout_ms)]
+        return [
+            message._replace(parts=message.parts[-1:])
+            for message in self._receiver.taken(timeout_ms)
+        ]
 
     def close(self) -> None:
         """Close the socket."""
@@ -344,7 +375,9 @@ def refuse_no_file(path: Path) -> None:
     except OSError:
         return
     if kind:
-        raise InputError(f"[answers] path = {path}: {kind}; write the file to which answers are appended")
+        raise InputError(
+            f"[answers] path = {path}: {kind}; write the file to which answers are appended"
+        )
 
 
 class FileBytes(ByteLink):

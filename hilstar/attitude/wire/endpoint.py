@@ -40,13 +40,18 @@ DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 5560
 BIND_FORM = 'write bind = "ADDRESS:PORT", such as "127.0.0.1:5560" or "[::1]:5560"'
 ALLOW_FORM = 'write addresses or networks, such as allow = ["192.168.1.20", "fd00::/64"]'
 # ADDRESS, ADDRESS:PORT, [IPv6] or [IPv6]:PORT; an IPv6 address without brackets has no port.
-PLACE = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+(?:%\w+)?)\]|(?P<host>[^:\[\]/\s]+))(?::(?P<port>\d{1,5}))?")
+PLACE = re.compile(
+    r"(?:\[(?P<six>[0-9A-Fa-f:.]+(?:%\w+)?)\]|(?P<host>[^:\[\]/\s]+))(?::(?P<port>\d{1,5}))?"
+)
 
 MAX_KNOWN = 1000
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-LOOPBACK: tuple[Network, ...] = (ipaddress.IPv4Network("127.0.0.0/8"), ipaddress.IPv6Network("::1/128"))
+LOOPBACK: tuple[Network, ...] = (
+    ipaddress.IPv4Network("127.0.0.0/8"),
+    ipaddress.IPv6Network("::1/128"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +73,14 @@ def parse_endpoint(text: str) -> Endpoint:
     """
     if text.startswith("ipc://"):
         name = text.removeprefix("ipc://")
-        if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
-            raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
+        if (
+            not name.startswith("/")
+            or not name.isprintable()
+            or len(os.fsencode(name)) > MAX_PATH_BYTES
+        ):
+            raise InputError(
+                f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}"
+            )
         return Endpoint(text, loopback=True, path=Path(name))
     match = TCP.fullmatch(text)
     port = match[2] if match else ""
@@ -97,8 +108,14 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
         return host, False, False
     mapped = getattr(address, "ipv4_mapped", None)
     if mapped is not None:
-        raise InputError(f"{shortened(text)}: an IPv4-mapped IPv6 address; write tcp://{mapped}:PORT")
-    return f"[{address}]" if bracketed else str(address), address.is_loopback, address.is_unspecified
+        raise InputError(
+            f"{shortened(text)}: an IPv4-mapped IPv6 address; write tcp://{mapped}:PORT"
+        )
+    return (
+        f"[{address}]" if bracketed else str(address),
+        address.is_loopback,
+        address.is_unspecified,
+    )
 
 
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
@@ -108,8 +125,12 @@ def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
     path = endpoint.path
     if path is None:
         if not bind and (endpoint.any_host or endpoint.any_port):
-            where, what = ("every interface", "address") if endpoint.any_host else ("a free port", "port")
-            raise InputError(f"{text}: cannot connect to {where}; write the {what} of the side that binds")
+            where, what = (
+                ("every interface", "address") if endpoint.any_host else ("a free port", "port")
+            )
+            raise InputError(
+                f"{text}: cannot connect to {where}; write the {what} of the side that binds"
+            )
         return
     try:
         mode = path.lstat().st_mode
@@ -118,11 +139,17 @@ def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
     except OSError as error:
         raise InputError(f"{text}: {error.strerror}; {PATH_FORM}") from error
     if bind and not path.parent.is_dir():
-        raise InputError(f"{text}: the directory {path.parent} does not exist; create it, or write another path")
+        raise InputError(
+            f"{text}: the directory {path.parent} does not exist; create it, or write another path"
+        )
     if mode is not None and not stat.S_ISSOCK(mode):
-        raise InputError(f"{text}: an existing file that is not a socket, and binding would delete it; write another path")
+        raise InputError(
+            f"{text}: an existing file that is not a socket, and binding would delete it; write another path"
+        )
     if mode is not None and bind and _is_served(path):
-        raise InputError(f"{text}: in use by a running program; stop that program, or write another path")
+        raise InputError(
+            f"{text}: in use by a running program; stop that program, or write another path"
+        )
 
 
 def _is_served(path: Path) -> bool:
@@ -194,7 +221,9 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
     wrong, or two disagree.
     """
     if bind is False:
-        raise InputError(f"bind = false: over UDP hilstar binds and the simulator sends to it; {BIND_FORM}")
+        raise InputError(
+            f"bind = false: over UDP hilstar binds and the simulator sends to it; {BIND_FORM}"
+        )
     said: dict[str, tuple[str | None, int | None]] = {}
     if isinstance(bind, str):
         said[f'bind = "{shortened(bind)}"'] = _parts(bind, f'bind = "{shortened(bind)}"')
@@ -203,10 +232,16 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
     if endpoint is not None:
         word = f'endpoint = "{shortened(endpoint)}"'
         if not endpoint.startswith("udp://"):
-            raise InputError(f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or {BIND_FORM.removeprefix('write ')}")
+            raise InputError(
+                f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or {BIND_FORM.removeprefix('write ')}"
+            )
         said[word] = _parts(endpoint.removeprefix("udp://"), word)
-    hosts = {word: host for word, (host, _) in said.items() if host is not None} or {"": DEFAULT_HOST}
-    ports = {word: number for word, (_, number) in said.items() if number is not None} or {"": DEFAULT_PORT}
+    hosts = {word: host for word, (host, _) in said.items() if host is not None} or {
+        "": DEFAULT_HOST
+    }
+    ports = {word: number for word, (_, number) in said.items() if number is not None} or {
+        "": DEFAULT_PORT
+    }
     for values in (hosts, ports):
         first, *others = values.items()
         for word, value in others:
@@ -224,7 +259,9 @@ def _parts(text: str, word: str) -> tuple[str, int | None]:
     try:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError as error:
-        raise InputError(f"{word}: {shortened(host)} is not an address of this machine; {BIND_FORM}") from error
+        raise InputError(
+            f"{word}: {shortened(host)} is not an address of this machine; {BIND_FORM}"
+        ) from error
     if address.is_multicast or getattr(address, "ipv4_mapped", None) is not None:
         raise InputError(f"{word}: {address} is not an address of one machine; {BIND_FORM}")
     return str(address), None if port is None else _port(port, word)
@@ -232,5 +269,7 @@ def _parts(text: str, word: str) -> tuple[str, int | None]:
 
 def _port(text: str, word: str) -> int:
     if not re.fullmatch(r"\d{1,5}", text) or int(text) > 65_535:
-        raise InputError(f"{word}: not a port; write a number from 1 to 65535, such as port = {DEFAULT_PORT}")
+        raise InputError(
+            f"{word}: not a port; write a number from 1 to 65535, such as port = {DEFAULT_PORT}"
+        )
     return int(text)

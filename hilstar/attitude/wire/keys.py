@@ -52,14 +52,22 @@ def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -
     """Refuse (InputError) a non-loopback endpoint without its keys, and keys of the other side."""
     if not keys.given:
         if not endpoint.loopback:
-            raise InputError(f"{text}: non-loopback endpoints require CURVE keys; {MAKE_KEYS}, or use tcp://127.0.0.1:PORT")
+            raise InputError(
+                f"{text}: non-loopback endpoints require CURVE keys; {MAKE_KEYS}, or use tcp://127.0.0.1:PORT"
+            )
         return
     if keys.secret_key is None:
-        raise InputError(f"{text}: curve_secret_key is missing; {MAKE_KEYS}, and name this side's secret key")
+        raise InputError(
+            f"{text}: curve_secret_key is missing; {MAKE_KEYS}, and name this side's secret key"
+        )
     if bind and keys.allowed_clients is None:
-        raise InputError(f"{text}: the side that binds requires allowed_clients, a directory of public keys; {MAKE_KEYS}")
+        raise InputError(
+            f"{text}: the side that binds requires allowed_clients, a directory of public keys; {MAKE_KEYS}"
+        )
     if not bind and keys.server_key is None:
-        raise InputError(f"{text}: the side that connects requires curve_server_key, the other side's public key; {MAKE_KEYS}")
+        raise InputError(
+            f"{text}: the side that connects requires curve_server_key, the other side's public key; {MAKE_KEYS}"
+        )
 
 
 def make_keys(directory: Path) -> list[Path]:
@@ -70,13 +78,19 @@ def make_keys(directory: Path) -> list[Path]:
     InputError where a key exists already: a key in use is never overwritten.
     """
     allowed = directory / "allowed_clients"
-    written = [directory / f"{name}.{kind}" for name in ("server", "client") for kind in ("key", "key_secret")]
+    written = [
+        directory / f"{name}.{kind}"
+        for name in ("server", "client")
+        for kind in ("key", "key_secret")
+    ]
     written.append(allowed / "client.key")
     before = os.umask(OTHERS)
     try:
         there = [path for path in written if exists(path)]
         if there:
-            raise InputError(f"{there[0]}: exists already, and may be in use; choose another directory")
+            raise InputError(
+                f"{there[0]}: exists already, and may be in use; choose another directory"
+            )
         allowed.mkdir(parents=True, exist_ok=True)
         # All keys are made in a temporary directory, then renamed into place: an incomplete set is
         # useless.
@@ -106,10 +120,16 @@ def load_secret(path: Path) -> tuple[bytes, bytes]:
     """
     public, secret = _load(path)
     if secret is None:
-        raise InputError(f"{path}: contains no secret key; name the .key_secret file that `hilstar keys` made")
+        raise InputError(
+            f"{path}: contains no secret key; name the .key_secret file that `hilstar keys` made"
+        )
     mode = path.stat().st_mode
     if mode & OTHERS:
-        log.warning("%s: this secret key is readable by other users (mode %03o); run chmod 600 on it", path, mode & 0o777)
+        log.warning(
+            "%s: this secret key is readable by other users (mode %03o); run chmod 600 on it",
+            path,
+            mode & 0o777,
+        )
     return public, secret
 
 
@@ -140,7 +160,9 @@ class AllowList:
         self._directory = directory
         self._seen = self._look()
         if not self._seen:
-            raise InputError(f"{directory}: allowed_clients contains no *.key file; put each client's public key there")
+            raise InputError(
+                f"{directory}: allowed_clients contains no *.key file; put each client's public key there"
+            )
         self._keys = {load_public(path) for path in self._seen}
 
     def callback(self, domain: str, key: bytes) -> bool:

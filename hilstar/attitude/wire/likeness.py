@@ -33,7 +33,10 @@ FRAME_BYTES = protocol.ATTITUDE_BYTES + 1  # an attitude's COBS frame, without i
 HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])
 # in an attitude: version, kind, flags, sequence and t_ns precede it
 Q_AT = struct.calcsize("<BBHIq")
-HTTP = re.compile(rb"(?:GET|POST|PUT|HEAD|OPTIONS|DELETE|PATCH|CONNECT|TRACE) \S{1,300} HTTP/|HTTP/\d", re.IGNORECASE)
+HTTP = re.compile(
+    rb"(?:GET|POST|PUT|HEAD|OPTIONS|DELETE|PATCH|CONNECT|TRACE) \S{1,300} HTTP/|HTTP/\d",
+    re.IGNORECASE,
+)
 NMEA = re.compile(rb"[$!][A-Z]{2,5}[A-Z0-9]{0,8},")
 LEADING_TEXT = re.compile(rb"[\t\r\n\x20-\x7e]+")
 ZMTP_SIGNATURE_BYTES = 10  # 0xFF, eight of padding, 0x7F (rfc.zeromq.org, 23/ZMTP)
@@ -71,7 +74,10 @@ def likeness(data: bytes) -> Likeness:
     if not seen:
         return Likeness("nothing", known=False)
     if len(set(seen)) == 1 and len(seen) >= MIN_TEXT_BYTES:
-        return Likeness(f"the byte 0x{seen[0]:02x} {len(seen)} times", "check the line's polarity, ground and baud rate")
+        return Likeness(
+            f"the byte 0x{seen[0]:02x} {len(seen)} times",
+            "check the line's polarity, ground and baud rate",
+        )
     return Likeness(f"binary, {_in_hex(seen)}", known=False)
 
 
@@ -82,8 +88,15 @@ def packet_likeness(message: bytes) -> Likeness | None:
     body, given = message[:-CRC_BYTES], message[-CRC_BYTES:]
     crc = zlib.crc32(body)
     if given == crc.to_bytes(CRC_BYTES, "big"):
-        if len(message) == protocol.ATTITUDE_BYTES and _is_unit(message, "<") and not _is_unit(message, ">"):
-            return Likeness("its CRC-32 fits byte-swapped, and its other fields are little-endian", "swap the CRC-32's bytes")
+        if (
+            len(message) == protocol.ATTITUDE_BYTES
+            and _is_unit(message, "<")
+            and not _is_unit(message, ">")
+        ):
+            return Likeness(
+                "its CRC-32 fits byte-swapped, and its other fields are little-endian",
+                "swap the CRC-32's bytes",
+            )
         return Likeness("its CRC-32 fits byte-swapped: the packet is big-endian", LITTLE_ENDIAN)
     for order in ("little", "big"):
         name = _other_crc(body, int.from_bytes(given, order))
@@ -110,7 +123,11 @@ def _telling(message: bytes) -> Likeness | None:
 
 
 def _big_endian_numbers(message: bytes) -> Likeness | None:
-    if len(message) != protocol.ATTITUDE_BYTES or _is_unit(message, "<") or not _is_unit(message, ">"):
+    if (
+        len(message) != protocol.ATTITUDE_BYTES
+        or _is_unit(message, "<")
+        or not _is_unit(message, ">")
+    ):
         return None
     return Likeness("its quaternion is a unit one read as big-endian", LITTLE_ENDIAN)
 
@@ -140,7 +157,8 @@ def _other_crc(body: bytes, given: int) -> str:
         zlib.crc32(body) ^ ALL_ONES: "CRC-32/JAMCRC, which lacks the last inversion",
         forward: "CRC-32/BZIP2, whose bits are in the other order",
         forward ^ ALL_ONES: "CRC-32/MPEG-2, whose bits are in the other order",
-        _unreflected(words) ^ ALL_ONES: "that of an STM32's CRC unit as it starts: CRC-32/MPEG-2 of 32-bit words",
+        _unreflected(words)
+        ^ ALL_ONES: "that of an STM32's CRC unit as it starts: CRC-32/MPEG-2 of 32-bit words",
     }
     return names.get(given, "")
 
@@ -154,21 +172,33 @@ def _unreflected(body: bytes) -> int:
 def _protocol(data: bytes) -> Likeness | None:
     """Another protocol, by its first bytes."""
     if HTTP.match(data):
-        return Likeness(f"HTTP, {_quoted(data)}", "an HTTP client or server is there; give the sender's own address and port")
+        return Likeness(
+            f"HTTP, {_quoted(data)}",
+            "an HTTP client or server is there; give the sender's own address and port",
+        )
     if len(data) >= 3 and data[0] in TLS_RECORDS and data[1] == 3 and data[2] <= 4:
         return Likeness("TLS", "send without TLS; ZeroMQ has keys of its own (hilstar keys)")
-    if len(data) >= ZMTP_SIGNATURE_BYTES and data[0] == 0xFF and data[ZMTP_SIGNATURE_BYTES - 1] == 0x7F:
+    if (
+        len(data) >= ZMTP_SIGNATURE_BYTES
+        and data[0] == 0xFF
+        and data[ZMTP_SIGNATURE_BYTES - 1] == 0x7F
+    ):
         return Likeness("the greeting of a ZeroMQ socket", 'write source = "zmq" for it')
     return _protocol_of_vehicles(data)
 
 
 def _protocol_of_vehicles(data: bytes) -> Likeness | None:
     if NMEA.match(data):
-        return Likeness(f"NMEA 0183, {_quoted(data)}", "a GNSS or compass is on this line; give the simulator's")
+        return Likeness(
+            f"NMEA 0183, {_quoted(data)}", "a GNSS or compass is on this line; give the simulator's"
+        )
     if data.startswith(UBX):
         return Likeness("u-blox UBX", "a GNSS receiver is on this line; give the simulator's")
     if len(data) > 1 and len(data) - data[1] in MAVLINK.get(data[0], ()):
-        return Likeness("a MAVLink frame", "send hilstar's packets; docs/sources.md says how to bring a log of PX4")
+        return Likeness(
+            "a MAVLink frame",
+            "send hilstar's packets; docs/sources.md says how to bring a log of PX4",
+        )
     return None
 
 
@@ -178,7 +208,9 @@ def _packet_inside(data: bytes) -> Likeness | None:
     if unframed is not None:
         return unframed
     if any(_is_attitude_frame(body) for body in data.split(b"\0")):
-        return Likeness("a COBS frame, as on a serial line", "send the packet's 64 bytes as they are")
+        return Likeness(
+            "a COBS frame, as on a serial line", "send the packet's 64 bytes as they are"
+        )
     if len(data) == protocol.ATTITUDE_BYTES - CRC_BYTES and data[: len(HEAD)] == HEAD:
         return Likeness("an attitude without its CRC-32", ZLIB_CRC)
     return None
@@ -214,9 +246,13 @@ def frame_likeness(body: bytes) -> Likeness:
 def _beside_a_frame(before: bytes, after: bytes) -> Likeness:
     """What stands beside a whole frame where only a 0x00 belongs."""
     if after or not before:
-        return Likeness("COBS frames without an end", "send 0x00 after each, which COBS libraries do not add")
+        return Likeness(
+            "COBS frames without an end", "send 0x00 after each, which COBS libraries do not add"
+        )
     what = "a line end" if before.isspace() else f"{likeness(before).what}, stands"
-    return Likeness(f"{what} before a frame", "send nothing between one frame's 0x00 and the next frame")
+    return Likeness(
+        f"{what} before a frame", "send nothing between one frame's 0x00 and the next frame"
+    )
 
 
 def _is_attitude_frame(body: bytes) -> bool:
@@ -238,25 +274,35 @@ def _serialised(data: bytes) -> Likeness | None:
     if len(data) > 2 and data[0] == 0x80 and data[1] in PICKLE_PROTOCOLS:
         return Likeness("a Python pickle", "send json.dumps of the object")
     if b"t_ns" in data and LEADING_TEXT.fullmatch(data) is None:
-        return Likeness("an object in a binary form, such as MessagePack or CBOR", "send it as JSON text")
+        return Likeness(
+            "an object in a binary form, such as MessagePack or CBOR", "send it as JSON text"
+        )
     for at in (0, 8) if len(data) in {32, 40, 56, 64} else ():
         for order, name in (("<", "little"), (">", "big")):
             if at + 32 <= len(data) and _unit_at(data, at, order):
-                return Likeness(f"a bare quaternion of {name}-endian float64", "put it into hilstar's packet, or send JSON")
+                return Likeness(
+                    f"a bare quaternion of {name}-endian float64",
+                    "put it into hilstar's packet, or send JSON",
+                )
     return None
 
 
 def _text(data: bytes) -> Likeness | None:
     """Text, of one kind or another."""
     text = data.removeprefix(b"\xef\xbb\xbf")
-    if data[:2] in {b"\xff\xfe", b"\xfe\xff"} or (len(data) >= 2 * MIN_TEXT_BYTES and not any(data[1::2]) and all(data[::2])):
+    if data[:2] in {b"\xff\xfe", b"\xfe\xff"} or (
+        len(data) >= 2 * MIN_TEXT_BYTES and not any(data[1::2]) and all(data[::2])
+    ):
         return Likeness("UTF-16 text", "write it as UTF-8")
     leading = LEADING_TEXT.match(text)
     length = 0 if leading is None else len(leading[0])
     if length == len(text) >= MIN_TEXT_BYTES or (length and _is_utf8(text)):
         return _kind_of_text(text)
     if length >= MIN_LEADING_TEXT_BYTES and leading is not None:
-        return Likeness(f"text before binary, {_quoted(leading[0])}", "let nothing but packets go over this line")
+        return Likeness(
+            f"text before binary, {_quoted(leading[0])}",
+            "let nothing but packets go over this line",
+        )
     return None
 
 
@@ -277,7 +323,10 @@ def _kind_of_text(text: bytes) -> Likeness:
     if start == b"{":
         return Likeness(f"JSON, {quoted}")
     if b"{" in text and b'"q"' in text:
-        return Likeness(f"text before JSON, {quoted}", "send a topic as a part of its own, before the JSON, or leave it out")
+        return Likeness(
+            f"text before JSON, {quoted}",
+            "send a topic as a part of its own, before the JSON, or leave it out",
+        )
     return Likeness(f"text, {quoted}")
 
 

@@ -70,7 +70,9 @@ class FloodGate:
         self._seen_ns = clock.now_ns()
         self._dropped_ns = self._seen_ns - OVER_NS - 1
 
-    def newest(self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]) -> list[RawMessage]:
+    def newest(
+        self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]
+    ) -> list[RawMessage]:
         """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses
         where others are passed over.
 
@@ -78,7 +80,9 @@ class FloodGate:
         attitude is interpolated across it.
         """
         now_ns = self._clock.now_ns()
-        self._left = min(self._left + (now_ns - self._seen_ns) * MAX_PACKETS_PER_S / NS_PER_S, MAX_BURST)
+        self._left = min(
+            self._left + (now_ns - self._seen_ns) * MAX_PACKETS_PER_S / NS_PER_S, MAX_BURST
+        )
         self._seen_ns = now_ns
         passed_over = max(len(waiting) - int(self._left), 0)
         self._left -= len(waiting) - passed_over
@@ -87,7 +91,9 @@ class FloodGate:
         self._counts.flooded += passed_over
         if now_ns - self._dropped_ns > OVER_NS:
             limits = f"over {MAX_PACKETS_PER_S} packets per second, or {MAX_BURST} at once"
-            self._notices.tell("flood", f"{limits}: taking the newest, passing over the others unread")
+            self._notices.tell(
+                "flood", f"{limits}: taking the newest, passing over the others unread"
+            )
         self._dropped_ns = now_ns
         self._clock.sleep(PAUSE_S)
         for k in range(passed_over - 1, max(passed_over - MAX_LOOKED_AT, 0) - 1, -1):

@@ -37,7 +37,9 @@ from hilstar.basics.units import NS_PER_S
 MAX_MESSAGE_BYTES = 65_536  # 42's own buffer holds 16 384
 TOO_LONG = b""
 END = re.compile(rb"^\[(?:ENDMSG|EOF)\][^\n]*\n", re.MULTILINE)
-TIME = re.compile(r"^TIME +(\d{4})-(\d{1,3})-(\d{1,2}):(\d{1,2}):(\d{1,2})(?:\.(\d{1,9})\d*)?\s*$", re.MULTILINE)
+TIME = re.compile(
+    r"^TIME +(\d{4})-(\d{1,3})-(\d{1,2}):(\d{1,2}):(\d{1,2})(?:\.(\d{1,9})\d*)?\s*$", re.MULTILINE
+)
 SPACECRAFT = re.compile(r"(?:SC\[)?(\d{1,3})\]?")
 EPOCH_DAY = date(1970, 1, 1).toordinal()
 SECONDS_PER_DAY = 86_400
@@ -73,7 +75,9 @@ def spacecraft_number(name: str | int | None) -> int:
     """The number of the spacecraft that 0 or "SC[0]" names; 0 for None. Raises InputError."""
     match = SPACECRAFT.fullmatch(str(0 if name is None else name))
     if match is None:
-        raise InputError(f'spacecraft = "{shortened(name)}": write 42\'s number of it, such as spacecraft = "SC[0]"')
+        raise InputError(
+            f'spacecraft = "{shortened(name)}": write 42\'s number of it, such as spacecraft = "SC[0]"'
+        )
     return int(match[1])
 
 
@@ -100,7 +104,11 @@ class MessageSplitter:
             self._line = self._kept.rfind(b"\n") + 1
         if len(self._kept) > MAX_MESSAGE_BYTES:
             # The last line may be the beginning of the end.
-            self._overlong, self._kept, self._line = True, self._kept[self._line :][:MAX_MESSAGE_BYTES], 0
+            self._overlong, self._kept, self._line = (
+                True,
+                self._kept[self._line :][:MAX_MESSAGE_BYTES],
+                0,
+            )
         return messages
 
 
@@ -120,17 +128,24 @@ class MessageReader:
         """The camera's attitude that a whole message holds, or why there is none."""
         self._sequence += 1
         if message == TOO_LONG:
-            return Refusal("format", f"a message of over {MAX_MESSAGE_BYTES} bytes; write fewer prefixes in Inp_IPC.txt")
+            return Refusal(
+                "format",
+                f"a message of over {MAX_MESSAGE_BYTES} bytes; write fewer prefixes in Inp_IPC.txt",
+            )
         text = message.decode("latin-1")
         t_ns = _time_ns(text)
         if t_ns is None:
             return Refusal("format", f"no TIME YYYY-DDD-hh:mm:ss, but {text[:SHOWN_CHARACTERS]!r}")
         try:
-            found = {name: tuple(map(float, values.split())) for name, values in self._line.findall(text)}
+            found = {
+                name: tuple(map(float, values.split())) for name, values in self._line.findall(text)
+            }
         except ValueError:
             found = {"qn": ()}
         if "qn" not in found:
-            return Refusal("format", f'no {self._name}.qn; write the prefix "{self._name}" in Inp_IPC.txt')
+            return Refusal(
+                "format", f'no {self._name}.qn; write the prefix "{self._name}" in Inp_IPC.txt'
+            )
         q, rate = found["qn"], found.get("wn", ())
         if len(q) != 4 or len(rate) not in {0, 3}:
             return Refusal("format", f"{self._name}.qn must have four numbers, and wn three")
@@ -174,10 +189,15 @@ class _Connection(Link):
         place = parse_endpoint(endpoint)
         check_use(place, endpoint, bind=bind)
         if place.path is not None:
-            raise InputError(f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001")
+            raise InputError(
+                f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001"
+            )
         self.endpoint, self.verb = endpoint, "bound to" if bind else "connecting to"
         host, _, port = place.address.removeprefix("tcp://").rpartition(":")
-        self._place = "0.0.0.0" if host == "*" else host.strip("[]"), 0 if port == "*" else int(port)
+        self._place = (
+            "0.0.0.0" if host == "*" else host.strip("[]"),
+            0 if port == "*" else int(port),
+        )
         self._reader, self._splitter = reader, MessageSplitter()
         self._allowed = AllowedSenders() if allowed is None else allowed
         self._connection: socket.socket | None = None
@@ -186,9 +206,13 @@ class _Connection(Link):
         if bind:
             six = ":" in self._place[0]
             try:
-                self._listener = socket.create_server(self._place, family=socket.AF_INET6 if six else socket.AF_INET)
+                self._listener = socket.create_server(
+                    self._place, family=socket.AF_INET6 if six else socket.AF_INET
+                )
             except OSError as error:
-                raise InputError(f"{endpoint}: cannot bind ({error.strerror}); write another address or port") from error
+                raise InputError(
+                    f"{endpoint}: cannot bind ({error.strerror}); write another address or port"
+                ) from error
             self._listener.setblocking(False)
             bound = f"[{self._place[0]}]" if six else self._place[0]
             self.endpoint = f"tcp://{bound}:{self._listener.getsockname()[1]}"
@@ -210,15 +234,25 @@ class _Connection(Link):
             if chunk:
                 whole = self._splitter.feed(chunk)
                 # The kernel's stamp is that of the last.
-                return [RawMessage(host_ns, [m], self._stamps.empty_ns, k == len(whole)) for k, m in enumerate(whole, 1)]
+                return [
+                    RawMessage(host_ns, [m], self._stamps.empty_ns, k == len(whole))
+                    for k, m in enumerate(whole, 1)
+                ]
             self.link_counts.lost += 1
-            self._notices.tell("lost", f"{self.endpoint}: 42 closed the connection; waiting for it to come back")
+            self._notices.tell(
+                "lost", f"{self.endpoint}: 42 closed the connection; waiting for it to come back"
+            )
             self._shut()
         self._accept()
         return []
 
     def arrival(self, message: RawMessage) -> Arrival[Event]:
-        return Arrival(message.host_ns, self._reader.decode(message.parts[0]), message.parts[0], message.waited_ns)
+        return Arrival(
+            message.host_ns,
+            self._reader.decode(message.parts[0]),
+            message.parts[0],
+            message.waited_ns,
+        )
 
     def acknowledge(self, count: int = 1) -> None:
         """Let 42 compute on: it waits after each message."""
@@ -243,11 +277,15 @@ class _Connection(Link):
             if not self._allowed.admits(peer[0]):
                 self.link_counts.rejected += 1
                 self._notices.begin(
-                    "sender-not-allowed", f"a connection from {peer[0]} is closed: it is not in [attitude] allow"
+                    "sender-not-allowed",
+                    f"a connection from {peer[0]} is closed: it is not in [attitude] allow",
                 )
             elif self._connection is not None:
                 self.link_counts.refused += 1
-                self._notices.tell("connections-refused", f"a second connection, from {peer[0]}, is closed; 42 has one already")
+                self._notices.tell(
+                    "connections-refused",
+                    f"a second connection, from {peer[0]}, is closed; 42 has one already",
+                )
             else:
                 self._take(made)
                 continue

@@ -34,7 +34,13 @@ import msgspec
 from cobs import cobs
 
 from hilstar.attitude.wire import protocol
-from hilstar.attitude.wire.likeness import Likeness, frame_likeness, likeness, numbers_likeness, packet_likeness
+from hilstar.attitude.wire.likeness import (
+    Likeness,
+    frame_likeness,
+    likeness,
+    numbers_likeness,
+    packet_likeness,
+)
 from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
 if TYPE_CHECKING:
@@ -46,7 +52,9 @@ MAX_JSON_BYTES = 4096
 INT64 = range(-(2**63), 2**63)
 U32 = 2**32
 MESSAGE_FORM = f"send an attitude of {protocol.ATTITUDE_BYTES} bytes or a JSON object"
-FRAME_FORM = f"send attitudes of {protocol.ATTITUDE_BYTES} bytes as COBS frames, each followed by 0x00"
+FRAME_FORM = (
+    f"send attitudes of {protocol.ATTITUDE_BYTES} bytes as COBS frames, each followed by 0x00"
+)
 JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
 UNIT = 1e-15  # this close, dividing by the norm would only move the last bit
 
@@ -176,19 +184,32 @@ def encode(packet: Packet) -> bytes:
             flags = 0 if rate is None else protocol.FLAG_RATE_VALID
             flags |= protocol.FLAG_DISCONTINUITY if packet.discontinuity else 0
             head = (VERSION, protocol.KIND_ATTITUDE, flags, packet.sequence % U32, packet.t_ns)
-            body = protocol.ATTITUDE_BODY.pack(*head, *packet.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate))
+            body = protocol.ATTITUDE_BODY.pack(
+                *head, *packet.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate)
+            )
         case TimeRequest(sequence, t1_ns):
-            body = protocol.TIME_REQUEST_BODY.pack(VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns)
+            body = protocol.TIME_REQUEST_BODY.pack(
+                VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns
+            )
         case TimeReply(sequence):
             times = (packet.t1_ns, packet.t2_ns, packet.t3_ns)
-            body = protocol.TIME_REPLY_BODY.pack(VERSION, protocol.KIND_TIME_REPLY, 0, sequence % U32, *times)
+            body = protocol.TIME_REPLY_BODY.pack(
+                VERSION, protocol.KIND_TIME_REPLY, 0, sequence % U32, *times
+            )
         case Status():
             counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
-            held = (min(max(t_ns, INT64[0]), INT64[-1]) for t_ns in (packet.light_t_ns, packet.attitude_age_ns))
-            body = protocol.STATUS_BODY.pack(VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32, *held, *counts)
+            held = (
+                min(max(t_ns, INT64[0]), INT64[-1])
+                for t_ns in (packet.light_t_ns, packet.attitude_age_ns)
+            )
+            body = protocol.STATUS_BODY.pack(
+                VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32, *held, *counts
+            )
         case AnswerPacket():
             head = (VERSION, protocol.KIND_ANSWER, packet.flags, packet.sequence % U32, packet.t_ns)
-            body = protocol.ANSWER_BODY.pack(*head, *packet.q_icrs_to_cam, *packet.rate_cam_rad_s, packet.stars)
+            body = protocol.ANSWER_BODY.pack(
+                *head, *packet.q_icrs_to_cam, *packet.rate_cam_rad_s, packet.stars
+            )
     return body + CRC.pack(zlib.crc32(body))
 
 
@@ -207,9 +228,13 @@ def _decode_packet(message: bytes, form: str) -> Event:
         return named_refusal("format", f"{len(message)} bytes", likeness(message), form)
     if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
         detail, found = "the CRC-32 does not match the packet", packet_likeness(message)
-        return Refusal("crc", detail) if found is None else named_refusal("crc", detail, found, form)
+        return (
+            Refusal("crc", detail) if found is None else named_refusal("crc", detail, found, form)
+        )
     if len(message) != size:
-        return Refusal("format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1")
+        return Refusal(
+            "format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1"
+        )
     return _decode_body(head[1], message)
 
 
@@ -221,7 +246,10 @@ def named_refusal(reason: Reason, detail: str, found: Likeness, form: str) -> Re
 def declares_discontinuity(message: bytes) -> bool:
     """Whether a message is an attitude that must not be interpolated to; quick where it is not."""
     if message[:2] == ATTITUDE_HEAD:
-        if len(message) != protocol.ATTITUDE_BYTES or not message[len(ATTITUDE_HEAD)] & protocol.FLAG_DISCONTINUITY:
+        if (
+            len(message) != protocol.ATTITUDE_BYTES
+            or not message[len(ATTITUDE_HEAD)] & protocol.FLAG_DISCONTINUITY
+        ):
             return False
     elif b"discontinuity" not in message[:MAX_JSON_BYTES]:
         return False
@@ -238,10 +266,14 @@ def _decode_body(kind: int, message: bytes) -> Event:
         return Status(*protocol.STATUS_BODY.unpack_from(message)[2:])
     if kind == protocol.KIND_ANSWER:
         _, _, flags, sequence, t_ns, *numbers = protocol.ANSWER_BODY.unpack_from(message)
-        return AnswerPacket(sequence, flags, t_ns, tuple(numbers[:4]), tuple(numbers[4:7]), numbers[7])
+        return AnswerPacket(
+            sequence, flags, t_ns, tuple(numbers[:4]), tuple(numbers[4:7]), numbers[7]
+        )
     _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
     known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
-    event = checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))
+    event = checked_sample(
+        t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY)
+    )
     if isinstance(event, Refusal) and (found := numbers_likeness(message)) is not None:
         return named_refusal(event.reason, event.detail, found, MESSAGE_FORM)
     return event
@@ -253,7 +285,11 @@ def is_unset(q: tuple[float, ...]) -> bool:
 
 
 def checked_sample(
-    t_ns: int, q: tuple[float, ...], rate: tuple[float, ...] | None, sequence: int = 0, discontinuity: bool = False
+    t_ns: int,
+    q: tuple[float, ...],
+    rate: tuple[float, ...] | None,
+    sequence: int = 0,
+    discontinuity: bool = False,
 ) -> AttitudeSample | Refusal:
     """A sample from raw numbers, or why they are not one: every source of attitudes passes
     through here.
@@ -263,18 +299,28 @@ def checked_sample(
     if not all(map(math.isfinite, (*q, *(rate or ())))):
         return Refusal("nan", "a quaternion or rate component is not finite", unset=is_unset(q))
     if rate is not None and math.hypot(*rate) > FASTEST_RAD_S:
-        return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; the maximum is {FASTEST_RAD_S:g}")
+        return Refusal(
+            "format", f"a rate of {math.hypot(*rate):.3g} rad/s; the maximum is {FASTEST_RAD_S:g}"
+        )
     norm = math.hypot(*q)
     if abs(norm - 1.0) > NORM_TOLERANCE:
         return Refusal(
-            "norm", f"the quaternion's norm is {norm:.6g}; it must be 1 within {NORM_TOLERANCE:g}", unset=is_unset(q)
+            "norm",
+            f"the quaternion's norm is {norm:.6g}; it must be 1 within {NORM_TOLERANCE:g}",
+            unset=is_unset(q),
         )
     if t_ns not in INT64:
         return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
     unit = np.array(q, dtype=np.float64)
     if abs(norm - 1.0) > UNIT:
         unit /= norm
-    return AttitudeSample(t_ns, unit, None if rate is None else np.array(rate, dtype=np.float64), sequence, discontinuity)
+    return AttitudeSample(
+        t_ns,
+        unit,
+        None if rate is None else np.array(rate, dtype=np.float64),
+        sequence,
+        discontinuity,
+    )
 
 
 def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | None:
@@ -293,7 +339,9 @@ def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | Non
 
 def _decode_json(message: bytes) -> AttitudeSample | Refusal:
     if len(message) > MAX_JSON_BYTES:
-        return Refusal("format", f"more than {MAX_JSON_BYTES} bytes of JSON; send an attitude alone")
+        return Refusal(
+            "format", f"more than {MAX_JSON_BYTES} bytes of JSON; send an attitude alone"
+        )
     try:
         form = _json_decoder.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
@@ -365,15 +413,30 @@ class StreamDecoder:
 def decode_frame(body: bytes) -> Event:
     """What a frame says, or why it says nothing."""
     if len(body) > MAX_FRAME_BYTES:
-        return named_refusal("format", f"no 0x00 within {MAX_FRAME_BYTES} bytes", frame_likeness(body), FRAME_FORM)
+        return named_refusal(
+            "format", f"no 0x00 within {MAX_FRAME_BYTES} bytes", frame_likeness(body), FRAME_FORM
+        )
     try:
         message = cobs.decode(body)
     except cobs.DecodeError as error:
-        return named_refusal("format", f"not COBS ({error})", frame_likeness(body), f"{FRAME_FORM}, at this line's baud rate")
+        return named_refusal(
+            "format",
+            f"not COBS ({error})",
+            frame_likeness(body),
+            f"{FRAME_FORM}, at this line's baud rate",
+        )
     if message.lstrip()[:1] == b"{":
-        return Refusal("format", f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ or UDP", telling=True)
+        return Refusal(
+            "format",
+            f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ or UDP",
+            telling=True,
+        )
     event = _decode_packet(message, FRAME_FORM)
-    if isinstance(event, Refusal) and event.reason == "format" and (found := frame_likeness(body)).known:
+    if (
+        isinstance(event, Refusal)
+        and event.reason == "format"
+        and (found := frame_likeness(body)).known
+    ):
         return named_refusal("format", f"{len(message)} bytes", found, FRAME_FORM)
     return event
 
@@ -381,7 +444,9 @@ def decode_frame(body: bytes) -> Event:
 def unended_line(data: bytes) -> str:
     """Why bytes of a serial line gave no packet, though no frame of theirs has ended."""
     found = frame_likeness(data)
-    return f"{len(data)} bytes came, and no frame ended: {found.what}; {found.instead or FRAME_FORM}"
+    return (
+        f"{len(data)} bytes came, and no frame ended: {found.what}; {found.instead or FRAME_FORM}"
+    )
 
 
 def frame_declares_discontinuity(body: bytes) -> bool:

@@ -64,8 +64,16 @@ def adapters() -> list[str]:
     (0403:6001)".
     """
     ports = sorted(list_ports.comports())
-    words = [f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})" if port.vid is not None else "UART" for port in ports]
-    return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
+    words = [
+        f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
+        if port.vid is not None
+        else "UART"
+        for port in ports
+    ]
+    return [
+        f"{words.count(word)} x {word}" if words.count(word) > 1 else word
+        for word in dict.fromkeys(words)
+    ]
 
 
 def open_port(port: str, baud: int) -> serial.Serial:
@@ -143,9 +151,14 @@ class SerialLink(StreamLink):
             bodies = self._decoder.frames(chunk.parts[0])
             # frames before the chunk's last were there earlier, and waited for it
             for k, body in enumerate(bodies, 1):
-                waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
+                waiting.append(
+                    chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies))
+                )
         taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
-        return [Arrival(each.host_ns, self._event(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
+        return [
+            Arrival(each.host_ns, self._event(each.parts[0]), each.parts[0], each.waited_ns)
+            for each in taken
+        ]
 
     def _event(self, body: bytes) -> wire.Event:
         """What a frame says. One that says nothing may be a piece of a packet that was not
@@ -155,7 +168,11 @@ class SerialLink(StreamLink):
         if not isinstance(event, wire.Refusal) or event.reason != "format":
             return event
         unframed = unframed_packet(self._recent)
-        return event if unframed is None else wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
+        return (
+            event
+            if unframed is None
+            else wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
+        )
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
@@ -169,7 +186,9 @@ class SerialLink(StreamLink):
         """True once unread bytes wait."""
         device = self._device
         try:
-            return device is not None and bool(select.select([device.fileno()], [], [], timeout_ms / 1000)[0])
+            return device is not None and bool(
+                select.select([device.fileno()], [], [], timeout_ms / 1000)[0]
+            )
         except (OSError, ValueError, TypeError):  # gone: `receive` notices, and reports it
             return False
 
@@ -216,7 +235,9 @@ class SerialLink(StreamLink):
 
     def _lose(self, why: str) -> None:
         self.link_counts.lost += 1
-        self._notices.tell("lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back")
+        self._notices.tell(
+            "lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back"
+        )
         self._shut()
         self._retry.put_off(anew=True)
 
@@ -305,9 +326,13 @@ def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError
         if not port.startswith("/") and Path("/dev", port).exists():
             return InputError(f"{where}: no such file; write /dev/{port}")
         here = ", ".join(serial_ports()) or "none"
-        return NotThereError(f"{where}: no such device; plug it in, or write another serial port (there now: {here})")
+        return NotThereError(
+            f"{where}: no such device; plug it in, or write another serial port (there now: {here})"
+        )
     if "://" in port and NO_SERVER.search(str(error)):
-        return NotThereError(f"{where}: {one_line(str(error))}; start the server of that port, or write another port")
+        return NotThereError(
+            f"{where}: {one_line(str(error))}; start the server of that port, or write another port"
+        )
     return InputError(f"{where}: {_opening_fault(error, port)}")
 
 
@@ -325,7 +350,9 @@ def _opening_fault(error: BaseException, port: str) -> str:
     return f"{' '.join(str(getattr(error, 'strerror', None) or error).split())}; {instead}"
 
 
-def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLOCK) -> Iterator[tuple[int, bytes]]:
+def read_lines(
+    port: str, baud: int, seconds: float, clock: HostClock = HOST_CLOCK
+) -> Iterator[tuple[int, bytes]]:
     """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within
     `seconds`.
 
@@ -343,7 +370,9 @@ def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLO
             try:
                 byte = device.read(1)
             except (OSError, TypeError) as error:
-                raise InputError(f"{name}: disconnected ({error}); plug it in and start again") from error
+                raise InputError(
+                    f"{name}: disconnected ({error}); plug it in and start again"
+                ) from error
             if byte == b"\n":
                 wire_ns = (len(line) + 1) * BITS_PER_BYTE * NS_PER_S // baud
                 yield clock.now_ns() - wire_ns, line.strip()

@@ -76,7 +76,11 @@ _heads = msgspec.json.Decoder(FrameHead)
 def frame_parts(frame: ShownFrame) -> list[bytes]:
     """The parts of a frame's message."""
     kind = "<u1" if frame.head.bits <= 8 else "<u2"
-    return [msgspec.json.encode(frame.head), frame.lit.astype("<u4").tobytes(), frame.codes.astype(kind).tobytes()]
+    return [
+        msgspec.json.encode(frame.head),
+        frame.lit.astype("<u4").tobytes(),
+        frame.codes.astype(kind).tobytes(),
+    ]
 
 
 def read_frame(parts: list[bytes]) -> ShownFrame | str:
@@ -91,14 +95,18 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
     head = _heads.decode(first)
     sizes = 0 < head.width <= MAX_SIDE_PX and 0 < head.height <= MAX_SIDE_PX
     if not (sizes and 1 <= head.bits <= 16 and head.channels in {1, 3}):
-        raise ValueError(f"{head.width} x {head.height} pixels of {head.channels} x {head.bits} bits")
+        raise ValueError(
+            f"{head.width} x {head.height} pixels of {head.channels} x {head.bits} bits"
+        )
     if head.q is not None and not abs(float(np.linalg.norm(head.q)) - 1) <= NORM_TOLERANCE:
         raise ValueError("its quaternion is not unit")
     lit = np.frombuffer(indices, dtype="<u4")
     if len(lit) and not (lit[-1] < head.width * head.height and (lit[1:] > lit[:-1]).all()):
         raise ValueError("its indices do not rise within the image")
     codes = np.frombuffer(values, dtype="<u1" if head.bits <= 8 else "<u2")
-    return ShownFrame(head, lit, codes.reshape(len(lit), 3) if head.channels == 3 else codes.reshape(len(lit)))
+    return ShownFrame(
+        head, lit, codes.reshape(len(lit), 3) if head.channels == 3 else codes.reshape(len(lit))
+    )
 
 
 class FrameSender(ZmqSender):

@@ -75,7 +75,11 @@ class Convention(Table, frozen=True):
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
         """The sample with its quaternion from ICRS to its frame; its rate is what it was."""
-        return sent if self.is_hilstars else replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
+        return (
+            sent
+            if self.is_hilstars
+            else replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
+        )
 
     def __str__(self) -> str:
         """As a bench file has it."""
@@ -207,7 +211,11 @@ class SentAttitudes:
 
     def as_sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """What the sender sends for an attitude (4,) of the camera."""
-        q = q_icrs_to_cam if self._mounting is None else self._mounting.q_icrs_to_body(q_icrs_to_cam)
+        q = (
+            q_icrs_to_cam
+            if self._mounting is None
+            else self._mounting.q_icrs_to_body(q_icrs_to_cam)
+        )
         return self.convention.as_sent(q)
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
@@ -236,7 +244,10 @@ def packet_conventions(
     """The conventions of packets, JSON and the logs that are written like them; `reference` is what
     attitudes refer to.
     """
-    frames = [f"{reference} components", "body components" if convention.frame == "body" else "camera components"]
+    frames = [
+        f"{reference} components",
+        "body components" if convention.frame == "body" else "camera components",
+    ]
     names = ["icrs" if reference == "ICRS" else "reference", convention.frame]
     if convention.direction == "cam_to_icrs":
         frames, names = frames[::-1], names[::-1]

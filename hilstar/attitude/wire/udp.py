@@ -28,7 +28,15 @@ from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
 from hilstar.attitude.wire.links import PAUSE_S, Arrival, RawMessage, StreamLink
-from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
+from hilstar.attitude.wire.packet import (
+    MAX_JSON_BYTES,
+    Event,
+    Packet,
+    Status,
+    declares_discontinuity,
+    decode,
+    encode,
+)
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -78,7 +86,9 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
         words = range(0, len(address), WORD_BYTES) if network.version == version else ()
         # each word of the source address must be the network's, else go on after this network
         for k, at in enumerate(words):
-            wanted, bits = (int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask))
+            wanted, bits = (
+                int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask)
+            )
             code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
             code.append(INSTRUCTION.pack(AND, 0, 0, bits))
             code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, 3 * (len(words) - k - 1) + 1, wanted))
@@ -99,7 +109,9 @@ class KernelStamps:
         with contextlib.suppress(OSError):
             receiving.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
 
-    def arrived_ns(self, ancillary: list[tuple[int, int, bytes]], now_ns: int, offset_ns: int | None = None) -> int:
+    def arrived_ns(
+        self, ancillary: list[tuple[int, int, bytes]], now_ns: int, offset_ns: int | None = None
+    ) -> int:
         """When something came, from what `recvmsg` told at `now_ns`.
 
         A realtime clock that was set meanwhile moves it by no more than it waited.
@@ -108,7 +120,9 @@ class KernelStamps:
         for _, kind, stamp in ancillary:
             if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
                 seconds, ns = TIMESPEC.unpack(stamp)
-                offset_ns = self._clock.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
+                offset_ns = (
+                    self._clock.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
+                )
                 stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
                 return min(max(stamped_ns, self.empty_ns), now_ns)
         return now_ns
@@ -130,15 +144,22 @@ class Datagrams:
     @classmethod
     def bound(cls, place: UdpPlace, clock: HostClock = HOST_CLOCK) -> "Datagrams":
         """Bound to a place. Raises InputError where it cannot be."""
-        made = socket.socket(socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
+        made = socket.socket(
+            socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM
+        )
         try:
             if place.host.version == 6:
                 made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            found = socket.getaddrinfo(str(place.host), place.port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)
+            found = socket.getaddrinfo(
+                str(place.host), place.port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST
+            )
             made.bind(found[0][4])
         except OSError as error:
             made.close()
-            trouble = TROUBLE.get(error.errno or 0, f"cannot bind ({error.strerror}); write an address of this machine")
+            trouble = TROUBLE.get(
+                error.errno or 0,
+                f"cannot bind ({error.strerror}); write an address of this machine",
+            )
             raise InputError(f"{place}: {trouble}") from error
         return cls(made, clock)
 
@@ -176,7 +197,9 @@ class Datagrams:
         for _ in range(count):
             asked_ns = self._clock.now_ns()
             try:
-                data, ancillary, _, sender = self._socket.recvmsg(MAX_DATAGRAM_BYTES, ANCILLARY_BYTES)
+                data, ancillary, _, sender = self._socket.recvmsg(
+                    MAX_DATAGRAM_BYTES, ANCILLARY_BYTES
+                )
             except BlockingIOError:
                 self._stamps.empty_ns = asked_ns
                 break
@@ -298,7 +321,9 @@ class UdpLink(StreamLink):
         for host_ns, (data,), _, _, sender in admitted:
             peer = sender or ()
             self._credit.earn(peer, len(data))
-            arrivals.append(Arrival(host_ns, self._decode(data), data, back=partial(self._answer, peer)))
+            arrivals.append(
+                Arrival(host_ns, self._decode(data), data, back=partial(self._answer, peer))
+            )
         return arrivals
 
     def _look(self, strangers: int) -> None:

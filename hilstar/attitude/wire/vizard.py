@@ -27,7 +27,14 @@ from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.endpoint import parse_endpoint
 from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
 from hilstar.attitude.wire.source import Conventions, Mounting
-from hilstar.attitude.wire.vizard_message import Components, SimUpdate, VizBody, VizCamera, WireFormatError, decode_update
+from hilstar.attitude.wire.vizard_message import (
+    Components,
+    SimUpdate,
+    VizBody,
+    VizCamera,
+    WireFormatError,
+    decode_update,
+)
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqSocket
 from hilstar.basics.arrays import FloatArray
@@ -159,7 +166,13 @@ class Follower:
     place and velocity about the Earth.
     """
 
-    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, taken: StateUse = "attitude") -> None:
+    def __init__(
+        self,
+        name: str | None,
+        mounting: Mounting,
+        rates: DifferenceRates,
+        taken: StateUse = "attitude",
+    ) -> None:
         self._name, self._mounting, self._rates = name, mounting, rates
         self._taken = taken
         self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
@@ -178,7 +191,9 @@ class Follower:
         if len(chosen.sigma_bn) != 3:
             what = f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
             return wire.Refusal("format", what), update
-        sample = wire.checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % wire.U32)
+        sample = wire.checked_sample(
+            update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % wire.U32
+        )
         state = self._state(update, chosen)
         if isinstance(state, wire.Refusal):
             return state, update
@@ -187,7 +202,9 @@ class Follower:
             sample = self._mounting.sample(self._rates.moving(sample))
         return sample, update
 
-    def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | wire.Refusal:
+    def _state(
+        self, update: SimUpdate, craft: VizBody
+    ) -> tuple[FloatArray | None, FloatArray | None] | wire.Refusal:
         """Place (3,), km, and velocity (3,), km/s, as far as they are taken, or why they are not.
 
         A "state" is about the Earth's centre: where the message has it, else at N's origin. A
@@ -198,19 +215,26 @@ class Follower:
         place_m, velocity_m_s = craft.position_m, craft.velocity_m_s
         if self._taken == "state":
             earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
-            place_m, velocity_m_s = _against(place_m, earth.position_m), _against(velocity_m_s, earth.velocity_m_s)
+            place_m, velocity_m_s = (
+                _against(place_m, earth.position_m),
+                _against(velocity_m_s, earth.velocity_m_s),
+            )
         speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
         if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
             told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
             advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
-            return wire.Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
+            return wire.Refusal(
+                "format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}"
+            )
         velocity = np.array(velocity_m_s) / M_PER_KM
         if self._taken == "velocity":
             return None, velocity
         if len(place_m) == 3 and wire.MIN_PLACE_KM < far_km < wire.MAX_PLACE_KM:
             return np.array(place_m) / M_PER_KM, velocity
         told = f"{far_km:.4g} km from the Earth's centre" if place_m else "nowhere"
-        advice = f'[spacecraft] orbit = "source" takes {wire.MIN_PLACE_KM:g} to {wire.MAX_PLACE_KM:g} km'
+        advice = (
+            f'[spacecraft] orbit = "source" takes {wire.MIN_PLACE_KM:g} to {wire.MAX_PLACE_KM:g} km'
+        )
         return wire.Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
     def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | wire.Refusal:
@@ -223,11 +247,20 @@ class Follower:
             found = [craft for craft in spacecraft if craft.name == self._name]
         if len(found) == 1:
             return found[0]
-        names = ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES])) or "none"
+        names = (
+            ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES]))
+            or "none"
+        )
         if self._name is None:
-            return wire.Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
+            return wire.Refusal(
+                "format",
+                f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"',
+            )
         wanted = shortened(printable(self._name))
-        return wire.Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
+        return wire.Refusal(
+            "format",
+            f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}",
+        )
 
 
 def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
@@ -236,7 +269,9 @@ def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
     """
     if len(camera.sigma) != 3 or not all(map(math.isfinite, camera.sigma)):
         return None
-    cam_to_unity, body_to_unity = (np.array(quaternion_of_mrp(s)) for s in (SIGMA_CAM_TO_UNITY, camera.sigma))
+    cam_to_unity, body_to_unity = (
+        np.array(quaternion_of_mrp(s)) for s in (SIGMA_CAM_TO_UNITY, camera.sigma)
+    )
     return multiply(conjugate(cam_to_unity), body_to_unity)
 
 
@@ -250,12 +285,20 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
         turn_arcsec = angle_between_rad(mounted, tracker.q_body_to_cam) * ARCSEC_PER_RAD
         if turn_arcsec > MAX_TURN_ARCSEC:
             q = ", ".join(f"{c:.7f}" for c in mounted)
-            differences.append(f"its sigma_CB is q_body_to_cam = ({q}), {turn_arcsec / 3600:.4g} deg from the bench's")
+            differences.append(
+                f"its sigma_CB is q_body_to_cam = ({q}), {turn_arcsec / 3600:.4g} deg from the bench's"
+            )
     if camera.resolution_px and camera.resolution_px != tracker.resolution_px:
-        differences.append("it has {} x {} px, not {} x {}".format(*(*camera.resolution_px, 0)[:2], *tracker.resolution_px))
+        differences.append(
+            "it has {} x {} px, not {} x {}".format(
+                *(*camera.resolution_px, 0)[:2], *tracker.resolution_px
+            )
+        )
     field_deg = camera.field_of_view_deg
     if abs(field_deg - tracker.field_of_view_deg) > MAX_FIELD_SHARE * tracker.field_of_view_deg:
-        differences.append(f"its field along y is {field_deg:.4g} deg, not {tracker.field_of_view_deg:.4g}")
+        differences.append(
+            f"its field along y is {field_deg:.4g} deg, not {tracker.field_of_view_deg:.4g}"
+        )
     if not differences:
         return None
     return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
@@ -267,7 +310,11 @@ def named(craft: VizBody) -> str:
 
 
 def _against(own: Components, other: Components) -> Components:
-    return tuple(a - b for a, b in zip(own, other, strict=True)) if len(own) == len(other) == 3 else own
+    return (
+        tuple(a - b for a, b in zip(own, other, strict=True))
+        if len(own) == len(other) == 3
+        else own
+    )
 
 
 class VizardLive(ZmqSocket, LockstepLink):
@@ -303,13 +350,18 @@ class VizardLive(ZmqSocket, LockstepLink):
         host_ns, word = self._clock.now_ns(), parts[0]
         if word == SIM_UPDATE:
             return self._step(host_ns, parts)
-        if word.startswith(REQUEST_IMAGE) and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit():
+        if (
+            word.startswith(REQUEST_IMAGE)
+            and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit()
+        ):
             image = self._picture(int(number))
             # the length goes ahead, big-endian; 0 where there is none
             self._answer([len(image).to_bytes(4, "big"), image])
             return None
         if word not in PLAIN_ANSWERS:
-            self._notices.tell("unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests")
+            self._notices.tell(
+                "unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests"
+            )
         self._answer(PLAIN_ANSWERS.get(word, [ERROR]))
         return None
 
@@ -317,10 +369,16 @@ class VizardLive(ZmqSocket, LockstepLink):
         self._sample = None
         message = update_of(parts)
         if message is None:
-            return Arrival(host_ns, wire.Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"), parts[-1])
+            return Arrival(
+                host_ns,
+                wire.Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"),
+                parts[-1],
+            )
         event, update = self._follower.take(message)
         self._sample = event if isinstance(event, wire.AttitudeSample) else None
-        self._described |= {camera.identity: camera for camera in (update.cameras if update is not None else ())}
+        self._described |= {
+            camera.identity: camera for camera in (update.cameras if update is not None else ())
+        }
         return Arrival(host_ns, event, message)
 
     def _picture(self, camera: int) -> bytes:
@@ -332,7 +390,9 @@ class VizardLive(ZmqSocket, LockstepLink):
             trouble = disagreement(self._described[camera], self._tracker)
             if trouble is not None:
                 self._notices.tell("other-camera", trouble)
-        return b"" if self._sample is None or self._pictures is None else self._pictures(self._sample)
+        return (
+            b"" if self._sample is None or self._pictures is None else self._pictures(self._sample)
+        )
 
     def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Let the simulation go on; or, where its step was refused, end it."""
@@ -393,15 +453,27 @@ class BroadcastDecoder(PacketDecoder):
         parts = list(message.parts)
         update = update_of(parts)
         if update is None:
-            refusal = wire.Refusal("format", f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage")
+            refusal = wire.Refusal(
+                "format",
+                f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage",
+            )
             return Arrival(message.host_ns, refusal, parts[-1], message.waited_ns)
         return Arrival(message.host_ns, self._follower.take(update)[0], update, message.waited_ns)
 
 
-def vizard_broadcast(endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None) -> ZmqReceiver:
+def vizard_broadcast(
+    endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None
+) -> ZmqReceiver:
     """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It
     connects, or binds with `bind`.
     """
     check_loopback(endpoint)
     decoder = BroadcastDecoder(follower)
-    return ZmqReceiver(endpoint, bind=bind, notices=notices, topic=SIM_UPDATE, max_part_bytes=MAX_UPDATE_BYTES, decoder=decoder)
+    return ZmqReceiver(
+        endpoint,
+        bind=bind,
+        notices=notices,
+        topic=SIM_UPDATE,
+        max_part_bytes=MAX_UPDATE_BYTES,
+        decoder=decoder,
+    )

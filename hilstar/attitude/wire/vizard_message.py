@@ -86,14 +86,18 @@ def _message_class() -> Any:
     """The class of a VizMessage with these fields; importing protobuf is not for every run."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    file = descriptor_pb2.FileDescriptorProto(name="vizard.proto", package="hilstar", syntax="proto3")
+    file = descriptor_pb2.FileDescriptorProto(
+        name="vizard.proto", package="hilstar", syntax="proto3"
+    )
     for form, fields in FORMS.items():
         named = file.message_type.add(name=form)
         for name, (number, kind, label) in fields.items():
             named.field.add(name=name, number=number, type=kind, label=label)
     whole = file.message_type.add(name="VizMessage")
     for name, (number, form, label) in PARTS.items():
-        whole.field.add(name=name, number=number, type=MESSAGE, label=label, type_name=f".hilstar.{form}")
+        whole.field.add(
+            name=name, number=number, type=MESSAGE, label=label, type_name=f".hilstar.{form}"
+        )
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("hilstar.VizMessage"))
@@ -119,7 +123,10 @@ def decode_update(message: bytes) -> SimUpdate:
         round(time_ns),
         read.time.frame,
         tuple(_body(each) for each in read.spacecraft),
-        tuple(VizCamera(c.identity, c.field_of_view_deg, _few(c.resolution_px), _few(c.sigma)) for c in read.cameras),
+        tuple(
+            VizCamera(c.identity, c.field_of_view_deg, _few(c.resolution_px), _few(c.sigma))
+            for c in read.cameras
+        ),
         tuple(_body(each)._replace(sigma_bn=()) for each in read.bodies),
     )
 

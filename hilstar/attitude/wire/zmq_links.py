@@ -59,7 +59,12 @@ class ZmqReceiver(ZmqSocket, StreamLink):
     """
 
     def __init__(
-        self, endpoint: str, *, topic: bytes = b"", decoder: PacketDecoder = PACKET_DECODER, **options: Unpack[SocketOptions]
+        self,
+        endpoint: str,
+        *,
+        topic: bytes = b"",
+        decoder: PacketDecoder = PACKET_DECODER,
+        **options: Unpack[SocketOptions],
     ) -> None:
         self.topic, self.decoder, self.bound = topic, decoder, options.get("bind", False)
         self.conventions, self.stamped = decoder.conventions, decoder.stamped
@@ -71,7 +76,11 @@ class ZmqReceiver(ZmqSocket, StreamLink):
 
     def opener(self) -> OpenStream:
         """What another process opens the same socket by."""
-        more: dict[str, Any] = {"keys": self._keys, "topic": self.topic, "max_part_bytes": self._max_part_bytes}
+        more: dict[str, Any] = {
+            "keys": self._keys,
+            "topic": self.topic,
+            "max_part_bytes": self._max_part_bytes,
+        }
         return partial(ZmqReceiver, self.endpoint, bind=self._bind, **more)
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
@@ -90,7 +99,11 @@ class ZmqReceiver(ZmqSocket, StreamLink):
             return []
         waiting: list[RawMessage] = []
         taken_bytes = 0
-        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
+        while (
+            len(waiting) < QUEUE_MESSAGES
+            and taken_bytes < MAX_TAKEN_BYTES
+            and (parts := self._take_parts()) is not None
+        ):
             waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
         return self._gate.newest(waiting, wire.declares_discontinuity)
@@ -123,7 +136,9 @@ class ZmqApart(StreamLink):
 
     stamped = True
 
-    def __init__(self, link: ZmqReceiver, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self, link: ZmqReceiver, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
+    ) -> None:
         super().__init__(notices, clock)
         link.close()
         self.verb, self.endpoint, self.conventions = link.verb, link.endpoint, link.conventions
@@ -176,7 +191,14 @@ class ZmqSender(ZmqSocket):
     status: wire.Status | None = None  # no way back
     answer: wire.AnswerPacket | None = None
 
-    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        bind: bool = True,
+        keys: CurveKeys = NO_KEYS,
+        clock: HostClock = HOST_CLOCK,
+    ) -> None:
         self._tended_until = clock.within(0.0)
         super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, clock=clock)
         self._ready()
@@ -214,7 +236,9 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
 
     _json = False  # whether the last request was
 
-    def __init__(self, endpoint: str, *, sent: SentAttitudes = AS_SENT, **options: Unpack[SocketOptions]) -> None:
+    def __init__(
+        self, endpoint: str, *, sent: SentAttitudes = AS_SENT, **options: Unpack[SocketOptions]
+    ) -> None:
         self.conventions, self._decode = sent.conventions, sent.decoder(wire.decode)
         options.setdefault("bind", True)
         super().__init__(zmq.REP, endpoint, **options)
@@ -230,7 +254,11 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
             return None
         host_ns, event = self._clock.now_ns(), self._decode(message)
         if isinstance(event, wire.TimeRequest):
-            self._answer(wire.encode(wire.TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())))
+            self._answer(
+                wire.encode(
+                    wire.TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())
+                )
+            )
             return None
         self._json = message[:64].lstrip()[:1] == b"{"
         return Arrival(host_ns, event, message)
@@ -267,7 +295,9 @@ class Feed(Closing):
         the same attitude.
         """
         raw = arrival.raw
-        if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(wire.decode(raw), wire.AttitudeSample):
+        if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(
+            wire.decode(raw), wire.AttitudeSample
+        ):
             raw = wire.encode(arrival.event)
         with contextlib.suppress(zmq.Again):
             self._socket.send_multipart([STAMP.pack(arrival.host_ns), raw], zmq.NOBLOCK)

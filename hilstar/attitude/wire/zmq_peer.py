@@ -63,9 +63,7 @@ def _keys_trouble(address: str, mechanism: str, keys: bool) -> str:
         return f"{address}: it asks for keys (CURVE), and we have none; give {KEYS} (hilstar keys makes them)"
     if mechanism == "NULL":
         return f"{address}: it has no keys, and we have; give it keys (hilstar keys), or leave {KEYS} out"
-    return (
-        "the other side rejected us: check its allowed_clients, and our curve_server_key, and that it is no other socket type"
-    )
+    return "the other side rejected us: check its allowed_clients, and our curve_server_key, and that it is no other socket type"
 
 
 def answer_of(address: str, patience_s: float = PATIENCE_S) -> bytes | None:

@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, TypedDict, Unpack
 import zmq
 
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
-from hilstar.attitude.wire.keys import NO_KEYS, AllowList, CurveKeys, check_reach, load_public, load_secret
+from hilstar.attitude.wire.keys import (
+    NO_KEYS,
+    AllowList,
+    CurveKeys,
+    check_reach,
+    load_public,
+    load_secret,
+)
 from hilstar.attitude.wire.links import PAUSE_S, WRONG_PEER, Link, LinkCounts
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
@@ -53,7 +60,13 @@ FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: LEFT_EARLY,
 }
 HANDSHAKE_NS = HANDSHAKE_MS * NS_PER_MS
-EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
+EVENTS = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_CONNECTED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | sum(FAILED)
+)
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part
 # over MAX_PART_BYTES drops its connection, which is then made anew. Of a message of more than
 # MAX_PARTS the rest is passed over, for other senders' wait behind it; one of more than
@@ -153,7 +166,13 @@ class _Doorkeeper:
         self.lost = False
         self.left: set[int] = set()
         self.place: int | str = ""
-        self._watched, self._look, self._counts, self._notices, self._clock = watched, look, counts, notices, clock
+        self._watched, self._look, self._counts, self._notices, self._clock = (
+            watched,
+            look,
+            counts,
+            notices,
+            clock,
+        )
         self._bound = look is None
         self._greeted = False  # whether the connection that we made had its handshake
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
@@ -192,7 +211,9 @@ class _Doorkeeper:
             self.left.discard(value)
             with _connection(value) as connection:
                 name = () if connection is None else connection.getpeername()
-                self._open[value] = f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
+                self._open[value] = (
+                    f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
+                )
         elif event == zmq.EVENT_DISCONNECTED:
             self._leave(value)
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and self._bound:
@@ -214,13 +235,20 @@ class _Doorkeeper:
         who, failure = self._open.pop(file, ""), self._failure
         greeted, self._failure, self._greeted = self._greeted, "", False
         accepted_ns = self._ungreeted.pop(file, None)
-        if accepted_ns is not None and not failure and self._clock.now_ns() - accepted_ns < HANDSHAKE_NS:
+        if (
+            accepted_ns is not None
+            and not failure
+            and self._clock.now_ns() - accepted_ns < HANDSHAKE_NS
+        ):
             failure = LEFT_EARLY
         if file in self._shut:
             self._shut.remove(file)
         elif failure and self._bound:
             self._counts.rejected += 1
-            self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
+            self._notices.tell(
+                "client-rejected",
+                f"a connection from {who or 'an unknown peer'} was rejected: {failure}",
+            )
         elif self._look is None:
             pass
         elif failure or not greeted:
@@ -242,7 +270,8 @@ class _Doorkeeper:
         if not self._shut:
             who = self._open[newest[0]] or "an unknown peer"
             self._notices.tell(
-                "connections-refused", f"over {MAX_CONNECTIONS} connections at once; closing further ones, from {who}"
+                "connections-refused",
+                f"over {MAX_CONNECTIONS} connections at once; closing further ones, from {who}",
             )
         for file in newest:
             self._counts.refused += 1
@@ -315,7 +344,9 @@ class ZmqSocket(Link):
         self._keys = keys
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
-        allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
+        allowed = (
+            AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
+        )
         _raise_file_limit()
         self._memory = _MemoryWatch(self._clock)
         self._context = zmq.Context()
@@ -343,14 +374,18 @@ class ZmqSocket(Link):
         self._socket = made
         kind = zmq.SocketType(self._kind).name
         look = None if self._bind else PeerLook(self._address, kind, keys=self._pair is not None)
-        self._keeper = _Doorkeeper(made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock)
+        self._keeper = _Doorkeeper(
+            made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock
+        )
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
         self._poller.register(self._keeper.monitor, zmq.POLLIN)
         try:
             if self._bind:
                 self._bind_within(made, patience_s)
-                self._keeper.place = str(self._place.path or "") or int(self._address.rpartition(":")[2])
+                self._keeper.place = str(self._place.path or "") or int(
+                    self._address.rpartition(":")[2]
+                )
             else:
                 made.connect(self._address)
         except zmq.ZMQError as error:
@@ -416,7 +451,9 @@ class ZmqSocket(Link):
         if self._keeper is not None:
             self._keeper.tend()
         if self._memory.grown_bytes() > MAX_GROWTH_BYTES:
-            self._reset(f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends")
+            self._reset(
+                f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends"
+            )
 
     def _take(self) -> bytes | None:
         parts = self._take_parts()
@@ -438,7 +475,8 @@ class ZmqSocket(Link):
             for _ in range(passed_over):
                 if not taken.getsockopt(zmq.RCVMORE):
                     self._notices.tell(
-                        "long-message", f"{self.endpoint}: a message of more than {MAX_PARTS} parts is passed over"
+                        "long-message",
+                        f"{self.endpoint}: a message of more than {MAX_PARTS} parts is passed over",
                     )
                     return None
                 taken.recv(zmq.NOBLOCK, copy=False)
@@ -450,7 +488,9 @@ class ZmqSocket(Link):
     def _reset(self, why: str) -> None:
         """Drop every connection, and what libzmq keeps of it."""
         self.link_counts.resets += 1
-        self._notices.tell("flood", f"{self.endpoint}: {why}; dropping every connection and reconnecting")
+        self._notices.tell(
+            "flood", f"{self.endpoint}: {why}; dropping every connection and reconnecting"
+        )
         self._shut()
         self._memory.await_release()
         self._open()
@@ -473,7 +513,9 @@ class ZmqSocket(Link):
 
 def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:
     if error.errno == zmq.EADDRINUSE:
-        return f"{endpoint}: the port is in use; stop the program that has it, or choose another port"
+        return (
+            f"{endpoint}: the port is in use; stop the program that has it, or choose another port"
+        )
     if bind and error.errno in {errno.ENODEV, zmq.EADDRNOTAVAIL}:
         return f"{endpoint}: not an address of this machine, so it cannot be bound; connect (--connect, bind = false) instead"
     verb = "bind" if bind else "connect"

@@ -99,7 +99,11 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _ending.holds:
         return
     if not _ending.stops:
-        if _ending.guard and frame is not None and frame.f_code.co_filename.startswith("<frozen importlib"):
+        if (
+            _ending.guard
+            and frame is not None
+            and frame.f_code.co_filename.startswith("<frozen importlib")
+        ):
             # Python's import calls itself back where an exception is lost, and so far nothing is
             # there to be put in order.
             _say_if_read("hilstar: stopped\n")
@@ -155,7 +159,11 @@ def held() -> Iterator[None]:
 
     It is for extensions in C that call Python back and do not look whether an exception came of it.
     """
-    if threading.current_thread() is not threading.main_thread() or _ending.stops or _ending.signal is not None:
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or _ending.stops
+        or _ending.signal is not None
+    ):
         yield
         return
     _ending.holds += 1
@@ -219,7 +227,11 @@ def _watch(watched: socket.socket) -> None:
             numbers = _signals_in(watched)
         heard_twice = len(_signals_in(watched)) > len(numbers)
     name = signal.Signals(numbers[0]).name
-    why = "at the second signal" if heard_twice else f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
+    why = (
+        "at the second signal"
+        if heard_twice
+        else f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
+    )
     _say_if_read(f"hilstar: ended {why}\n")
     end_children(os.getpid(), _ending.guard)
     _let_guard_go()
@@ -341,7 +353,11 @@ class _QueuedStderr(io.RawIOBase):
                     self._changed.wait()
                 piece = self._waiting.popleft()
                 dropped, self._dropped = self._dropped, 0
-            data = piece + (f"hilstar: {dropped} lines were dropped: nothing read them\n".encode() if dropped else b"")
+            data = piece + (
+                f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
+                if dropped
+                else b""
+            )
             with contextlib.suppress(OSError):  # there is no reader to tell
                 while data:
                     try:
@@ -363,7 +379,9 @@ def queue_stderr() -> None:
     if _queued is None and sys.stderr is not None:
         _queued = _QueuedStderr()
         encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-        sys.stderr = io.TextIOWrapper(io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True)
+        sys.stderr = io.TextIOWrapper(
+            io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True
+        )
         atexit.register(finish_stderr, LAST_WORDS_S)
 
 

@@ -64,7 +64,10 @@ class ProcessPool(Closing):
     """
 
     def __init__(
-        self, start: Callable[..., tuple[Any, Work]], arguments: tuple[Any, ...], told: tuple[type[Exception], ...]
+        self,
+        start: Callable[..., tuple[Any, Work]],
+        arguments: tuple[Any, ...],
+        told: tuple[type[Exception], ...],
     ) -> None:
         self._serve = start, arguments, told
         self.workers: list[WorkerProcess] = []
@@ -85,7 +88,9 @@ class ProcessPool(Closing):
 
     def heard(self) -> Iterator[News]:
         """Wait until there is news of any worker."""
-        ends: list[Any] = [end for worker in self.workers for end in (worker.link, worker.process.sentinel)]
+        ends: list[Any] = [
+            end for worker in self.workers for end in (worker.link, worker.process.sentinel)
+        ]
         ready = set(wait(ends))
         for worker in list(self.workers):
             if worker.link in ready or worker.process.sentinel in ready:
@@ -141,7 +146,10 @@ def _for_children() -> Iterator[None]:
 
 
 def _serve(
-    link: Connection, start: Callable[..., tuple[Any, Work]], arguments: tuple[Any, ...], told: tuple[type[Exception], ...]
+    link: Connection,
+    start: Callable[..., tuple[Any, Work]],
+    arguments: tuple[Any, ...],
+    told: tuple[type[Exception], ...],
 ) -> None:
     """A worker's life: greet, and answer tasks until the link ends."""
     end_with_parent()

@@ -36,7 +36,9 @@ class Child(Closing):
     cannot be started.
     """
 
-    def __init__(self, words: list[str], folder: Path | None = None, *, keeps_stdout: bool = True) -> None:
+    def __init__(
+        self, words: list[str], folder: Path | None = None, *, keeps_stdout: bool = True
+    ) -> None:
         self.too_much = False
         self._process = subprocess.Popen(
             words,
@@ -48,7 +50,11 @@ class Child(Closing):
         )
         self._said = {"out": bytearray(), "err": bytearray()}
         streams = [("out", self._process.stdout), ("err", self._process.stderr)]
-        self._readers = [threading.Thread(target=self._read, args=each, daemon=True) for each in streams if each[1] is not None]
+        self._readers = [
+            threading.Thread(target=self._read, args=each, daemon=True)
+            for each in streams
+            if each[1] is not None
+        ]
         for reader in self._readers:
             reader.start()
 
@@ -99,7 +105,9 @@ class Child(Closing):
         for reader in self._readers:
             # a grandchild in another process group may still hold the pipe
             reader.join(ENDED_WAIT_S)
-        for stream, reader in zip((self._process.stderr, self._process.stdout), reversed(self._readers), strict=False):
+        for stream, reader in zip(
+            (self._process.stderr, self._process.stdout), reversed(self._readers), strict=False
+        ):
             if stream is not None and not reader.is_alive():
                 stream.close()
 

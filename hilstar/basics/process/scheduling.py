@@ -87,7 +87,9 @@ class HostClock:
         """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still
         meanwhile.
         """
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(
+            time.CLOCK_MONOTONIC
+        )
 
     def realtime_ns(self) -> int:
         """The time that the machine's calendar shows, ns since 1970; somebody may set it."""
@@ -113,7 +115,10 @@ class HostClock:
         """
         told = Timex()  # modes = 0: nothing is set
         answered = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) >= 0
-        return UnixOffset(self.monotonic_minus_realtime_ns(), told.maxerror * 1000 if answered else UNDISCIPLINED_NS)
+        return UnixOffset(
+            self.monotonic_minus_realtime_ns(),
+            told.maxerror * 1000 if answered else UNDISCIPLINED_NS,
+        )
 
     def sleep(self, seconds: float) -> None:
         """Do nothing for a while; nothing for 0 or less."""
@@ -206,7 +211,9 @@ def raise_priority() -> str:
     everything.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY))
+        os.sched_setscheduler(
+            0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY)
+        )
     except (OSError, AttributeError) as error:
         return f"normal: SCHED_FIFO is not allowed ({getattr(error, 'strerror', error)}); give this user rtprio in limits.conf"
     return f"SCHED_FIFO {FIFO_PRIORITY}"
@@ -225,9 +232,13 @@ class PromptWhileLight:
     def __init__(self, wall_s: Clock = time.monotonic, cpu_s: Clock = time.process_time) -> None:
         number = SCHED_SETATTR.get(platform.machine())
         if number is not None:
-            asked = SCHED_ATTRIBUTES.pack(SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, SHORT_SLICE_NS, 0, 0)
+            asked = SCHED_ATTRIBUTES.pack(
+                SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, SHORT_SLICE_NS, 0, 0
+            )
             with contextlib.suppress(OSError, AttributeError):  # an older kernel refuses
-                ctypes.CDLL(None).syscall(number, 0, ctypes.create_string_buffer(asked, len(asked)), 0)
+                ctypes.CDLL(None).syscall(
+                    number, 0, ctypes.create_string_buffer(asked, len(asked)), 0
+                )
         self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
         self._allowed = self._prompt
         self._wall_s, self._cpu_s = wall_s, cpu_s
@@ -276,11 +287,17 @@ def drawing_threads_apart() -> Iterator[None]:
     yield
     begun_s = time.monotonic()
     while True:
-        begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
+        begun = {
+            thread: name for thread, name in sorted(_threads().items()) if thread not in before
+        }
         rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
         # Those that compute have the process's own name; others of the driver's have one with a
         # colon.
-        computing = [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
+        computing = [
+            thread
+            for thread, name in begun.items()
+            if thread not in rasterisers and ":" not in name
+        ]
         if len(rasterisers) == len(computing):
             break
         may_be_llvmpipe = len(rasterisers) + len(computing) >= 2 * len(_cores())

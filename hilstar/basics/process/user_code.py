@@ -36,7 +36,9 @@ def user_function(name: str, folder: Path, trust: Collection[str] = ()) -> Calla
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # whatever a user's module does
-        raise UserCodeError(f"{module_name} cannot be imported ({type(error).__name__}: {error})") from error
+        raise UserCodeError(
+            f"{module_name} cannot be imported ({type(error).__name__}: {error})"
+        ) from error
     finally:
         _look_here_last(str(folder.resolve()))
     found = getattr(module, function_name, None)
@@ -50,15 +52,21 @@ def _check_place(package: str, folder: str) -> None:
     importlib.invalidate_caches()
     spec = PathFinder.find_spec(package, [folder])
     if spec is None:
-        raise UserCodeError(f"no module {package} stands in {folder}; {ADVICE.format(package=package)}")
+        raise UserCodeError(
+            f"no module {package} stands in {folder}; {ADVICE.format(package=package)}"
+        )
     loaded = sys.modules.get(package)
     if loaded is not None and package in _folders and _folders[package] != folder:
         for each in [each for each in sys.modules if each.partition(".")[0] == package]:
             del sys.modules[each]
         loaded = None
-    own = package in sys.stdlib_module_names or (loaded is not None and not _is_same(loaded.__spec__, spec))
+    own = package in sys.stdlib_module_names or (
+        loaded is not None and not _is_same(loaded.__spec__, spec)
+    )
     if own:
-        raise UserCodeError(f"{package} is the name of a module of Python or of hilstar; give {folder}/{package} another")
+        raise UserCodeError(
+            f"{package} is the name of a module of Python or of hilstar; give {folder}/{package} another"
+        )
     _folders[package] = folder
     sys.path.insert(0, folder)
 

@@ -19,7 +19,13 @@ def level_of_code(response: Response, code: int) -> int:
     return int(np.argmin(away))
 
 
-def lay_over(levels: Levels | Codes, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
+def lay_over(
+    levels: Levels | Codes,
+    overlay: int,
+    patch_level: int,
+    line_level: int,
+    cross_px: tuple[int, int],
+) -> None:
     """Change levels (height, width), or codes (height, width, 3), in place; `cross_px` is the
     crosshair's pixel.
     """
@@ -37,7 +43,9 @@ def lay_over(levels: Levels | Codes, overlay: int, patch_level: int, line_level:
 
 
 def _on_line(offset_px: int, overlay: int) -> bool:
-    return bool((overlay & GRID and offset_px % GRID_PX == 0) or (overlay & CROSSHAIR and offset_px == 0))
+    return bool(
+        (overlay & GRID and offset_px % GRID_PX == 0) or (overlay & CROSSHAIR and offset_px == 0)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +65,9 @@ class AidLevels:
         if not overlay:
             return levels
         levels, white = levels.copy(), 2**self.bits - 1
-        patch, line = (level_of_code(self.response, code) for code in (round(patch_share * white), int(LINE_SHARE * white)))
+        patch, line = (
+            level_of_code(self.response, code)
+            for code in (round(patch_share * white), int(LINE_SHARE * white))
+        )
         lay_over(levels, overlay, patch, line, self.cross_px)
         return levels

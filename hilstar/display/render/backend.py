@@ -93,7 +93,10 @@ class Target:
         if not panels:
             return [Turn(0, [0.0])]
         step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
-        order, alone = np.argsort(-step, kind="stable").tolist(), getattr(QUANTISERS[self.quantisation], "remembers", False)
+        order, alone = (
+            np.argsort(-step, kind="stable").tolist(),
+            getattr(QUANTISERS[self.quantisation], "remembers", False),
+        )
         share = self.together / self.together.diagonal() * step[:, None] / step
         # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by
         # what each leaves.
@@ -102,7 +105,9 @@ class Target:
             makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
             own[k] = -makes_up
             own[k, k] += 1
-            found.append(Turn(k, makes_up.tolist(), KEPT if alone or k == order[-1] else KEPT_BEFORE))
+            found.append(
+                Turn(k, makes_up.tolist(), KEPT if alone or k == order[-1] else KEPT_BEFORE)
+            )
         return found
 
     def quantisers(self) -> dict[int, Quantiser]:
@@ -111,21 +116,33 @@ class Target:
         """
         panel, made = self.panel(), QUANTISERS[self.quantisation]
         panels = self.primaries or (() if panel is None else (panel,))
-        found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, *_ in self.in_turn() if panels}
+        found = {
+            k: made(panels[k], self.resolution_px, self.psf, self.seen)
+            for k, *_ in self.in_turn()
+            if panels
+        }
         for k, makes_up, kept in self.in_turn() if self.primaries else ():
             if isinstance(one := found[k], ExactQuantiser):
                 one.kept, one.given = kept, [(part, found[j]) for j, part in enumerate(makes_up)]
         return found
 
-    def by_plane(self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]) -> Levels:
+    def by_plane(
+        self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]
+    ) -> Levels:
         """The levels of a frame by those of each primary, if primaries are driven apart, chosen
         in their order.
         """
         if not self.primaries or sprites is None:
             found = {k: levels(k, sprites) for k, *_ in self.in_turn()}
         else:
-            found = {k: levels(k, by_primary(sprites, self.places_px, k)) for k, *_ in self.in_turn()}
-        return found[0] if not self.primaries else Levels(np.stack([found[k] for k in range(len(found))], -1))
+            found = {
+                k: levels(k, by_primary(sprites, self.places_px, k)) for k, *_ in self.in_turn()
+            }
+        return (
+            found[0]
+            if not self.primaries
+            else Levels(np.stack([found[k] for k in range(len(found))], -1))
+        )
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -134,7 +151,9 @@ class Target:
         width, height = self.resolution_px
         if self.uniformity is not None and self.uniformity.shape != (height, width):
             found = " x ".join(map(str, self.uniformity.shape[::-1]))
-            raise InputError(f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel")
+            raise InputError(
+                f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel"
+            )
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
 
@@ -212,7 +231,9 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+    def present(
+        self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
+    ) -> None:
         """Draw the last levels on the screen's back buffer, turned and mirrored, as codes.
 
         Over them lie the bits of `overlay` (see `aids`), with a patch of `patch_code`, and in the
@@ -272,14 +293,21 @@ def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
     if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
         return sprites
     if sprites.primaries is not None:
-        parts = (as_maps(by_primary(sprites, target.places_px, k), target) for k in range(len(target.primaries)))
+        parts = (
+            as_maps(by_primary(sprites, target.places_px, k), target)
+            for k in range(len(target.primaries))
+        )
         lights = tuple(() if part is None else part.extended for part in parts)
         return replace(without_stars(sprites), extended=lights[0], lights=lights)
     image = np.ascontiguousarray(psf.image(sprites, sprites.spectra, target.resolution_px))
-    return replace(without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False)))
+    return replace(
+        without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False))
+    )
 
 
-def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False) -> Float32Array:
+def linear_light(
+    backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False
+) -> Float32Array:
     """The linear image of sprites by channel: float32 (channels, height, width), electrons per
     second, in memory of its own.
 

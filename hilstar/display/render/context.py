@@ -65,7 +65,9 @@ def _device_count() -> int:
         find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
         if address := find(b"eglQueryDevicesEXT"):
             devices = (ctypes.c_void_p * MAX_GPUS)()
-            query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))(address)
+            query = ctypes.CFUNCTYPE(
+                ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int)
+            )(address)
             query(MAX_GPUS, devices, ctypes.byref(found))
     return found.value
 
@@ -86,7 +88,9 @@ def create_context(gpu: int | str | None = None) -> moderngl.Context:
             return _context_on(one.index)
     known = "; ".join(one.line() for one in found) or "none: EGL lists no devices"
     meant = did_you_mean(gpu, (one.renderer for one in found))
-    raise NotThereError(f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}")
+    raise NotThereError(
+        f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}"
+    )
 
 
 def _context_on(index: int | None) -> moderngl.Context:
@@ -97,9 +101,13 @@ def _context_on(index: int | None) -> moderngl.Context:
             version = 100 * major + 10 * minor
             try:
                 if index is None:
-                    return moderngl.create_context(require=version, standalone=True, **settings | {"backend": "egl"})
+                    return moderngl.create_context(
+                        require=version, standalone=True, **settings | {"backend": "egl"}
+                    )
                 # moderngl's own way to an index gives way to a variable of the environment.
-                on_device = egl.create_context(glversion=version, mode="standalone", device_index=index, **settings)
+                on_device = egl.create_context(
+                    glversion=version, mode="standalone", device_index=index, **settings
+                )
                 return moderngl.create_context(require=version, standalone=True, context=on_device)
             except Exception as error:  # moderngl and glcontext raise plain Exceptions here
                 refusal = str(error)
@@ -114,29 +122,46 @@ def described() -> str:
     try:
         info = ctx.info
         what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
-        exact = "compute shaders" if ctx.version_code >= COMPUTE_VERSION else "NumPy (slow: their shaders need OpenGL 4.3)"
+        exact = (
+            "compute shaders"
+            if ctx.version_code >= COMPUTE_VERSION
+            else "NumPy (slow: their shaders need OpenGL 4.3)"
+        )
         return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
     finally:
         ctx.release()
 
 
-def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
+def check_limits(
+    ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str
+) -> None:
     """Raise InputError where this GL cannot draw such an image, or points as large as its
     sprites; those are by `sigma`.
     """
-    largest = int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
+    largest = (
+        int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"]))
+        - 2 * footprint_px
+    )
     if max(resolution_px) > largest:
-        raise InputError(f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px")
+        raise InputError(
+            f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px"
+        )
     points = ctx.info["GL_POINT_SIZE_RANGE"][1]
     if footprint_px > points:
-        raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
+        raise InputError(
+            f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px"
+        )
 
 
 def computes_in_software(ctx: moderngl.Context) -> bool:
     """Whether this GL is a processor's, with compute shaders in the process's own memory; cards
     rasterise in their stride.
     """
-    return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx) and PINNED_MEMORY in ctx.extensions
+    return (
+        bool(ctx.version_code >= COMPUTE_VERSION)
+        and is_software(ctx)
+        and PINNED_MEMORY in ctx.extensions
+    )
 
 
 def is_software(ctx: moderngl.Context) -> bool:
@@ -144,7 +169,9 @@ def is_software(ctx: moderngl.Context) -> bool:
     return str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
 
 
-def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) -> tuple[npt.NDArray[Any], moderngl.Buffer]:
+def pinned(
+    ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike
+) -> tuple[npt.NDArray[Any], moderngl.Buffer]:
     """A black array in whole pages, which it keeps for as long as somebody holds it, and a
     buffer of the same memory.
     """
@@ -155,7 +182,9 @@ def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) 
     find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
     find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
     bind = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint)(find(b"glBindBuffer"))
-    specify = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint)(find(b"glBufferData"))
+    specify = ctypes.CFUNCTYPE(
+        None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint
+    )(find(b"glBufferData"))
     buffer = ctx.buffer(reserve=size)
     bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, buffer.glo)
     specify(EXTERNAL_VIRTUAL_MEMORY_BUFFER, size, values.ctypes.data, DYNAMIC_COPY)

@@ -55,7 +55,10 @@ class Sure:
         """
         times = np.where(smooth, SMOOTH_TIMES, SURE_TIMES)
         rows, columns = smooth.shape[-2:]
-        corners = [e_per_s[..., row : row + rows, column : column + columns] for row, column in set(CORNERS)]
+        corners = [
+            e_per_s[..., row : row + rows, column : column + columns]
+            for row, column in set(CORNERS)
+        ]
         brightest, darkest = np.maximum.reduce(corners), np.minimum.reduce(corners)
         return darkest > times * self.white_e_per_s, brightest * times < self.dark_e_per_s
 
@@ -116,7 +119,10 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     left, top, width, height = region
     if width * height < MIN_TILED_PX:
         return None
-    x, y = (begin + TILE_PX * np.arange(-1, -(-size // TILE_PX) + 2) for begin, size in ((left, width), (top, height)))
+    x, y = (
+        begin + TILE_PX * np.arange(-1, -(-size // TILE_PX) + 2)
+        for begin, size in ((left, width), (top, height))
+    )
     whole = _lattice(light, np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64), TILE_PX)
     drawn, white = ~whole.is_beside, np.zeros_like(whole.is_face)
     apart = white
@@ -128,20 +134,43 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
         # beside it.
         around = _all(_all(np.pad(dark, 1, constant_values=True)))
         drawn &= ~(apart & dark & (smooth | around))
-    some, of_air = np.argwhere(drawn), (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
+    some, of_air = (
+        np.argwhere(drawn),
+        (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread),
+    )
     if not len(some):
-        return Tiles((left, top, 0, 0), NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, of_air)
-    (first_y, first_x), (last_y, last_x) = some.min(axis=0) * TILE_PX, (some.max(axis=0) + 1) * TILE_PX
-    inner = left + first_x, top + first_y, min(width, last_x) - first_x, min(height, last_y) - first_y
+        return Tiles(
+            (left, top, 0, 0), NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, of_air
+        )
+    (first_y, first_x), (last_y, last_x) = (
+        some.min(axis=0) * TILE_PX,
+        (some.max(axis=0) + 1) * TILE_PX,
+    )
+    inner = (
+        left + first_x,
+        top + first_y,
+        min(width, last_x) - first_x,
+        min(height, last_y) - first_y,
+    )
     drawn &= ~white
     # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile
     # by tile.
     steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
     edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_inside & ~whole.is_air]
-    fine = _lattice(light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX)
-    fine_white = np.zeros_like(fine.is_face) if sure is None else sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
+    fine = _lattice(
+        light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX
+    )
+    fine_white = (
+        np.zeros_like(fine.is_face)
+        if sure is None
+        else sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
+    )
     fine_inside, fine_air = fine.is_inside & ~fine_white, fine.is_air & ~fine_white
-    face, inside, air = whole.is_face & drawn, whole.is_inside & drawn & ~whole.is_face, whole.is_air & drawn
+    face, inside, air = (
+        whole.is_face & drawn,
+        whole.is_inside & drawn & ~whole.is_face,
+        whole.is_air & drawn,
+    )
     return Tiles(
         (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
         _corners(whole.face, face & ~apart),
@@ -159,7 +188,11 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     """The light at lattices of places (..., rows, columns, 2), `size_px` apart, and between
     them, but for the outer ones.
     """
-    disc, px_per_rad, sigma_px = light.disc, light.camera.scales_px_rad()[0], max(light.psf.variance_px2) ** 0.5
+    disc, px_per_rad, sigma_px = (
+        light.disc,
+        light.camera.scales_px_rad()[0],
+        max(light.psf.variance_px2) ** 0.5,
+    )
     shape, distance = places.shape[:-1], disc.distance_radii
     seen, sr = _rays(light, places.reshape(-1, 2))
     directions = seen @ light.icrs_to_image
@@ -169,7 +202,9 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
     angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2]).reshape(shape)
     rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / distance))
-    beside = _all(angle > rim + WIDER * (size_px * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad)
+    beside = _all(
+        angle > rim + WIDER * (size_px * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad
+    )
     # Tiles far enough within the limb, and off the terminator where that would be seen. A face's
     # height over the plane of its limb goes as the root of 1 - impact^2, whose second derivative is
     # its power -3/2.
@@ -177,17 +212,32 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     radii_per_px = np.sqrt(np.maximum(distance**2 - inside**2, 0.0)) / px_per_rad
     # the Gaussian's reach, radii
     margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
-    most = (size_px * radii_per_px) ** 2 / 8 * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
+    most = (
+        (size_px * radii_per_px) ** 2
+        / 8
+        * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
+    )
     is_inside = _all((impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)) & ~beside
     is_inside[..., 1:-1, 1:-1] &= _even(lit)
     is_face = _all(SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & is_inside
-    is_air, touched, hidden, spread = np.zeros_like(is_face), np.zeros_like(face), np.zeros_like(face), 0.0
+    is_air, touched, hidden, spread = (
+        np.zeros_like(is_face),
+        np.zeros_like(face),
+        np.zeros_like(face),
+        0.0,
+    )
     if disc.air is not None and distance > 1:
         touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
-        hidden = -np.expm1(-disc.slant_depth * np.exp(-np.maximum(impact - 1, 0.0) / disc.air_radii))
+        hidden = -np.expm1(
+            -disc.slant_depth * np.exp(-np.maximum(impact - 1, 0.0) / disc.air_radii)
+        )
         # The variances of the Gaussian in scale heights: half of their mean by tile.glsl, and what
         # it leaves out.
-        along_x, along_y = np.array(light.psf.variance_px2) * (distance**2 - 1) / (disc.air_radii * px_per_rad) ** 2
+        along_x, along_y = (
+            np.array(light.psf.variance_px2)
+            * (distance**2 - 1)
+            / (disc.air_radii * px_per_rad) ** 2
+        )
         spread = (along_x + along_y) / 4
         if abs(along_x - along_y) / 4 + max(along_x, along_y) ** 2 / 8 < SPREAD:
             is_air = _all(impact > 1 + margin) & ~beside
@@ -207,7 +257,9 @@ def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]
     u, v = light.camera.tangents(x_px, y_px)
     seen = np.stack([u, v, np.ones_like(u)], axis=1)
     if light.shear is not None:
-        seen += light.shear.late_s(x_px, y_px)[:, None] * np.cross(light.shear.rate_image_rad_s, seen)
+        seen += light.shear.late_s(x_px, y_px)[:, None] * np.cross(
+            light.shear.rate_image_rad_s, seen
+        )
     a, b, c, d = light.camera.slopes(u, v)
     return seen, 1 / ((a * d - b * c) * np.linalg.norm(seen, axis=1) ** 3)
 
@@ -231,7 +283,10 @@ def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
     if not tiles.any():
         return NOTHING
     size = nodes.shape[-3] - 1, nodes.shape[-2] - 1
-    parts = [nodes[..., row : row + size[0], column : column + size[1], :][tiles] for row, column in CORNERS]
+    parts = [
+        nodes[..., row : row + size[0], column : column + size[1], :][tiles]
+        for row, column in CORNERS
+    ]
     return np.stack(parts, axis=-2).reshape(-1, 6).astype(np.float32)
 
 
@@ -246,5 +301,8 @@ def _runs(x: IntArray, y: IntArray, tiles: BoolArray) -> Float32Array:
     goes_on = (np.diff(begin) == 0) & (np.diff(end) == 0) & (np.diff(row) == 1)
     first, last = np.append(True, ~goes_on)[: len(row)], np.append(~goes_on, True)[: len(row)]
     sides = (y[row[first]], y[row[last] + 1]), (x[begin[first]], x[end[first]])
-    places = [np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1) for j, k in CORNERS]
+    places = [
+        np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1)
+        for j, k in CORNERS
+    ]
     return np.stack(places, axis=-2).reshape(-1, 6).astype(np.float32)

@@ -38,7 +38,10 @@ RESETS = {
     0x8255: "it was reset for an unknown reason",
     0x92BB: "its memory was purged",  # GL_PURGED_CONTEXT_RESET_NV
 }
-RESET_STATUS = {"GL_KHR_robustness": "glGetGraphicsResetStatus", "GL_ARB_robustness": "glGetGraphicsResetStatusARB"}
+RESET_STATUS = {
+    "GL_KHR_robustness": "glGetGraphicsResetStatus",
+    "GL_ARB_robustness": "glGetGraphicsResetStatusARB",
+}
 RESET_STATUS_VERSION = 450  # the OpenGL that has glGetGraphicsResetStatus
 
 
@@ -55,19 +58,32 @@ class Driver:
     def __init__(self, ctx: moderngl.Context) -> None:
         load: Callable[[str], int] = ctx.mglo._context.load_opengl_function
         # PYFUNCTYPE keeps Python's lock, for calls that only queue work or ask; CFUNCTYPE frees it.
-        self._fence = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint)(load("glFenceSync"))
+        self._fence = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint)(
+            load("glFenceSync")
+        )
         self._delete = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(load("glDeleteSync"))
         wait = (ctypes.c_uint, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint64)
         self._ask = ctypes.PYFUNCTYPE(*wait)(load("glClientWaitSync"))
         self._wait = ctypes.CFUNCTYPE(*wait)(load("glClientWaitSync"))
         self._error = ctypes.PYFUNCTYPE(ctypes.c_uint)(load("glGetError"))
-        self._enable, self._disable = (ctypes.PYFUNCTYPE(None, ctypes.c_uint)(load(f"gl{what}able")) for what in ("En", "Dis"))
+        self._enable, self._disable = (
+            ctypes.PYFUNCTYPE(None, ctypes.c_uint)(load(f"gl{what}able")) for what in ("En", "Dis")
+        )
         self._scissor = ctypes.PYFUNCTYPE(None, *[ctypes.c_int] * 4)(load("glScissor"))
-        self._clear = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)(load("glClearBufferfv"))
+        self._clear = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)(
+            load("glClearBufferfv")
+        )
         self._black = (ctypes.c_float * 4)()
         name = "glGetGraphicsResetStatus"
         if ctx.version_code < RESET_STATUS_VERSION:
-            name = next((function for extension, function in RESET_STATUS.items() if extension in ctx.extensions), "")
+            name = next(
+                (
+                    function
+                    for extension, function in RESET_STATUS.items()
+                    if extension in ctx.extensions
+                ),
+                "",
+            )
         address = load(name) if name else 0
         self._reset: Any = ctypes.PYFUNCTYPE(ctypes.c_uint)(address) if address else None
 
@@ -86,7 +102,9 @@ class Driver:
             self._delete(fence)
         if result == GL_TIMEOUT_EXPIRED:
             self.check()
-            raise GpuError(f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see dmesg")
+            raise GpuError(
+                f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see dmesg"
+            )
         if result == GL_WAIT_FAILED:
             self.check()
             raise GpuError("the GPU's driver cannot wait for it; see dmesg")

@@ -48,25 +48,35 @@ def build_program(
     """
     # moderngl makes a program's members by Python, and an exception there ends the process
     with held():
-        return ctx.program(_source(vertex, defines), fragment_shader=_source(fragment, defines, include, last))
+        return ctx.program(
+            _source(vertex, defines), fragment_shader=_source(fragment, defines, include, last)
+        )
 
 
 def build_compute(
-    ctx: moderngl.Context, main: str, defines: Sequence[str], parts: Sequence[str] = (), last: Sequence[str] = ()
+    ctx: moderngl.Context,
+    main: str,
+    defines: Sequence[str],
+    parts: Sequence[str] = (),
+    last: Sequence[str] = (),
 ) -> moderngl.ComputeShader:
     """A compute program from a file of shaders/, between the files `parts` and `last`."""
     with held():  # as for any program
         return ctx.compute_shader(_source(main, defines, parts, last))
 
 
-def _source(main: str, defines: Sequence[str], before: Sequence[str] = (), after: Sequence[str] = ()) -> str:
+def _source(
+    main: str, defines: Sequence[str], before: Sequence[str] = (), after: Sequence[str] = ()
+) -> str:
     """A file of shaders/ after `defines`, between others."""
     version, body = _shader(main).split("\n", 1)
     first, last = ([_shader(name) for name in names] for names in (before, after))
     return "\n".join([version, *(f"#define {name}" for name in defines), *first, body, *last])
 
 
-def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: Mapping[str, Any]) -> None:
+def set_uniforms(
+    program: moderngl.Program | moderngl.ComputeShader, values: Mapping[str, Any]
+) -> None:
     """Set the uniforms of a program by name; compilers drop what it does not need."""
     for name, value in values.items():
         if name in program:
@@ -98,7 +108,14 @@ class Planes:
         share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
         margin_px = float(away[0]), float(away[1])
         side_px = target.psf.footprint_px + 2 * math.ceil(max(margin_px))
-        return cls(panels, share, side_px, margin_px, tuple(defines), [(float(x), float(y)) for x, y in target.places_px])
+        return cls(
+            panels,
+            share,
+            side_px,
+            margin_px,
+            tuple(defines),
+            [(float(x), float(y)) for x, y in target.places_px],
+        )
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -118,7 +135,10 @@ class Planes:
     @property
     def lit(self) -> Panel:
         """A grey panel whose first level takes as little light as that of any plane."""
-        first, share = min(zip(self.panels, self.share, strict=True), key=lambda one: float(one[0].response.threshold[0]))
+        first, share = min(
+            zip(self.panels, self.share, strict=True),
+            key=lambda one: float(one[0].response.threshold[0]),
+        )
         return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
 
     def packed(self, sprites: Sprites) -> Sprites:
@@ -131,10 +151,14 @@ class Planes:
         words = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
         words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
         data["primaries_e_per_s"] = sprites.primaries
-        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(axis=1)
+        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(
+            axis=1
+        )
         return replace(sprites, data=data)
 
-    def set(self, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]) -> None:
+    def set(
+        self, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]
+    ) -> None:
         """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop
         what it does not need.
         """
@@ -171,7 +195,11 @@ class Shares:
 
 
 def splat_program(
-    ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, planes: Planes, in_units: bool = False
+    ctx: moderngl.Context,
+    resolution_px: tuple[int, int],
+    shares: Shares,
+    planes: Planes,
+    in_units: bool = False,
 ) -> moderngl.Program:
     """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a
     LightUnits.
@@ -185,11 +213,15 @@ def splat_program(
     return program
 
 
-def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer, planes: Planes) -> moderngl.VertexArray:
+def sprites_array(
+    program: moderngl.Program, buffer: moderngl.Buffer, planes: Planes
+) -> moderngl.VertexArray:
     """A vertex array of what a program of star.vert asks of sprites in a buffer."""
     inputs = {name: INPUTS[name] for name in planes.dtype.names or ()}
     layout = (form if name in program else f"{4 * int(form[0])}x" for name, form in inputs.items())
-    return program.ctx.vertex_array(program, [(buffer, " ".join(layout), *(name for name in inputs if name in program))])
+    return program.ctx.vertex_array(
+        program, [(buffer, " ".join(layout), *(name for name in inputs if name in program))]
+    )
 
 
 MAX_RATE = 3e38  # in float32
@@ -231,7 +263,9 @@ def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
     program["side_px"] = [side.side_px for side in padded]
 
 
-def lit_sides(panel: Panel, lit_e_per_s: float, psf: Psf, wings: int = MEETING_WINGS) -> SpriteSides:
+def lit_sides(
+    panel: Panel, lit_e_per_s: float, psf: Psf, wings: int = MEETING_WINGS
+) -> SpriteSides:
     """The squares outside which no pixel of a star has 1 / `wings` of the light that lights one, by
     falling rates.
 
@@ -268,16 +302,22 @@ class Eraser:
     its renderer's context.
     """
 
-    def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool
+    ) -> None:
         self._ctx, self._planes = ctx, planes
         self._size_px = size_px
         on_processor = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
-        self._most_px = size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
+        self._most_px = (
+            size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
+        )
         self._most_share = MAX_ERASED_REGION if is_software(ctx) else MAX_ERASED_BY_CARD
         defines = ("LEVELS 0u",) if of_levels else ()
         self._program = build_program(ctx, "star.vert", "erase.frag", defines)
         self._program["resolution_px"] = size_px
-        self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", defines), [])
+        self._triangle = ctx.vertex_array(
+            build_program(ctx, "full.vert", "erase.frag", defines), []
+        )
         self._vao: moderngl.VertexArray | None = None
         self._footprint_px = 0
 
@@ -337,7 +377,9 @@ def draw_tiles(
     set_uniforms(program, {"size_px": size_px, "air": of_air})
     buffer, has_given = program.ctx.buffer(corners), "given" in program
     names = ("place_px", "given") if has_given else ("place_px",)
-    triangles = program.ctx.vertex_array(program, [(buffer, "2f 4f" if has_given else "2f 16x", *names)])
+    triangles = program.ctx.vertex_array(
+        program, [(buffer, "2f 4f" if has_given else "2f 16x", *names)]
+    )
     triangles.render(moderngl.TRIANGLES)
     triangles.release()
     buffer.release()
@@ -351,16 +393,24 @@ class LevelTexture:
     call.
     """
 
-    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes
+    ) -> None:
         width, height = resolution_px
         kind, self._components = level_dtype(planes.panels[0].response), planes.texel
         shape = height, width, planes.texel
         made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
         self.image, self.memory = pinned(ctx, shape, kind) if computes_in_software(ctx) else made
-        self._levels = Levels(self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0])
+        self._levels = Levels(
+            self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0]
+        )
         self._dtype = f"u{self.image.itemsize}"
         bits = 8 * self.image.itemsize
-        self.defines = f"LEVELS_FORMAT {'rgba' if planes.apart else 'r'}{bits}ui", f"LEVEL_BITS {bits}", f"TEXEL {planes.texel}"
+        self.defines = (
+            f"LEVELS_FORMAT {'rgba' if planes.apart else 'r'}{bits}ui",
+            f"LEVEL_BITS {bits}",
+            f"TEXEL {planes.texel}",
+        )
         self.texture = ctx.texture(resolution_px, planes.texel, dtype=self._dtype)
         self.fbo = ctx.framebuffer([self.texture])
         self.fbo.clear()
@@ -383,7 +433,9 @@ class LevelTexture:
         overwrites the same array.
         """
         if not self.in_memory:
-            self.fbo.read_into(self.image, components=self._components, dtype=self._dtype, alignment=1)
+            self.fbo.read_into(
+                self.image, components=self._components, dtype=self._dtype, alignment=1
+            )
         return self._levels
 
 
@@ -398,7 +450,9 @@ class LookupTable:
     else in a storage buffer.
     """
 
-    def __init__(self, ctx: moderngl.Context, name: str, binding: int, values: npt.NDArray[Any]) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, name: str, binding: int, values: npt.NDArray[Any]
+    ) -> None:
         rows = table_rows(values, ctx)
         self.define = [] if rows is None else [f"{name} {len(rows)}"]
         self._binding, self._in_block = binding, rows is not None
@@ -417,7 +471,9 @@ def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[i
     return np.concatenate(tables), [0, *np.cumsum([len(one) for one in tables])[:-1].tolist()]
 
 
-def level_steps(edges: Sequence[Float32Array]) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:
+def level_steps(
+    edges: Sequence[Float32Array],
+) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:
     """The table of levels.glsl for planes that count these edges, and its `bins`; None where a
     bin has several thresholds.
     """
@@ -470,7 +526,11 @@ class Encoder:
         thresholds, first = joined(edges)
         counts = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
         rows = table_rows(thresholds, ctx) if rises else None
-        self._blocks = {place: ctx.buffer(one.tobytes()) for place, one in enumerate((steps, rows)) if one is not None}
+        self._blocks = {
+            place: ctx.buffer(one.tobytes())
+            for place, one in enumerate((steps, rows))
+            if one is not None
+        }
         if rows is not None:
             self._defines = (*self._defines, f"EDGES {len(rows)}")
         elif table is None or rises:
@@ -480,7 +540,10 @@ class Encoder:
             codes, begins = joined([one.first_code for one in tables])
             self._textures["first_code"] = self._texture(_rows(codes))
             each = zip(tables, begins, strict=True)
-            bins = [(one.first_bin, len(one.first_code) - 1, one.bin_shift, begin) for one, begin in each]
+            bins = [
+                (one.first_bin, len(one.first_code) - 1, one.bin_shift, begin)
+                for one, begin in each
+            ]
         else:
             bins = table[1]
             self._textures |= {} if steps is not None else {"steps": self._texture(_rows(table[0]))}
@@ -489,7 +552,9 @@ class Encoder:
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
         self._bins = bins, counts
         self._programs: dict[tuple[str, ...], moderngl.Program] = {}
-        self.sprite_program, self._whole = (self._program(vertex) for vertex in ("star.vert", "full.vert"))
+        self.sprite_program, self._whole = (
+            self._program(vertex) for vertex in ("star.vert", "full.vert")
+        )
         self.sprite_program["resolution_px"] = linear.size
         self._whole_vao = ctx.vertex_array(self._whole, [])
 
@@ -499,7 +564,11 @@ class Encoder:
         """
         if (key := (vertex, *of_tiles)) not in self._programs:
             include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
-            program = self._built(vertex=vertex, defines=(*self._defines, *(of_tiles or self._of_image)), include=include)
+            program = self._built(
+                vertex=vertex,
+                defines=(*self._defines, *(of_tiles or self._of_image)),
+                include=include,
+            )
             self._planes.set(program, bins=self._bins[0], thresholds=self._bins[1])
             if "Edges" in program:
                 cast(moderngl.UniformBlock, program["Edges"]).binding = 1
@@ -510,7 +579,9 @@ class Encoder:
     def _texture(self, values: npt.NDArray[Any]) -> moderngl.Texture:
         """A texture of float32 or uint32 `values` (height, width), read texel by texel."""
         dtype = "f4" if values.dtype == np.float32 else "u4"
-        texture = self._ctx.texture(values.shape[::-1], 1, np.ascontiguousarray(values), dtype=dtype)
+        texture = self._ctx.texture(
+            values.shape[::-1], 1, np.ascontiguousarray(values), dtype=dtype
+        )
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 
@@ -579,12 +650,22 @@ class Encoder:
     def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
-        given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))
-        for program, corners in [(self._program("tile.vert", *defines), corners) for corners, defines in given if len(corners)]:
+        given = (
+            (of_image, ()),
+            (tiles.face_levels, ("TILE",)),
+            (tiles.air_levels, ("TILE", "AIR")),
+        )
+        for program, corners in [
+            (self._program("tile.vert", *defines), corners)
+            for corners, defines in given
+            if len(corners)
+        ]:
             set_uniforms(program, uniforms)
             draw_tiles(program, corners, self._size_px, tiles.of_air)
         if (key := ("white",)) not in self._programs:
-            self._programs[key] = build_program(self._ctx, "tile.vert", "erase.frag", (f"LEVELS {self._white}u",))
+            self._programs[key] = build_program(
+                self._ctx, "tile.vert", "erase.frag", (f"LEVELS {self._white}u",)
+            )
         draw_tiles(self._programs[key], tiles.white, self._size_px)  # last, for sprites add to it
         self._fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
 

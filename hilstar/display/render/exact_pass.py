@@ -36,7 +36,10 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-PARTS = tuple(f"{one}.glsl" for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
+PARTS = tuple(
+    f"{one}.glsl"
+    for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")
+)
 LOCAL_SIZE = 32  # as in exact.comp
 FIRST_BINDING = 4  # first binding of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
@@ -74,7 +77,11 @@ class ExactPass:
         self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
         self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
-        self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
+        self._gain = (
+            None
+            if gain is None
+            else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
+        )
         self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
         self._turns = ctx.buffer(reserve=4, dynamic=True)
@@ -87,13 +94,43 @@ class ExactPass:
         """
         if (paths, summed, floor) in self._programs:
             return self._programs[paths, summed, floor]
-        order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
-        defines = [f"NEAR {order.near}", *self._level_defines, f"LINEAR {linear_format(self._planes)}"]
-        defines += [f"PLANE {self.plane}", f"KEPT {self._kept}", *self._planes.defines, *self._shares.defines]
-        defines += [f"SIZE {order.size}", f"FIRST ({order.first})", *self._order.define, *self._light.define]
+        order, panel, balance, together = (
+            self._pixels,
+            self._panel,
+            self._balance,
+            self._together is not None and not paths,
+        )
+        defines = [
+            f"NEAR {order.near}",
+            *self._level_defines,
+            f"LINEAR {linear_format(self._planes)}",
+        ]
+        defines += [
+            f"PLANE {self.plane}",
+            f"KEPT {self._kept}",
+            *self._planes.defines,
+            *self._shares.defines,
+        ]
+        defines += [
+            f"SIZE {order.size}",
+            f"FIRST ({order.first})",
+            *self._order.define,
+            *self._light.define,
+        ]
         narrow, uneven = min(balance.psf.width_px) < NARROW_PX, self._gain is not None
-        whether = {"MAKES_UP": any(self._makes_up), "LEAVES": self._kept == KEPT_BEFORE, "TOGETHER": together, "NARROW": narrow}
-        whether |= {"PATHS": paths, "UNIFORMITY": uneven, "TEMPORAL": self._memory is not None, "SUMS": summed, "FLOOR": floor}
+        whether = {
+            "MAKES_UP": any(self._makes_up),
+            "LEAVES": self._kept == KEPT_BEFORE,
+            "TOGETHER": together,
+            "NARROW": narrow,
+        }
+        whether |= {
+            "PATHS": paths,
+            "UNIFORMITY": uneven,
+            "TEMPORAL": self._memory is not None,
+            "SUMS": summed,
+            "FLOOR": floor,
+        }
         defines += [name for name, is_so in whether.items() if is_so]
         files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
@@ -107,14 +144,21 @@ class ExactPass:
             "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
             "fewest": self._quantiser.fewest(order),
             "white": panel.response.white,
-            "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
+            "first_threshold_e_per_s": float(
+                panel.response.threshold[0] * panel.flux_at_white_e_per_s
+            ),
             "resolution_px": self._linear.size,
             "odd": order.bias,
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
             "half_inverse_spread2": tuple(0.5 / variance for variance in balance.psf.variance_px2),
             "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
             "follows": (*balance.follows(3), *balance.follows(5)),
-            "weights": (weights.light, weights.moments, weights.window_light, weights.window_moments),
+            "weights": (
+                weights.light,
+                weights.moments,
+                weights.window_light,
+                weights.window_moments,
+            ),
             "few_steps": weights.few_steps,
             "last_light": weights.last_light,
         } | ({"gain": 0} if self._gain is not None else {})
@@ -137,20 +181,32 @@ class ExactPass:
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
         """The tables by which levels are chosen."""
-        return [self._order.buffer, self._light.buffer, *([] if self._gain is None else [self._gain])]
+        return [
+            self._order.buffer,
+            self._light.buffer,
+            *([] if self._gain is None else [self._gain]),
+        ]
 
-    def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
+    def draw(
+        self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None
+    ) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or
         else the linear image.
         """
         paths = sprites.per_star > 1
-        program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
+        program = self._program(
+            paths, passes is not None, passes is not None and passes.floor is not None
+        )
         if passes is None:
             self._linear.bind_to_image(1, read=True, write=False)
         else:
             passes.bind(program)
         if paths or passes is None or not self._planes.apart:  # else `passes` have an order
-            turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+            turns = (
+                stretches_of(sprites.star)
+                if paths
+                else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+            )
             write(self._turns, turns.astype(np.int32))
             self._turns.bind_to_storage_buffer(TURNS_BINDING)
         count = len(turns) if paths else len(sprites)
@@ -184,7 +240,9 @@ class Memory:
         self._ctx = ctx
         self._star: IntArray | None = None  # the last frame's stars
         self._room = 0
-        self._begins, self._before, self._left = (self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,)))
+        self._begins, self._before, self._left = (
+            self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,))
+        )
 
     def _reserved(self, size: int) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=max(self._room, 1) * size, dynamic=True)
@@ -207,7 +265,9 @@ class Memory:
             self._left.release()
             self._left = self._reserved(SUMS_BYTES)
         self._begins.write(begins)
-        for place, buffer in enumerate((self._begins, self._before, self._left), start=FIRST_BINDING):
+        for place, buffer in enumerate(
+            (self._begins, self._before, self._left), start=FIRST_BINDING
+        ):
             buffer.bind_to_storage_buffer(place)
         self._star = star.copy()
 
@@ -216,7 +276,9 @@ class Memory:
         """The errors of the last frame, read back; None at the beginning of a sequence."""
         if self._star is None:
             return None
-        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(-1, SUMS)
+        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(
+            -1, SUMS
+        )
         return Left(self._star, np.ascontiguousarray(sums.T))
 
     @left.setter
@@ -236,7 +298,9 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     """
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
-    box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))
+    box_3, box_5 = (
+        np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5)
+    )
     words = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
     return np.asarray(words, dtype=np.uint32)
 
@@ -252,9 +316,13 @@ def overrated(width_px: tuple[float, float]) -> float:
     if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px)
+    along_x, along_y = (
+        np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px
+    )
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
-    return OVERRATED * float((along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max())
+    return OVERRATED * float(
+        (along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max()
+    )
 
 
 def _ratio(place: float, width_px: float) -> float:
@@ -277,4 +345,6 @@ def stretches_of(star: IntArray) -> IntArray:
     path = np.repeat(np.arange(len(begins)), parts)
     number = np.arange(len(path)) - np.repeat(np.cumsum(parts) - parts, parts)
     first = begins[path] + number * CARRIED
-    return np.stack([first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1)
+    return np.stack(
+        [first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1
+    )

@@ -42,7 +42,11 @@ class ExtendedLayer:
         have as levels is left out.
         """
         ctx, regions, found = self._ctx, [], None
-        on_image = [(light, region) for light in lights if (region := light.region(self._resolution_px)) is not None]
+        on_image = [
+            (light, region)
+            for light in lights
+            if (region := light.region(self._resolution_px)) is not None
+        ]
         sure = sure if len(on_image) == 1 else None
         fbo.use()
         ctx.enable(moderngl.BLEND)
@@ -83,11 +87,15 @@ class ExtendedLayer:
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _draw_map(self, light: LightMap) -> None:
-        program, triangle = self._program("light_map.frag", (), *(() if light.cover is None else ("COVER",)))
+        program, triangle = self._program(
+            "light_map.frag", (), *(() if light.cover is None else ("COVER",))
+        )
         own = []
         for unit, image in enumerate((light.image, light.cover)):
             if image is not None:
-                texture = self._texture(image, image, 1) if light.lasting else self._upload(image, 1)
+                texture = (
+                    self._texture(image, image, 1) if light.lasting else self._upload(image, 1)
+                )
                 texture.use(unit)
                 own += [] if light.lasting else [texture]
         if light.cover is not None:
@@ -101,12 +109,16 @@ class ExtendedLayer:
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
         for corners, defines in ((tiles.face, ()), (tiles.air, ("AIR",))):
             if len(corners):
-                program, _ = self._program("tile.frag", ("tile.glsl",), *defines, vertex="tile.vert")
+                program, _ = self._program(
+                    "tile.frag", ("tile.glsl",), *defines, vertex="tile.vert"
+                )
                 program["covers"] = float(light.covers)
                 draw_tiles(program, corners, self._resolution_px, tiles.of_air)
         for corners, defines in ((tiles.inside, ("INSIDE",)), (tiles.edges, ())):
             if len(corners):
-                program, _ = self._with_rays("disc.frag", light.camera, *defines, vertex="tile.vert")
+                program, _ = self._with_rays(
+                    "disc.frag", light.camera, *defines, vertex="tile.vert"
+                )
                 _set_disc(program, light)
                 draw_tiles(program, corners, self._resolution_px)
 
@@ -120,7 +132,9 @@ class ExtendedLayer:
         program["focal_px"] = camera.focal_length_px
         if camera.lens is not None:
             shifts = self._texture(camera, None, 2)
-            program["nodes_per_px"] = tuple((n - 1) / size for n, size in zip(shifts.size, self._resolution_px, strict=True))
+            program["nodes_per_px"] = tuple(
+                (n - 1) / size for n, size in zip(shifts.size, self._resolution_px, strict=True)
+            )
             shifts.use(0)
         return program, triangle
 
@@ -144,7 +158,10 @@ class ExtendedLayer:
         if kept is None:
             if len(self._textures) >= KEPT_TEXTURES:
                 self._textures.pop(next(iter(self._textures)))[1].release()
-            kept = owner, self._upload(ray_shifts(owner) if isinstance(owner, Camera) else image, components)
+            kept = (
+                owner,
+                self._upload(ray_shifts(owner) if isinstance(owner, Camera) else image, components),
+            )
         self._textures[id(owner)] = kept  # the last used is the last to go
         return kept[1]
 

@@ -36,7 +36,9 @@ class HostImage:
     the same bits.
     """
 
-    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares
+    ) -> None:
         self._ctx, self._size_px, self._footprint_px = ctx, resolution_px, shares.footprint_px
         self._shares = shares
         footprint_px = shares.footprint_px
@@ -65,7 +67,10 @@ class HostImage:
         """
         width, height = self._size_px
         count = 0 if sprites is None else len(sprites)
-        if len(self._rows) * self._footprint_px**2 > MAX_ERASED * width * height or count > self._capacity:
+        if (
+            len(self._rows) * self._footprint_px**2 > MAX_ERASED * width * height
+            or count > self._capacity
+        ):
             self._light.clear()
             self._rows = self._rows[:0]
         if count > self._capacity:
@@ -101,7 +106,13 @@ class HostImage:
         """
         if bands == 1 or self._is_few(len(self._rows)):  # all, in any order
             return np.array([[0, len(self._rows)]])
-        return np.stack([np.searchsorted(self._rows, self._first_row), np.searchsorted(self._rows, self._end_row)], axis=1)
+        return np.stack(
+            [
+                np.searchsorted(self._rows, self._first_row),
+                np.searchsorted(self._rows, self._end_row),
+            ],
+            axis=1,
+        )
 
     def _run(self, ranges: npt.NDArray[np.int32], bands: int) -> None:
         """Make black and draw the sprites in these ranges of the buffer, in as many passes as

@@ -17,7 +17,14 @@ from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import MachineError, NotThereError
 from hilstar.display.quantise import FrameLight
 from hilstar.display.render.aids import LINE_SHARE, lay_over
-from hilstar.display.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target, as_maps
+from hilstar.display.render.backend import (
+    EGL_LIBRARY,
+    NO_FRAME,
+    Backend,
+    ScreenView,
+    Target,
+    as_maps,
+)
 from hilstar.display.render.reference import add_stars, extended_image
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
@@ -65,7 +72,9 @@ def headless_context(gpu: int | str | None = None) -> "Context | None":
 
 @lru_cache(maxsize=1)
 def _say_once(why: str) -> None:
-    log.warning("NumPy draws, slower than OpenGL would (%s); 'hilstar doctor' says what to install", why)
+    log.warning(
+        "NumPy draws, slower than OpenGL would (%s); 'hilstar doctor' says what to install", why
+    )
 
 
 class NumpyBackend(Backend):
@@ -100,7 +109,10 @@ class NumpyBackend(Backend):
             self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
 
     def _plane(self, frame: int, k: int, light: Sprites | None) -> Levels:
-        image, alone = partial(self._image, light, True, k), partial(self._image, light, False, k, stars=False)
+        image, alone = (
+            partial(self._image, light, True, k),
+            partial(self._image, light, False, k, stars=False),
+        )
         return self._quantisers[k].draw(FrameLight(light, image, alone, frame))
 
     def draw_linear(self, sprites: Sprites) -> None:
@@ -125,7 +137,9 @@ class NumpyBackend(Backend):
         """See `Backend.show_on`."""
         self._screen = view
 
-    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+    def present(
+        self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
+    ) -> None:
         """See `Backend.present`."""
         view = self._screen
         turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
@@ -134,8 +148,12 @@ class NumpyBackend(Backend):
         codes = np.zeros((height, width, 3), dtype=np.uint16)
         codes[: shown.shape[0], : shown.shape[1]] = shown if shown.ndim == 3 else shown[..., None]
         cross_x, cross_y = map(round, view.cross_px)
-        lay_over(codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y))
-        codes = np.rot90(codes, -turn.quarter_turns)[:: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1].copy()
+        lay_over(
+            codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y)
+        )
+        codes = np.rot90(codes, -turn.quarter_turns)[
+            :: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1
+        ].copy()
         codes[len(codes) - marker[0] :, : marker[0]] = marker[1]
         self.back_buffer = codes
 
@@ -157,7 +175,9 @@ class NumpyBackend(Backend):
     def close(self) -> None:
         """Do nothing."""
 
-    def _image(self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True) -> Float32Array:
+    def _image(
+        self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True
+    ) -> Float32Array:
         """The linear image of a plane, or its extended light; `shrunk` draws fainter stars
         within the target's `sides`.
         """
@@ -172,7 +192,10 @@ class NumpyBackend(Backend):
         sides_px = np.full(len(sprites), self.target.psf.footprint_px)
         rate = sprites.data["electrons_per_s"] * sprites.per_star
         if self.target.primaries:
-            rate = rate * (self.target.flux_at_white_e_per_s / self.target.primaries[plane].flux_at_white_e_per_s)
+            rate = rate * (
+                self.target.flux_at_white_e_per_s
+                / self.target.primaries[plane].flux_at_white_e_per_s
+            )
         for side in self.target.sides if shrunk else ():
             sides_px[rate < side.below_e_per_s] = side.side_px
         for side_px in np.unique(sides_px).tolist():

@@ -18,10 +18,18 @@ MAX_LEVELS = 2**16
 PRIMARIES = {"grey": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 
 
-def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8 | np.uint16]) -> moderngl.Texture:
+def level_texture(
+    context: moderngl.Context, levels: npt.NDArray[np.uint8 | np.uint16]
+) -> moderngl.Texture:
     """A texture of levels (height, width) that no renderer made."""
     with context:
-        texture = context.texture(levels.shape[::-1], 1, np.ascontiguousarray(levels), dtype=f"u{levels.itemsize}", alignment=1)
+        texture = context.texture(
+            levels.shape[::-1],
+            1,
+            np.ascontiguousarray(levels),
+            dtype=f"u{levels.itemsize}",
+            alignment=1,
+        )
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 
@@ -34,7 +42,9 @@ def window_context() -> moderngl.Context:
         settings: Any = {"libgl": GL_LIBRARY, "libx11": X11_LIBRARY}
         return moderngl.create_context(require=330, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
-        raise MachineError(f"the window's OpenGL is not there ({error}); install it: apt-get install libgl1") from error
+        raise MachineError(
+            f"the window's OpenGL is not there ({error}); install it: apt-get install libgl1"
+        ) from error
 
 
 def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
@@ -44,11 +54,17 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
     All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
     """
     codes = np.arange(2**bits, dtype=np.uint16)
-    triples = np.concatenate([np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()])
+    triples = np.concatenate(
+        [np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()]
+    )
     width, height = screen_px
     wrong, first = 0, ""
     for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
-        levels = (np.arange(width * height, dtype=np.uint32) % len(part)).astype(np.uint16).reshape(height, width)
+        levels = (
+            (np.arange(width * height, dtype=np.uint32) % len(part))
+            .astype(np.uint16)
+            .reshape(height, width)
+        )
         with context:
             texture = level_texture(context, levels)
             Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
@@ -56,7 +72,9 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error
             texture.release()
-        drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
+        drawn = np.rint(
+            np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1]
+        )
         differ = (drawn != part[levels]).any(axis=-1)
         changed = np.unique(levels[differ])
         if len(changed) and not wrong:
@@ -90,7 +108,10 @@ class Presenter:
         view, orientation = self._view, self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
         wanted = flips | {"STEALING": view.triples is not None, "APART": self._apart, "AIDS": aids}
-        defines = (f"QUARTER_TURNS {orientation.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
+        defines = (
+            f"QUARTER_TURNS {orientation.quarter_turns % 4}",
+            *(name for name, is_set in wanted.items() if is_set),
+        )
         program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,
@@ -110,7 +131,9 @@ class Presenter:
         padded = np.zeros((rows, TABLE_WIDTH, 3), dtype=np.uint16)
         padded.reshape(-1, 3)[: len(used)] = used
         with self._ctx:
-            self.table = self._ctx.texture((TABLE_WIDTH, rows), 3, padded.tobytes(), dtype="u2", alignment=2)
+            self.table = self._ctx.texture(
+                (TABLE_WIDTH, rows), 3, padded.tobytes(), dtype="u2", alignment=2
+            )
             self.table.filter = (moderngl.NEAREST, moderngl.NEAREST)
 
     def wait(self) -> None:
@@ -124,7 +147,9 @@ class Presenter:
             self._driver.take_back_buffer()
             self._driver.wait()
 
-    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+    def present(
+        self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
+    ) -> None:
         """Draw the last levels on the back buffer; see `Backend.present`."""
         with self._ctx:
             screen = self._ctx.screen

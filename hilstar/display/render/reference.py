@@ -15,7 +15,9 @@ RAYS_AT_ONCE = 2**14  # of a disc that are computed at once: few enough for a ca
 REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
-def linear_image(sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None) -> FloatArray:
+def linear_image(
+    sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None
+) -> FloatArray:
     """Electrons per second of each pixel, float64, shape (height, width): extended light, then
     sprites.
 
@@ -52,7 +54,12 @@ def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, 
 
 
 def add_stars(
-    image: FloatArray, sprites: Sprites, psf: Psf, side_px: int, some: IntArray | slice = slice(None), share: float = 1.0
+    image: FloatArray,
+    sprites: Sprites,
+    psf: Psf,
+    side_px: int,
+    some: IntArray | slice = slice(None),
+    share: float = 1.0,
 ) -> None:
     """Add a share of the light of `some` sprites to an image (height, width), each in a square
     of `side_px`, one by one.
@@ -64,7 +71,9 @@ def add_stars(
     for begin in range(0, len(data), at_once):
         part = slice(begin, begin + at_once)
         columns, rows = (data["pixel"][part, axis, None] + steps for axis in (0, 1))
-        of_pixels = psf.shares((columns - x_px[part, None])[:, None, :], (rows - y_px[part, None])[:, :, None])
+        of_pixels = psf.shares(
+            (columns - x_px[part, None])[:, None, :], (rows - y_px[part, None])[:, :, None]
+        )
         light = share * data["electrons_per_s"][part, None, None].astype(np.float64) * of_pixels
         on_x, on_y = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
         inside = on_y[:, :, None] & on_x[:, None, :]
@@ -77,7 +86,9 @@ def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
     y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
     u, v = light.camera.tangents(x.ravel(), y.ravel())
     seen = np.stack([u, v, np.ones_like(u)], axis=1)
-    angle = np.arctan2(np.linalg.norm(np.cross(light.direction_image, seen), axis=1), seen @ light.direction_image)
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(light.direction_image, seen), axis=1), seen @ light.direction_image
+    )
     profile = (1 + (angle / light.scale_rad) ** 2) ** (-light.exponent / 2)
     return np.asarray(light.peak_e_per_s * profile.reshape(height, width))
 
@@ -95,12 +106,16 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
         for size, first in ((width, left), (height, top))
     )
     at_once = max(1, RAYS_AT_ONCE // len(columns))
-    sharp = np.concatenate([_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1)
+    sharp = np.concatenate(
+        [_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1
+    )
     sigma = [RAYS_ACROSS * width_px for width_px in reversed(light.psf.width_px)]
     found = []
     for part in sharp:
         fine = gaussian_filter(part, sigma, mode="nearest", truncate=REACH_SIGMAS)
-        whole = fine.reshape(height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS).mean(axis=(1, 3))
+        whole = fine.reshape(
+            height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS
+        ).mean(axis=(1, 3))
         found.append(whole[margin : margin + height, margin : margin + width])
     return light.times * found[0], light.covers * found[1]
 

@@ -15,8 +15,22 @@ from hilstar.basics.arrays import Float32Array
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.display.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
-from hilstar.display.render.context import MAX_WRITTEN_BYTES, Context, check_limits, computes_in_software, create_context
+from hilstar.display.render.backend import (
+    NO_FRAME,
+    Backend,
+    ScreenView,
+    SpriteSide,
+    SpriteSides,
+    Target,
+    as_maps,
+)
+from hilstar.display.render.context import (
+    MAX_WRITTEN_BYTES,
+    Context,
+    check_limits,
+    computes_in_software,
+    create_context,
+)
 from hilstar.display.render.driver import Driver
 from hilstar.display.render.encoder import (
     CUT_WINGS,
@@ -64,15 +78,26 @@ class Renderer(Backend):
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
-        self._by_star = quantiser if target.response is not None and issubclass(quantiser, ExactQuantiser) else None
+        self._by_star = (
+            quantiser
+            if target.response is not None and issubclass(quantiser, ExactQuantiser)
+            else None
+        )
         self._last_frame = NO_FRAME
         self.context = self._ctx = context or create_context()
-        self.gl_renderer, self.gl_version = (str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION"))
+        self.gl_renderer, self.gl_version = (
+            str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION")
+        )
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
                 key = "sprite_sigma_px" if target.response else "psf_sigma_px"
-                check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.psf.width_px)}")
+                check_limits(
+                    self._ctx,
+                    target.resolution_px,
+                    self.footprint_px,
+                    f"{key} = {list(target.psf.width_px)}",
+                )
                 self._build()
         except BaseException:
             self._ctx.release()
@@ -133,13 +158,27 @@ class Renderer(Backend):
         self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
         by_star, ctx = self._by_star, self._ctx
         if by_star is not None and by_star.takes(target.psf, ctx.version_code):
-            left = ctx.buffer(reserve=4, dynamic=True) if planes.apart and not by_star.remembers else None
-            chosen = partial(ExactPass, by_star, target, planes, linear=self._linear, levels=self._levels, shares=self._shares)
+            left = (
+                ctx.buffer(reserve=4, dynamic=True)
+                if planes.apart and not by_star.remembers
+                else None
+            )
+            chosen = partial(
+                ExactPass,
+                by_star,
+                target,
+                planes,
+                linear=self._linear,
+                levels=self._levels,
+                shares=self._shares,
+            )
             self._exact_passes = [chosen(turn, left=left) for turn in target.in_turn()]
         if by_star is None or self._exact_passes:
             self._encoder = Encoder(ctx, self._linear, self._levels, planes, self._by_pixel)
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
-            sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
+            sides = (
+                () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
+            )
             self._lit_sides = self._wider(sides)
             set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
@@ -161,10 +200,15 @@ class Renderer(Backend):
         target, planes = self.target, self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            made, psf = ApartPasses if planes.apart else StarPasses, target.psf if self._by_star is not None else None
+            made, psf = (
+                ApartPasses if planes.apart else StarPasses,
+                target.psf if self._by_star is not None else None,
+            )
             self._passes = made(levels, planes, self._shares, units, psf)
             return
-        self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
+        self._unit_splat = splat_program(
+            self._ctx, target.resolution_px, self._shares, planes, in_units=True
+        )
         planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
         planes.set(encoder.sprite_program)
         for program in (self._unit_splat, encoder.sprite_program):
@@ -196,9 +240,15 @@ class Renderer(Backend):
             extended = sprites is not None and bool(sprites.extended)
             # Stars are added to levels of extended light, by passes or by NumPy.
             on_floor = extended and by_star is not None
-            units = None if extended and (not on_floor or passes is None or self._planes.apart) else self._units
+            units = (
+                None
+                if extended and (not on_floor or passes is None or self._planes.apart)
+                else self._units
+            )
             unit_e_per_s = None if units is None else units.unit_for(sprites)
-            self._by_numpy = by_star is not None and (not self._exact_passes or (on_floor and unit_e_per_s is None))
+            self._by_numpy = by_star is not None and (
+                not self._exact_passes or (on_floor and unit_e_per_s is None)
+            )
             if sprites is not None and not self._by_numpy:
                 sprites = self._planes.packed(sprites)
             if passes is not None and unit_e_per_s is not None:
@@ -260,24 +310,36 @@ class Renderer(Backend):
         """The linear image and its levels by rasterised sprites, in units where one is given."""
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
         sides = self._lit_sides if self._encoder is not None else ()
-        covered_px = 0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
+        covered_px = (
+            0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
+        )
         units, encoder, splat = self._units, self._encoder, self._unit_splat
         in_units = sprites is not None and unit_e_per_s is not None and splat is not None
         if units is not None and encoder is not None and splat is not None:
-            reach_per_e = 0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
+            reach_per_e = (
+                0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
+            )
             encoder.sprite_program["reach_per_e"] = reach_per_e
             if in_units and unit_e_per_s is not None:
                 splat["reach_per_e"] = reach_per_e
                 self._planes.set(splat, unit_e_per_s=unit_e_per_s)
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
-        sure = None if sprites is None or not sprites.extended or covered_px >= few_px else self._sure(self._by_pixel, sprites)
-        self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units, sure=sure)
+        sure = (
+            None
+            if sprites is None or not sprites.extended or covered_px >= few_px
+            else self._sure(self._by_pixel, sprites)
+        )
+        self._draw_linear(
+            sprites, whole=not (self.target.sides or cut), in_units=in_units, sure=sure
+        )
         if self._encoder is not None:
             with self._stage("encode"):
                 count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
                 uniforms = self._by_pixel.uniforms(self._last_frame)
                 lit = self._regions, self._tiles
-                self._encoder.draw(count, per_star, covered_px, uniforms, *lit, is_black=self._levels_black)
+                self._encoder.draw(
+                    count, per_star, covered_px, uniforms, *lit, is_black=self._levels_black
+                )
                 self._levels_black = True  # but for what this frame has
         if in_units or (cut and not self.target.sides) or self._tiles is not None:
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
@@ -306,7 +368,9 @@ class Renderer(Backend):
         if levels is None or by_star is None:
             return
         if not self._exact:
-            self._exact = {k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)}
+            self._exact = {
+                k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)
+            }
         for one in self._exact_passes:
             if (left := one.left) is not None:
                 self._exact[one.plane].left, one.left = left, None
@@ -314,7 +378,9 @@ class Renderer(Backend):
         if sprites is not None and sprites.extended:
             floor = self._floor(sprites, by_star.floor_turn(frame)).read()
         on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
-        self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
+        self._exact_levels = target.by_plane(
+            sprites, lambda k, light: self._exact[k].levels(light, on[k])
+        )
         levels.write(self._exact_levels)
 
     def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
@@ -325,12 +391,19 @@ class Renderer(Backend):
         """
         key = sprites.lights or sprites.extended, turn
         if self._floor_encoder is None or self._floor_levels is None:
-            self._floor_key, self._floor_levels = ((), 0.0), LevelTexture(self._ctx, self.target.resolution_px, self._planes)
-            self._floor_encoder = Encoder(self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser)
+            self._floor_key, self._floor_levels = (
+                ((), 0.0),
+                LevelTexture(self._ctx, self.target.resolution_px, self._planes),
+            )
+            self._floor_encoder = Encoder(
+                self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser
+            )
         if key != self._floor_key:
             self._erase(levels=False)
             self._draw_extended(sprites, self._sure(DitherQuantiser, None))
-            self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False)
+            self._floor_encoder.draw(
+                0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False
+            )
             self._floor_levels.in_memory = False
             self._floor_levels.read()
             self._floor_levels.in_memory = True  # read back once, for all frames that keep it
@@ -346,7 +419,9 @@ class Renderer(Backend):
         panel, (least, most) = self._planes.panels[0], self._gains
         white_e_per_s = panel.flux_at_white_e_per_s
         # The first step by the smallest threshold of a mask, at all of its turns
-        dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(panel.response.light[1]) * white_e_per_s / (2 * MASK_TURNS)
+        dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(
+            panel.response.light[1]
+        ) * white_e_per_s / (2 * MASK_TURNS)
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
@@ -360,11 +435,18 @@ class Renderer(Backend):
         fbo.color_mask = True, True, True, True
 
     def _draw_linear(
-        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: "Sure | None" = None
+        self,
+        sprites: Sprites | None,
+        whole: bool,
+        levels: bool = True,
+        in_units: bool = False,
+        sure: "Sure | None" = None,
     ) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn, sprites = None, as_maps(sprites, self.target)
-        self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
+        self._on_host = (
+            self._host is not None and whole and not (sprites is not None and sprites.extended)
+        )
         if self._host is not None and self._on_host:
             self._host.draw(sprites)
             return
@@ -390,7 +472,12 @@ class Renderer(Backend):
                     self._splat["sprites_per_star"] = float(sprites.per_star)
                 self._linear_fbo.use()
                 self._shares.bind()
-                self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+                self._linear_fbo.viewport = (
+                    -margin,
+                    -margin,
+                    width + 2 * margin,
+                    height + 2 * margin,
+                )
                 self._ctx.enable(moderngl.BLEND)
                 vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
                 if vao is not None:
@@ -401,7 +488,9 @@ class Renderer(Backend):
         """Make black what the last frame drew."""
         if levels and self._encoder is not None and self._levels is not None:
             # A clear waits for the encoder: the fewer changes from image to image, the faster.
-            self._levels_black = self._levels_black and not self._level_eraser.clears(self._last_count)
+            self._levels_black = self._levels_black and not self._level_eraser.clears(
+                self._last_count
+            )
             if self._levels_black:
                 self._level_eraser.erase(self._levels.fbo, self._last_count)
                 self._level_eraser.erase_regions(self._levels.fbo, self._regions)
@@ -447,10 +536,15 @@ class Renderer(Backend):
         """See `Backend.show_on`."""
         from hilstar.display.render.presenter import Presenter
 
-        self._screen, self._presenter = view, Presenter(self.codes_texture, view, apart=self._planes.apart)
+        self._screen, self._presenter = (
+            view,
+            Presenter(self.codes_texture, view, apart=self._planes.apart),
+        )
         self.tables.append(self._presenter.table)
 
-    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+    def present(
+        self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
+    ) -> None:
         """See `Backend.present`."""
         _ = self.codes_texture  # with the last levels
         self._presenter.present(overlay, patch_code, marker)

@@ -69,13 +69,18 @@ class LightUnits:
     large sprites are at most, and what light of a star alone they may leave out.
     """
 
-    def __init__(self, planes: Planes, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()) -> None:
+    def __init__(
+        self, planes: Planes, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()
+    ) -> None:
         panel, self._share = planes.lit, planes.share
         self._size_px, self._footprint_px = size_px, planes.footprint_px
         gain = panel.gain()
         low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
-        self.lit_e_per_s, self._white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
+        self.lit_e_per_s, self._white_e_per_s = (
+            float(thresholds[0]) / high,
+            panel.flux_at_white_e_per_s / low,
+        )
         self.most_e_per_s = [self._white_e_per_s * share for share in planes.share]
         self._peak_share = psf.peak_share
         self.axes_px2, self._share_bound = psf.reach
@@ -83,8 +88,13 @@ class LightUnits:
         # what part of the light that lights a pixel the squares leave out beside them at most: one
         # in so many
         if sides:
-            outside = [self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px)) for side in sides]
-            fewest = min([wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS)
+            outside = [
+                self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px))
+                for side in sides
+            ]
+            fewest = min(
+                [wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS
+            )
             self.wings = SQUARE_WINGS * max(1.0, fewest)
         more_px = planes.footprint_px - psf.footprint_px
         self.side_px = max((side.side_px + more_px for side in sides), default=self._footprint_px)
@@ -97,7 +107,11 @@ class LightUnits:
         A panel's table may have no bin with several thresholds.
         """
         size, side_px = 4 * size_px[0] * size_px[1] * len(planes.panels), planes.footprint_px
-        return size <= MAX_WRITTEN_BYTES and side_px * (side_px + 2) <= MAX_ROUNDS and level_steps(edges_of(planes)) is not None
+        return (
+            size <= MAX_WRITTEN_BYTES
+            and side_px * (side_px + 2) <= MAX_ROUNDS
+            and level_steps(edges_of(planes)) is not None
+        )
 
     def unit_for(self, sprites: Sprites | None) -> list[float] | None:
         """The unit of each plane (e-/s) in which no pixel's sum can be too large; None where one is
@@ -107,10 +121,20 @@ class LightUnits:
         """
         if sprites is None or not len(sprites):
             return self.most_e_per_s
-        rates = np.minimum(sprites.data["electrons_per_s"], np.float32(self._white_e_per_s / self._peak_share))
-        most_e_per_s = max(float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001, self._white_e_per_s)
-        units = [2.0 ** math.ceil(math.log2(most_e_per_s * share / (MAX_SUM - len(sprites)))) for share in self._share]
-        fine = all(unit <= self.lit_e_per_s * share * MAX_UNIT for unit, share in zip(units, self._share, strict=True))
+        rates = np.minimum(
+            sprites.data["electrons_per_s"], np.float32(self._white_e_per_s / self._peak_share)
+        )
+        most_e_per_s = max(
+            float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001, self._white_e_per_s
+        )
+        units = [
+            2.0 ** math.ceil(math.log2(most_e_per_s * share / (MAX_SUM - len(sprites))))
+            for share in self._share
+        ]
+        fine = all(
+            unit <= self.lit_e_per_s * share * MAX_UNIT
+            for unit, share in zip(units, self._share, strict=True)
+        )
         return units if fine else None
 
     def reach_per_e(self, sprites: Sprites, alone: bool = False) -> float:
@@ -119,8 +143,15 @@ class LightUnits:
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
-        denser = DENSER_WINGS if len(sprites) * self._footprint_px**2 > math.prod(self._size_px) else 1
-        return self._share_bound * sprites.per_star * (1.0 if alone else self.wings * denser) / self.lit_e_per_s
+        denser = (
+            DENSER_WINGS if len(sprites) * self._footprint_px**2 > math.prod(self._size_px) else 1
+        )
+        return (
+            self._share_bound
+            * sprites.per_star
+            * (1.0 if alone else self.wings * denser)
+            / self.lit_e_per_s
+        )
 
 
 class StarPasses:
@@ -133,13 +164,26 @@ class StarPasses:
     those in light.
     """
 
-    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
+    def __init__(
+        self,
+        levels: LevelTexture,
+        planes: Planes,
+        shares: Shares,
+        units: LightUnits,
+        exact_psf: Psf | None,
+    ) -> None:
         ctx = self._ctx = levels.texture.ctx
         self._levels, self._planes, self._units, self._shares = levels, planes, units, shares
         width, height = self._size_px = levels.texture.size
-        self._footprint_px, self._gain, (edges, *_) = planes.footprint_px, planes.panels[0].gain(), edges_of(planes)
+        self._footprint_px, self._gain, (edges, *_) = (
+            planes.footprint_px,
+            planes.panels[0].gain(),
+            edges_of(planes),
+        )
         self._counter = ThresholdCounter(edges)
-        self._dark_e_per_s = float(edges[0]) / (1.0 if self._gain is None else float(self._gain.max())) * (1 - 1e-6)
+        self._dark_e_per_s = (
+            float(edges[0]) / (1.0 if self._gain is None else float(self._gain.max())) * (1 - 1e-6)
+        )
         sums, self._sums = pinned(ctx, (height, width * len(planes.panels)), np.int32)
         self._unit_e_per_s: list[float] = []  # units of the sums
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
@@ -148,7 +192,10 @@ class StarPasses:
         self._square = np.add.outer(width * np.arange(side_px), np.arange(side_px)).ravel()
         self._images = sums, levels.image.reshape(height, -1)
         wide = [image.shape[1] // width * side_px for image in self._images]
-        self._squares = [sliding_window_view(image, (side_px, wide[k]), writeable=True) for k, image in enumerate(self._images)]
+        self._squares = [
+            sliding_window_view(image, (side_px, wide[k]), writeable=True)
+            for k, image in enumerate(self._images)
+        ]
         # row and column of the squares about sprites; None: anywhere
         self._corner: tuple[IntArray, IntArray] | None = None
         self._alone = 0  # how many stars need no sums, the first in an order
@@ -161,7 +208,9 @@ class StarPasses:
     def _program(self, *defines: str, last: Sequence[str] = ()) -> moderngl.ComputeShader:
         """A program of light.comp."""
         defines = (*defines, *self._levels.defines, *self._planes.defines, *self._shares.defines)
-        program = build_compute(self._ctx, "light.comp", defines, ("planes.glsl", "shares.glsl", "sums.glsl"), last)
+        program = build_compute(
+            self._ctx, "light.comp", defines, ("planes.glsl", "shares.glsl", "sums.glsl"), last
+        )
         program["resolution_px"], program["reach_px2"] = self._size_px, self._units.axes_px2
         self._planes.set(program, most_e_per_s=self._units.most_e_per_s)
         self._shares.set(program)
@@ -195,8 +244,12 @@ class StarPasses:
         for program in self._programs:
             program["reach_per_e"] = self._units.reach_per_e(sprites)
         (width, height), side_px, self._corner = self._size_px, self._footprint_px, None
-        if len(sprites) * side_px**2 <= MAX_GATHERED * width * height and side_px <= min(width, height):
-            x, y = np.clip(sprites.data["pixel"] - (side_px - 1) // 2, 0, (width - side_px, height - side_px)).T
+        if len(sprites) * side_px**2 <= MAX_GATHERED * width * height and side_px <= min(
+            width, height
+        ):
+            x, y = np.clip(
+                sprites.data["pixel"] - (side_px - 1) // 2, 0, (width - side_px, height - side_px)
+            ).T
             self._corner = y, x
 
     def add_light(self, unit_e_per_s: list[float]) -> None:
@@ -223,7 +276,11 @@ class StarPasses:
     def bind(self, program: moderngl.ComputeShader) -> None:
         """Let another program look at the sums (see shaders/sums.glsl) and change levels."""
         self._planes.set(program, unit_e_per_s=self._unit_e_per_s)
-        for binding, buffer in ((0, self.sprites), (SUMS_BINDING, self._sums), (LEVELS_BINDING, self._levels.memory)):
+        for binding, buffer in (
+            (0, self.sprites),
+            (SUMS_BINDING, self._sums),
+            (LEVELS_BINDING, self._levels.memory),
+        ):
             if buffer is not None:
                 buffer.bind_to_storage_buffer(binding)
 
@@ -245,17 +302,35 @@ class ApartPasses(StarPasses):
     There each pixel's three levels lie beside each other, which NumPy would look for three times.
     """
 
-    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
+    def __init__(
+        self,
+        levels: LevelTexture,
+        planes: Planes,
+        shares: Shares,
+        units: LightUnits,
+        exact_psf: Psf | None,
+    ) -> None:
         super().__init__(levels, planes, shares, units, exact_psf)
         table, gain = level_steps(edges_of(planes)), self._gain
         if table is None:
             raise ValueError("several thresholds in a bin; ask `LightUnits.takes` first")
         self._steps = LookupTable(self._ctx, "STEPS", STEPS_BINDING, table[0])
-        self._gains = None if gain is None else self._ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
-        of_levels = ("LEVELS", f"FOOTPRINT {units.side_px}", *self._steps.define, *["UNIFORMITY"] * (gain is not None))
+        self._gains = (
+            None
+            if gain is None
+            else self._ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
+        )
+        of_levels = (
+            "LEVELS",
+            f"FOOTPRINT {units.side_px}",
+            *self._steps.define,
+            *["UNIFORMITY"] * (gain is not None),
+        )
         self._programs.append(self._program(*of_levels, last=["levels.glsl"]))
         planes.set(self._programs[1], bins=table[1])
-        self._least_reach = 0.0 if exact_psf is None else 0.5 * PixelOrder(exact_psf).near_sigmas(PHASE_PX) ** 2
+        self._least_reach = (
+            0.0 if exact_psf is None else 0.5 * PixelOrder(exact_psf).near_sigmas(PHASE_PX) ** 2
+        )
         self._order = self._ctx.buffer(reserve=4, dynamic=True)
         self.tables += [self._steps.buffer, *([] if self._gains is None else [self._gains])]
 
@@ -264,19 +339,31 @@ class ApartPasses(StarPasses):
         alike light one after another.
         """
         super().upload(sprites)
-        reach_per_e, rates = self._units.reach_per_e(sprites), np.ascontiguousarray(sprites.data["electrons_per_s"])
+        reach_per_e, rates = (
+            self._units.reach_per_e(sprites),
+            np.ascontiguousarray(sprites.data["electrons_per_s"]),
+        )
         crowded = np.ones(len(sprites), dtype=np.bool_)
         # else few do
-        if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(self._size_px):
-            squares = np.maximum(np.log(np.maximum(reach_per_e * rates, 1e-30)), self._least_reach) * max(self._units.axes_px2)
-            crowded = crowded_at(sprites.x_px, sprites.y_px, np.sqrt(squares) + math.hypot(*self._planes.margin_px))
+        if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(
+            self._size_px
+        ):
+            squares = np.maximum(
+                np.log(np.maximum(reach_per_e * rates, 1e-30)), self._least_reach
+            ) * max(self._units.axes_px2)
+            crowded = crowded_at(
+                sprites.x_px, sprites.y_px, np.sqrt(squares) + math.hypot(*self._planes.margin_px)
+            )
         order = turns_of(rates, self._units.lit_e_per_s)
         last = crowded[order]
         order = np.concatenate([order[~last], order[last]]).astype(np.int32)
         write(self._order, order)
         self._alone = len(order) - int(np.count_nonzero(last))
         for program in self._programs:
-            program["alone"], program["reach_of_alone_per_e"] = self._alone, self._units.reach_per_e(sprites, alone=True)
+            program["alone"], program["reach_of_alone_per_e"] = (
+                self._alone,
+                self._units.reach_per_e(sprites, alone=True),
+            )
 
     def encode(self) -> None:
         """Make levels of the sums under the sprites, the nearest."""
@@ -307,8 +394,12 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
     runs = max(1, min(count // RUN, MAX_RUNS))
     # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows
     # by a pixel or two.
-    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (np.float32(step_e_per_s).view(np.int32) >> 22)
-    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
+    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (
+        np.float32(step_e_per_s).view(np.int32) >> 22
+    )
+    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(
+        half_octaves, 0, HALF_OCTAVES - 1
+    )
     # 16-bit keys are sorted by radix
     return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))
 
@@ -322,7 +413,13 @@ def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> Bool
     strip, long = np.floor(x_px / max(most_px, STRIP_PX)), high - low + 2 * most_px
     key = strip * long + (y_px - low)
     order = key.argsort()
-    x, y, reach, key, crowded = x_px[order], y_px[order], reach_px[order], key[order], np.zeros(len(x_px), dtype=np.bool_)
+    x, y, reach, key, crowded = (
+        x_px[order],
+        y_px[order],
+        reach_px[order],
+        key[order],
+        np.zeros(len(x_px), dtype=np.bool_),
+    )
     count = key.searchsorted(key + (reach + most_px / 2)) - np.arange(1, len(key) + 1)
     pairs = [(np.arange(1, len(key) + 1), np.maximum(count, 0))]
     if strip.max() > strip.min():
@@ -332,6 +429,8 @@ def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> Bool
         end = count.cumsum()
         one = np.repeat(np.arange(len(key)), count)
         other = np.arange(end[-1]) + np.repeat(first - (end - count), count)
-        meet = (x[one] - x[other]) ** 2 + (y[one] - y[other]) ** 2 <= (reach[one] + reach[other]) ** 2
+        meet = (x[one] - x[other]) ** 2 + (y[one] - y[other]) ** 2 <= (
+            reach[one] + reach[other]
+        ) ** 2
         crowded[one[meet]] = crowded[other[meet]] = True
     return np.asarray(crowded[order.argsort()])

@@ -60,7 +60,9 @@ class VariantRenderer(Renderer):
             self._shares = Shares(self._ctx, self.target.psf, self.footprint_px)
             if variant.profile == "erf":  # where a polynomial would do
                 self._shares.defines = ()
-            self._splat = splat_program(self._ctx, self.target.resolution_px, self._shares, self._planes)
+            self._splat = splat_program(
+                self._ctx, self.target.resolution_px, self._shares, self._planes
+            )
         else:
             define = variant.profile.upper().replace(" ", "_")
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
@@ -70,8 +72,12 @@ class VariantRenderer(Renderer):
                 # its footprint's edge
                 reach_px, size = self.footprint_px / 2 + 1, variant.table_size
                 offset_px = np.linspace(0, reach_px, size)
-                shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1)
-                self._table = self._ctx.texture((size, 1), 2, shares.astype(np.float32).tobytes(), dtype="f4")
+                shares = np.stack(
+                    [pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1
+                )
+                self._table = self._ctx.texture(
+                    (size, 1), 2, shares.astype(np.float32).tobytes(), dtype="f4"
+                )
                 self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
                 self._table.use(0)
                 self._splat["samples_per_px"] = (size - 1) / reach_px

@@ -32,7 +32,11 @@ class Awake:
     def __init__(self) -> None:
         program = [sys.executable, "-I", "-S", __file__]
         self._process = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+            program,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         self._wait()  # GLFW sets a screen saver of its own aside, and must not be the first
 
@@ -46,7 +50,10 @@ class Awake:
             self._process.stdout.close()
 
     def _wait(self) -> None:
-        if self._process.stdout is not None and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]:
+        if (
+            self._process.stdout is not None
+            and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]
+        ):
             os.read(self._process.stdout.fileno(), 1)
         self._process.poll()  # the one that was begun ends at once, and leaves the other behind
 
@@ -76,7 +83,9 @@ class _Server:
             raise OSError("no X server")
         self._display: Any = ctypes.c_void_p(opened)
         number = ctypes.c_int()
-        query = self._xext.DPMSQueryExtension(self._display, ctypes.byref(number), ctypes.byref(number))
+        query = self._xext.DPMSQueryExtension(
+            self._display, ctypes.byref(number), ctypes.byref(number)
+        )
         self._has_dpms = bool(query and self._xext.DPMSCapable(self._display))
 
     def blanking(self) -> _Blanking:
@@ -94,7 +103,9 @@ class _Server:
             self._xext.DPMSForceLevel(self._display, DPMS_ON)
             self._xext.DPMSDisable(self._display)
         self._x11.XForceScreenSaver(self._display, SCREEN_SAVER_RESET)
-        self._x11.XSetScreenSaver(self._display, 0, found.interval_s, DONT_PREFER_BLANKING, found.allow)
+        self._x11.XSetScreenSaver(
+            self._display, 0, found.interval_s, DONT_PREFER_BLANKING, found.allow
+        )
         self._x11.XSync(self._display, 0)
 
     def restore(self, before: _Blanking) -> None:

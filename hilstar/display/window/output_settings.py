@@ -61,7 +61,9 @@ class OutputState:
         """The output for a person."""
         width, height = self.mode_px
         parts = [f"{self.name}, {width} x {height}"]
-        parts += [f"{name} {_words(value)}" for name, value in sorted((self.properties or {}).items())]
+        parts += [
+            f"{name} {_words(value)}" for name, value in sorted((self.properties or {}).items())
+        ]
         return "; ".join(parts) + ("" if self.properties else "; no properties")
 
 
@@ -74,7 +76,9 @@ class Finding(NamedTuple):
     refused: bool
 
 
-def property_value(kind: str, form: int, items: tuple[int, ...], names: Callable[[int], str]) -> Value | None:
+def property_value(
+    kind: str, form: int, items: tuple[int, ...], names: Callable[[int], str]
+) -> Value | None:
     """The value of a property of type `kind` with items of `form` bits; `names` resolves atoms.
     None for none, or a table.
     """
@@ -87,7 +91,9 @@ def property_value(kind: str, form: int, items: tuple[int, ...], names: Callable
     return items[0] if len(items) == 1 else items
 
 
-def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None) -> Iterator[Finding]:
+def findings(
+    state: OutputState, bits: int, pixel_pitch_um: float | None = None
+) -> Iterator[Finding]:
     """The faults of an output that shows codes of `bits` bits on pixels of that pitch (None: not
     known).
     """
@@ -96,7 +102,10 @@ def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None)
         verdict = RIGHT if value is None else rule.judge(value, bits)
         if value is not None and verdict != RIGHT:
             mend = rule.mend.format(output=state.name, name=rule.name, bits=bits)
-            yield Finding(f"{rule.name} of {state.name} is {_words(value)}: {rule.why}; {mend}", verdict == WRONG)
+            yield Finding(
+                f"{rule.name} of {state.name} is {_words(value)}: {rule.why}; {mend}",
+                verdict == WRONG,
+            )
     yield from _geometry_findings(state)
     found = _own_pitch_um(state.edid)
     if (
@@ -113,7 +122,10 @@ def _geometry_findings(state: OutputState) -> Iterator[Finding]:
     off = max(abs(a - b) for a, b in zip(state.transform, IDENTITY, strict=True))
     if off > TRANSFORM_TOLERANCE:
         mend = f"xrandr --output {state.name} --transform none"
-        yield Finding(f"{state.name} has a transform (fractional scaling), which resamples every frame; {mend}", True)
+        yield Finding(
+            f"{state.name} has a transform (fractional scaling), which resamples every frame; {mend}",
+            True,
+        )
     if state.preferred_px and state.mode_px not in state.preferred_px:
         width, height = state.mode_px
         wide, high = state.preferred_px[0]
@@ -127,7 +139,9 @@ def _geometry_findings(state: OutputState) -> Iterator[Finding]:
     if len(state.providers) > 1:
         gpus = f"the X screen has {len(state.providers)} GPUs ({', '.join(state.providers)})"
         mend = "plug the monitor into the GPU that draws, or draw by its own (xrandr --listproviders; DRI_PRIME=0)"
-        yield Finding(f"{gpus}: frames may be copied from one to the other, a refresh late; {mend}", False)
+        yield Finding(
+            f"{gpus}: frames may be copied from one to the other, a refresh late; {mend}", False
+        )
 
 
 def size_mm_of(edid: bytes) -> Pair | None:
@@ -196,10 +210,18 @@ def _identity_matrix(value: Value, bits: int) -> str:
     """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0
     where none is set.
     """
-    halves = np.array([value] if isinstance(value, int) else value).astype(np.int64) & 0xFFFFFFFF if value else np.zeros(1)
+    halves = (
+        np.array([value] if isinstance(value, int) else value).astype(np.int64) & 0xFFFFFFFF
+        if value
+        else np.zeros(1)
+    )
     if not np.any(halves):
         return RIGHT
-    return RIGHT if halves.tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1] else WRONG
+    return (
+        RIGHT
+        if halves.tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+        else WRONG
+    )
 
 
 def _set(value: str) -> str:
@@ -212,7 +234,12 @@ def _by_nvidia(attribute: str) -> str:
 
 DITHERS = "the driver adds a pattern to every code"
 RULES = (
-    _Rule("Broadcast RGB", _one_of("full", "automatic"), "codes go to 16 to 235, always or at television modes", _set("Full")),
+    _Rule(
+        "Broadcast RGB",
+        _one_of("full", "automatic"),
+        "codes go to 16 to 235, always or at television modes",
+        _set("Full"),
+    ),
     _Rule("output_csc", _one_of("bypass"), "codes are converted on their way", _set("bypass")),
     _Rule(
         "max bpc",
@@ -222,25 +249,67 @@ RULES = (
     ),
     _Rule("dithering mode", _one_of("off"), DITHERS, _set("off")),
     _Rule("dither", _one_of("off"), DITHERS, _set("off")),
-    _Rule("CTM", _identity_matrix, "a colour matrix mixes the primaries", _set("0,1,0,0,0,0,0,0,0,1,0,0,0,0,0,0,0,1")),
+    _Rule(
+        "CTM",
+        _identity_matrix,
+        "a colour matrix mixes the primaries",
+        _set("0,1,0,0,0,0,0,0,0,1,0,0,0,0,0,0,0,1"),
+    ),
     _Rule("Colorspace", _one_of("default"), "the panel converts colours", _set("Default")),
     _Rule("HDR_OUTPUT_METADATA", _one_of("0"), "the panel maps tones (HDR)", _set("0")),
-    _Rule("underscan", _one_of("off", "auto"), "frames are scaled down, always or on a television", _set("off")),
+    _Rule(
+        "underscan",
+        _one_of("off", "auto"),
+        "frames are scaled down, always or on a television",
+        _set("off"),
+    ),
     *(
         _Rule(f"{side} margin", _one_of("0"), "frames are scaled to leave a margin", _set("0"))
         for side in ("left", "right", "top", "bottom")
     ),
-    _Rule("abm level", _one_of("0"), "the driver dims the backlight and lifts codes by the picture", _set("0")),
+    _Rule(
+        "abm level",
+        _one_of("0"),
+        "the driver dims the backlight and lifts codes by the picture",
+        _set("0"),
+    ),
     _Rule("vibrant hue", _one_of("90"), "the driver turns hues", _set("90")),
     _Rule("color vibrance", _one_of("150"), "the driver saturates colours", _set("150")),
     _Rule("VRR_ENABLED", _one_of("0,off"), "the refresh follows the frames", _set("0")),
     _Rule("adaptive-sync", _one_of("0,off"), "the refresh follows the frames", _set("0")),
     _Rule("freesync", _one_of("0,off"), "the refresh follows the frames", _set("0")),
-    _Rule("TearFree", _doubtful_unless("off,auto"), "frames are copied once more, and may come a refresh late", _set("off")),
-    _Rule("content type", _doubtful_unless("no data,graphics"), "the monitor may process pictures by it", _set("Graphics")),
+    _Rule(
+        "TearFree",
+        _doubtful_unless("off,auto"),
+        "frames are copied once more, and may come a refresh late",
+        _set("off"),
+    ),
+    _Rule(
+        "content type",
+        _doubtful_unless("no data,graphics"),
+        "the monitor may process pictures by it",
+        _set("Graphics"),
+    ),
     _Rule(f"{NVIDIA}CurrentDithering", _one_of("0"), DITHERS, _by_nvidia("Dithering=2")),
-    _Rule(f"{NVIDIA}CurrentColorRange", _one_of("0"), "codes go to 16 to 235", _by_nvidia("ColorRange=0")),
-    _Rule(f"{NVIDIA}CurrentColorSpace", _one_of("0"), "codes are converted to YCbCr", _by_nvidia("ColorSpace=0")),
-    _Rule(f"{NVIDIA}DigitalVibrance", _one_of("0"), "the driver saturates colours", _by_nvidia("DigitalVibrance=0")),
+    _Rule(
+        f"{NVIDIA}CurrentColorRange",
+        _one_of("0"),
+        "codes go to 16 to 235",
+        _by_nvidia("ColorRange=0"),
+    ),
+    _Rule(
+        f"{NVIDIA}CurrentColorSpace",
+        _one_of("0"),
+        "codes are converted to YCbCr",
+        _by_nvidia("ColorSpace=0"),
+    ),
+    _Rule(
+        f"{NVIDIA}DigitalVibrance",
+        _one_of("0"),
+        "the driver saturates colours",
+        _by_nvidia("DigitalVibrance=0"),
+    ),
 )
-NVIDIA_ATTRIBUTES = tuple(rule.name.removeprefix(NVIDIA) for rule in RULES if rule.name.startswith(NVIDIA))
+NVIDIA_ATTRIBUTES = tuple(
+    rule.name.removeprefix(NVIDIA) for rule in RULES if rule.name.startswith(NVIDIA)
+)

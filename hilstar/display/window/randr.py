@@ -13,8 +13,26 @@ from dataclasses import replace
 from typing import Any
 
 from hilstar.basics.process.closing import Closing
-from hilstar.display.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
-from hilstar.display.window.x11 import INT, NUMBER, POINTER, TEXT, Survival, has_extension, is_composited, load_library, xlib
+from hilstar.display.window.output_settings import (
+    IDENTITY,
+    NVIDIA,
+    NVIDIA_ATTRIBUTES,
+    OutputState,
+    Pair,
+    Value,
+    property_value,
+)
+from hilstar.display.window.x11 import (
+    INT,
+    NUMBER,
+    POINTER,
+    TEXT,
+    Survival,
+    has_extension,
+    is_composited,
+    load_library,
+    xlib,
+)
 
 XRANDR_LIBRARY = "libXrandr.so.2"
 ROTATE_0 = 1  # randr.h
@@ -28,33 +46,67 @@ _Id, _Ids, UINT = NUMBER, ctypes.POINTER(NUMBER), ctypes.c_uint
 # XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
 class _Mode(ctypes.Structure):
     _fields_ = (
-        *(("id", _Id), ("width", UINT), ("height", UINT), ("dot_clock", NUMBER), ("sync", UINT * 7)),
+        *(
+            ("id", _Id),
+            ("width", UINT),
+            ("height", UINT),
+            ("dot_clock", NUMBER),
+            ("sync", UINT * 7),
+        ),
         *(("name", POINTER), ("name_length", UINT), ("flags", NUMBER)),
     )
 
 
 class _Resources(ctypes.Structure):  # XRRScreenResources
     _fields_ = (
-        *(("times", NUMBER * 2), ("ncrtc", INT), ("crtcs", _Ids), ("noutput", INT), ("outputs", _Ids)),
+        *(
+            ("times", NUMBER * 2),
+            ("ncrtc", INT),
+            ("crtcs", _Ids),
+            ("noutput", INT),
+            ("outputs", _Ids),
+        ),
         *(("nmode", INT), ("modes", ctypes.POINTER(_Mode))),
     )
 
 
 class _Output(ctypes.Structure):  # XRROutputInfo
     _fields_ = (
-        *(("time", NUMBER), ("crtc", _Id), ("name", TEXT), ("name_length", INT), ("size_mm", NUMBER * 2)),
-        *(("connection", ctypes.c_ushort), ("subpixels", ctypes.c_ushort), ("ncrtc", INT), ("crtcs", _Ids)),
+        *(
+            ("time", NUMBER),
+            ("crtc", _Id),
+            ("name", TEXT),
+            ("name_length", INT),
+            ("size_mm", NUMBER * 2),
+        ),
+        *(
+            ("connection", ctypes.c_ushort),
+            ("subpixels", ctypes.c_ushort),
+            ("ncrtc", INT),
+            ("crtcs", _Ids),
+        ),
         *(("nclone", INT), ("clones", _Ids), ("nmode", INT), ("npreferred", INT), ("modes", _Ids)),
     )
 
 
 class _Crtc(ctypes.Structure):  # XRRCrtcInfo, its beginning
-    _fields_ = (("time", NUMBER), ("corner", INT * 2), ("size", UINT * 2), ("mode", _Id), ("rotation", ctypes.c_ushort))
+    _fields_ = (
+        ("time", NUMBER),
+        ("corner", INT * 2),
+        ("size", UINT * 2),
+        ("mode", _Id),
+        ("rotation", ctypes.c_ushort),
+    )
 
 
 class _Transform(ctypes.Structure):  # XRRCrtcTransformAttributes
     _fields_ = (
-        *(("pending", INT * 9), ("pending_filter", POINTER), ("pending_count", INT), ("pending_parameters", POINTER)),
+        *(
+            ("pending", INT * 9),
+            ("pending_filter", POINTER),
+            ("pending_count", INT),
+            ("pending_parameters", POINTER),
+        ),
         *(("current", INT * 9), ("current_filter", POINTER)),
     )
 
@@ -69,7 +121,13 @@ class _Providers(ctypes.Structure):  # XRRProviderResources
 
 class _Provider(ctypes.Structure):  # XRRProviderInfo, its beginning
     _fields_ = (
-        *(("capabilities", UINT), ("ncrtcs", INT), ("crtcs", _Ids), ("noutputs", INT), ("outputs", _Ids)),
+        *(
+            ("capabilities", UINT),
+            ("ncrtcs", INT),
+            ("crtcs", _Ids),
+            ("noutputs", INT),
+            ("outputs", _Ids),
+        ),
         ("name", TEXT),
     )
 
@@ -81,12 +139,28 @@ XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "XRRGetCrtcGamma": (POINTER, POINTER, _Id),
     "XRRGetCrtcTransform": (INT, POINTER, _Id, POINTER),
     "XRRListOutputProperties": (_Ids, POINTER, _Id, POINTER),
-    "XRRGetOutputProperty": (INT, POINTER, _Id, _Id, *[ctypes.c_long] * 2, *[INT] * 2, _Id, *[POINTER] * 5),
+    "XRRGetOutputProperty": (
+        INT,
+        POINTER,
+        _Id,
+        _Id,
+        *[ctypes.c_long] * 2,
+        *[INT] * 2,
+        _Id,
+        *[POINTER] * 5,
+    ),
     "XRRGetProviderResources": (POINTER, POINTER, _Id),
     "XRRGetProviderInfo": (POINTER, POINTER, POINTER, _Id),
 } | {
     f"XRRFree{what}": (None, POINTER)
-    for what in ("ScreenResources", "OutputInfo", "CrtcInfo", "Gamma", "ProviderResources", "ProviderInfo")
+    for what in (
+        "ScreenResources",
+        "OutputInfo",
+        "CrtcInfo",
+        "Gamma",
+        "ProviderResources",
+        "ProviderInfo",
+    )
 }
 
 
@@ -127,12 +201,19 @@ class Randr(Closing):
             modes = {mode.id: mode for mode in resources.modes[: resources.nmode]}
             for number in resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
-                    state = None if output is None or not output.crtc else self._state(resources, number, output, modes)
+                    state = (
+                        None
+                        if output is None or not output.crtc
+                        else self._state(resources, number, output, modes)
+                    )
                 lit += [] if state is None else [state]
         providers = self._providers()
         names = [state.name for state in lit]
         others = [tuple(name for name in names if name != state.name) for state in lit]
-        return [replace(state, others=rest, providers=providers) for state, rest in zip(lit, others, strict=True)]
+        return [
+            replace(state, others=rest, providers=providers)
+            for state, rest in zip(lit, others, strict=True)
+        ]
 
     def ramp(self, name: str) -> bytes:
         """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b""
@@ -152,9 +233,14 @@ class Randr(Closing):
 
     def additions(self) -> dict[str, bool]:
         """What may stand between X and the displays, and whether it does."""
-        return {"XWayland": has_extension(self._display, b"XWAYLAND"), "a compositing manager": is_composited(self._display)}
+        return {
+            "XWayland": has_extension(self._display, b"XWAYLAND"),
+            "a compositing manager": is_composited(self._display),
+        }
 
-    def _state(self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]) -> OutputState | None:
+    def _state(
+        self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]
+    ) -> OutputState | None:
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
         with self._got(_Crtc, self._xrandr.XRRFreeCrtcInfo, crtc) as now:
             if now is None or now.mode not in modes:
@@ -168,17 +254,26 @@ class Randr(Closing):
             name=name,
             mode_px=_size_px(mode),
             refresh_hz=mode.dot_clock / pixels if pixels else 0.0,
-            preferred_px=tuple(dict.fromkeys(_size_px(modes[k]) for k in output.modes[: output.npreferred] if k in modes)),
+            preferred_px=tuple(
+                dict.fromkeys(
+                    _size_px(modes[k]) for k in output.modes[: output.npreferred] if k in modes
+                )
+            ),
             transform=self._transform(output.crtc),
             rotated=rotated,
-            properties={key: value for key, value in properties.items() if not isinstance(value, bytes)}
+            properties={
+                key: value for key, value in properties.items() if not isinstance(value, bytes)
+            }
             | self._of_nvidia(name),
             edid=edid if isinstance(edid, bytes) else b"",
         )
 
     def _transform(self, crtc: int) -> tuple[float, ...]:
         pointer = ctypes.POINTER(_Transform)()
-        if not self._xrandr.XRRGetCrtcTransform(self._display, crtc, ctypes.byref(pointer)) or not pointer:
+        if (
+            not self._xrandr.XRRGetCrtcTransform(self._display, crtc, ctypes.byref(pointer))
+            or not pointer
+        ):
             return IDENTITY
         current = tuple(value / FIXED_ONE for value in pointer.contents.current)
         self._x11.XFree(ctypes.cast(pointer, POINTER))
@@ -199,7 +294,9 @@ class Randr(Closing):
         kind, form = ctypes.c_ulong(), ctypes.c_int()
         count, rest, data = ctypes.c_ulong(), ctypes.c_ulong(), POINTER()
         results = (ctypes.byref(part) for part in (kind, form, count, rest, data))
-        failed = self._xrandr.XRRGetOutputProperty(self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results)
+        failed = self._xrandr.XRRGetOutputProperty(
+            self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results
+        )
         if failed or not data.value:
             return None
         # Xlib gives 32 bits as long
@@ -208,7 +305,9 @@ class Randr(Closing):
         self._x11.XFree(data)
         if raw and form.value == BYTE_BITS:
             return bytes(items)
-        return property_value(self._atom(kind.value) if kind.value else "", form.value, items, self._atom)
+        return property_value(
+            self._atom(kind.value) if kind.value else "", form.value, items, self._atom
+        )
 
     def _atom(self, atom: int) -> str:
         name = self._x11.XGetAtomName(self._display, atom)
@@ -225,7 +324,9 @@ class Randr(Closing):
         names = []
         with self._resources() as resources:
             for number in () if resources is None else numbers:
-                found = self._xrandr.XRRGetProviderInfo(self._display, ctypes.byref(resources), number)
+                found = self._xrandr.XRRGetProviderInfo(
+                    self._display, ctypes.byref(resources), number
+                )
                 with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, found) as provider:
                     names.append("" if provider is None else _name(provider))
         return tuple(names)
@@ -234,12 +335,16 @@ class Randr(Closing):
         """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of
         it.
         """
-        tool = shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
+        tool = (
+            shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
+        )
         values: dict[str, Value] = {}
         for attribute in () if tool is None else NVIDIA_ATTRIBUTES:
             command = [str(tool), "-t", "-q", f"[DPY:{output}]/{attribute}"]
             try:
-                said = subprocess.run(command, capture_output=True, text=True, timeout=NVIDIA_S, check=False).stdout.strip()
+                said = subprocess.run(
+                    command, capture_output=True, text=True, timeout=NVIDIA_S, check=False
+                ).stdout.strip()
             except (OSError, subprocess.TimeoutExpired):
                 break
             if said.removeprefix("-").isdecimal():

@@ -36,7 +36,11 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
         ramp, adds = randr.ramp(display.name), randr.additions()
         for state in randr.outputs():
             if state.name == display.name:
-                edid, refresh_hz, adds["a transform"] = state.edid, state.refresh_hz, state.transform != IDENTITY
+                edid, refresh_hz, adds["a transform"] = (
+                    state.edid,
+                    state.refresh_hz,
+                    state.transform != IDENTITY,
+                )
     edid = edid or edid_of_drm(display.name)
     width, height = display.resolution_px
     return msgspec.structs.replace(
@@ -57,7 +61,9 @@ def edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
     for path in sorted(drm.glob("card*-*/edid")):
         with contextlib.suppress(OSError):
             name = path.parent.name.partition("-")[2]
-            if connector in (name, re.sub(r"-[A-Z](?=-\d)", "", name)) and (edid := path.read_bytes()):
+            if connector in (name, re.sub(r"-[A-Z](?=-\d)", "", name)) and (
+                edid := path.read_bytes()
+            ):
                 return edid
     return b""
 
@@ -71,13 +77,19 @@ def _by_ddc(edid: bytes) -> dict[str, int]:
         return {}
     command = [program, "getvcp", *VCP, "--terse", "--edid", edid[:EDID_BYTES].hex()]
     try:
-        told = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=DDC_S, check=False).stdout
+        told = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=DDC_S, check=False
+        ).stdout
     except (OSError, subprocess.TimeoutExpired):
         return {}
     found = {}
     # VCP 10 C 40 100 (now, maximum); VCP 14 SNC x05; VCP C0 CNC x00 xff x04 xb0 (maximum, now)
-    for code, kind, words in re.findall(r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", told, re.MULTILINE):
+    for code, kind, words in re.findall(
+        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", told, re.MULTILINE
+    ):
         values = words.split()
         with contextlib.suppress(ValueError):
-            found[VCP[code]] = int(values[0]) if kind == "C" else int("".join(values[-2:]).replace("x", ""), 16)
+            found[VCP[code]] = (
+                int(values[0]) if kind == "C" else int("".join(values[-2:]).replace("x", ""), 16)
+            )
     return found

@@ -87,10 +87,16 @@ class Visibility:
             if self._there and not self._mapped:
                 self.hidden = "not on the screen"
             elif self._there:  # X11 also calls covered what is off the screen
-                self.hidden = off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
+                self.hidden = (
+                    off_place
+                    or COVERED[self._covered]
+                    or ("on a display that sleeps" if self._asleep() else "")
+                )
             ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
             # A readable connection without an event has ended.
-            if self._stop in ready or (ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)):
+            if self._stop in ready or (
+                ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)
+            ):
                 return
 
     def _off_place(self) -> str:
@@ -107,7 +113,9 @@ class Visibility:
         corner = x.value, y.value
         if self.place is not None:
             return "" if ScreenArea(corner, size) == self.place else "moved off its display"
-        inside = all(at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True))
+        inside = all(
+            at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True)
+        )
         return "" if inside else "off the screen, in part or wholly"
 
     def _geometry(self, drawable: int) -> tuple[int, int] | None:
@@ -138,10 +146,14 @@ def _sleep_of(connection: int) -> Any:
     known.
     """
     try:
-        library = load_library("libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER))
+        library = load_library(
+            "libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER)
+        )
         parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
         # Asked for a missing extension, Xlib prints to stderr.
-        if not xlib().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
+        if not xlib().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(
+            connection
+        ):
             return bool
     except (OSError, AttributeError):
         return bool

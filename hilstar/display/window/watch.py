@@ -33,7 +33,11 @@ def is_straight(ramp: bytes | FloatArray) -> bool:
     rounds to them. In a finer table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less
     light at the faintest code.
     """
-    parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP if isinstance(ramp, bytes) else ramp
+    parts = (
+        np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP
+        if isinstance(ramp, bytes)
+        else ramp
+    )
     if not parts.size:
         return False
     off = np.abs(parts - np.linspace(0, 1, parts.shape[1]))
@@ -73,7 +77,10 @@ class PresentEvents:
             xcb_poll_for_event=(POINTER, POINTER),
             xcb_disconnect=(None, POINTER),
         )
-        self._present = load_library(PRESENT_LIBRARY, xcb_present_select_input=(ctypes.c_uint, POINTER, number, number, number))
+        self._present = load_library(
+            PRESENT_LIBRARY,
+            xcb_present_select_input=(ctypes.c_uint, POINTER, number, number, number),
+        )
         self._free: Any = ctypes.CDLL(None).free
         self._free.argtypes = [ctypes.c_void_p]
         self._connection: Any = self._xcb.xcb_connect(None, None)
@@ -97,7 +104,12 @@ class PresentEvents:
             head = ctypes.string_at(event, 12)
             self._free(event)
             generic = head[0] & 0x7F == GENERIC_EVENT and head[1] == self._opcode
-            if generic and head[8] == COMPLETE_NOTIFY and head[10] == KIND_PIXMAP and head[11] < len(MODES):
+            if (
+                generic
+                and head[8] == COMPLETE_NOTIFY
+                and head[10] == KIND_PIXMAP
+                and head[11] < len(MODES)
+            ):
                 found.append(MODES[head[11]])
         return found
 
@@ -113,7 +125,9 @@ class DisplayWatch:
     `ramp_changed` is true while the ramp is neither the one of the start nor straight.
     """
 
-    def __init__(self, output: str | None, window: int, survival: Survival, look_s: float = LOOK_S) -> None:
+    def __init__(
+        self, output: str | None, window: int, survival: Survival, look_s: float = LOOK_S
+    ) -> None:
         self.ramp_changed = False
         self._shown: Counter[str] = Counter()
         self._output, self._look_s = output, look_s
@@ -130,7 +144,9 @@ class DisplayWatch:
         self._thread.start()
 
     def _ramp(self) -> bytes:
-        return b"" if self._randr is None or self._output is None else self._randr.ramp(self._output)
+        return (
+            b"" if self._randr is None or self._output is None else self._randr.ramp(self._output)
+        )
 
     def _run(self) -> None:
         while not self._stop.wait(self._look_s):

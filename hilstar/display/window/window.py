@@ -24,7 +24,15 @@ from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import output_named
 from hilstar.display.window.visibility import ScreenArea, Visibility
 from hilstar.display.window.watch import DisplayWatch, is_straight
-from hilstar.display.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
+from hilstar.display.window.x11 import (
+    BackBuffer,
+    Survival,
+    SwapStamps,
+    back_buffer,
+    has_extension,
+    is_composited,
+    sync_control,
+)
 
 TITLE = "hilstar"
 USUAL_REFRESH_HZ = 60
@@ -60,7 +68,9 @@ class Display:
 
     def is_named(self, wanted: int | str) -> bool:
         """Whether `[monitor] display` means it: its index, or a part of its name."""
-        return wanted == self.index or (isinstance(wanted, str) and wanted.lower() in self.name.lower())
+        return wanted == self.index or (
+            isinstance(wanted, str) and wanted.lower() in self.name.lower()
+        )
 
     def line(self) -> str:
         """The display for a person."""
@@ -184,7 +194,10 @@ class Window(Closing):
             # Left to itself, GLFW switches a display to its highest refresh.
             wanted_hz = round(settings.refresh_hz or 0)
             has_it = wanted_hz in _modes_hz(self.display, monitor)
-            glfw.window_hint(glfw.REFRESH_RATE, wanted_hz if has_it else self.display.refresh_hz or glfw.DONT_CARE)
+            glfw.window_hint(
+                glfw.REFRESH_RATE,
+                wanted_hz if has_it else self.display.refresh_hz or glfw.DONT_CARE,
+            )
         for hint, value in (
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
@@ -196,16 +209,22 @@ class Window(Closing):
             (glfw.BLUE_BITS, settings.bits),
         ):
             glfw.window_hint(hint, value)
-        width, height = settings.resolution_px if self.display is None else self.display.resolution_px
+        width, height = (
+            settings.resolution_px if self.display is None else self.display.resolution_px
+        )
         with drawing_threads_apart():
             self._window = _newest_window(width, height, monitor)
         if not self._window:
-            raise MachineError("no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri")
+            raise MachineError(
+                "no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri"
+            )
         if self.display is not None:  # as it is now
             self.display = _describe(self.display.index, monitor)
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
-        glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
+        glfw.set_input_mode(
+            self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL
+        )
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_monitor_callback(self._on_monitor)
         glfw.set_window_iconify_callback(self._window, self._on_iconify)
@@ -215,10 +234,16 @@ class Window(Closing):
             self._survival = Survival(self._on_end)
             self._survival.cover(self._x_display)
             window = glfw.get_x11_window(self._window)
-            self._visibility = Visibility.of(window, None if monitor is None else _area_of(monitor), self._survival)
-        sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
+            self._visibility = Visibility.of(
+                window, None if monitor is None else _area_of(monitor), self._survival
+            )
+        sync = sync_control(
+            self._x_display, glfw.get_glx_window(self._window) if self._x_display else None
+        )
         refresh_hz = self.display.refresh_hz if self.display is not None else 0
-        self._stamps = SwapStamps(sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ))
+        self._stamps = SwapStamps(
+            sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ)
+        )
         if monitor is not None:
             self._set_identity_ramp(monitor)
         if self._survival is not None:
@@ -268,13 +293,20 @@ class Window(Closing):
         if display is None:
             return
         on_it = bool(glfw.get_window_monitor(self._window))
-        monitor = next((m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None)
+        monitor = next(
+            (m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None
+        )
         if monitor is None and not self.lost:
             self.lost, self._ramp = True, None
-            log.warning("the display %s is gone; frames go on, and the window returns to it when it is back", display.name)
+            log.warning(
+                "the display %s is gone; frames go on, and the window returns to it when it is back",
+                display.name,
+            )
         elif monitor is not None and (self.lost or not on_it):
             width, height = display.resolution_px
-            glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
+            glfw.set_window_monitor(
+                self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE
+            )
             self._set_identity_ramp(monitor)
             if self._visibility is not None:
                 self._visibility.place = _area_of(monitor)
@@ -334,7 +366,9 @@ class Window(Closing):
     @property
     def by_wayland(self) -> bool:
         """True where the X server is XWayland: a Wayland compositor draws the display."""
-        return has_extension(self._x_display, b"XWAYLAND") or any(one.name.startswith("XWAYLAND") for one in _displays())
+        return has_extension(self._x_display, b"XWAYLAND") or any(
+            one.name.startswith("XWAYLAND") for one in _displays()
+        )
 
     @property
     def others(self) -> tuple[str, ...]:
@@ -350,7 +384,11 @@ class Window(Closing):
         """
         if self.display is None:
             return None
-        same = (d.name for d in _displays() if d.name != self.display.name and d.position_px == self.display.position_px)
+        same = (
+            d.name
+            for d in _displays()
+            if d.name != self.display.name and d.position_px == self.display.position_px
+        )
         return next(same, None)
 
     @property
@@ -427,7 +465,9 @@ class Window(Closing):
 
 def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
     modes = glfw.get_video_modes(monitor)
-    same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px}
+    same = {
+        int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px
+    }
     return tuple(sorted(same - {0}))
 
 

@@ -120,10 +120,23 @@ class Survival:
             return 0
 
         self._library: Any = ctypes.CDLL(X11_LIBRARY)
-        self._handlers = _IoHandler(io_error), _ErrorHandler(error), _ExitHandler(lambda display, data: None)
-        self._library.XSetIOErrorHandler.argtypes, self._library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
-        self._library.XSetIOErrorHandler.restype, self._library.XSetErrorHandler.restype = _IoHandler, _ErrorHandler
-        self._before = self._library.XSetIOErrorHandler(self._handlers[0]), self._library.XSetErrorHandler(self._handlers[1])
+        self._handlers = (
+            _IoHandler(io_error),
+            _ErrorHandler(error),
+            _ExitHandler(lambda display, data: None),
+        )
+        self._library.XSetIOErrorHandler.argtypes, self._library.XSetErrorHandler.argtypes = (
+            [_IoHandler],
+            [_ErrorHandler],
+        )
+        self._library.XSetIOErrorHandler.restype, self._library.XSetErrorHandler.restype = (
+            _IoHandler,
+            _ErrorHandler,
+        )
+        self._before = (
+            self._library.XSetIOErrorHandler(self._handlers[0]),
+            self._library.XSetErrorHandler(self._handlers[1]),
+        )
 
     def close(self) -> None:
         """Let Xlib handle errors as before."""
@@ -138,7 +151,11 @@ class Survival:
             self._undecided.add(x_display)
         # libX11 1.7 of 2020; with an older one the process ends
         if hasattr(self._library, "XSetIOErrorExitHandler"):
-            self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
+            self._library.XSetIOErrorExitHandler.argtypes = [
+                ctypes.c_void_p,
+                _ExitHandler,
+                ctypes.c_void_p,
+            ]
             self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)
 
 
@@ -150,7 +167,9 @@ class SyncControl:
         if not function:
             raise OSError("glXWaitForSbcOML is not there")
         counter = ctypes.POINTER(ctypes.c_int64)
-        prototype = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_ulong, ctypes.c_int64, counter, counter, counter)
+        prototype = ctypes.CFUNCTYPE(
+            ctypes.c_int, ctypes.c_void_p, ctypes.c_ulong, ctypes.c_int64, counter, counter, counter
+        )
         self._wait_for_swap = prototype(function)
         self._window = (x_display, drawable)
 
@@ -159,7 +178,9 @@ class SyncControl:
         it does not say.
         """
         ust, msc, sbc = (ctypes.c_int64() for _ in range(3))
-        if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
+        if not self._wait_for_swap(
+            *self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)
+        ):
             return None
         return ust.value * NS_PER_US
 
@@ -173,7 +194,12 @@ class SwapStamps:
     one that cannot be right is passed over.
     """
 
-    def __init__(self, sync: SyncControl | None, period_ns: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        sync: SyncControl | None,
+        period_ns: float,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self._sync, self._period_ns, self._now_ns = sync, period_ns, now_ns
         self._gaps = 0
         self.source = CLOCK if sync is None else SYNC_EXTENSION.decode()
@@ -184,12 +210,18 @@ class SwapStamps:
         """
         if self._sync is not None:
             swap_ns = self._sync.swap_ns()
-            if swap_ns is not None and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS:
+            if (
+                swap_ns is not None
+                and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS
+            ):
                 self._gaps, self.source = 0, SYNC_EXTENSION.decode()
                 return swap_ns
             self._gaps += 1
             if self._gaps == MAX_GAPS:
-                log.warning("%s gives no time of swaps; the host's clock after them is used instead", SYNC_EXTENSION.decode())
+                log.warning(
+                    "%s gives no time of swaps; the host's clock after them is used instead",
+                    SYNC_EXTENSION.decode(),
+                )
                 self._sync = None
         wait()
         self.source = CLOCK
@@ -201,9 +233,17 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
     if not x_display or not drawable:
         return None
     try:
-        library = load_library(GL_LIBRARY, glXQueryExtensionsString=(TEXT, POINTER, INT), glXGetProcAddress=(POINTER, TEXT))
+        library = load_library(
+            GL_LIBRARY,
+            glXQueryExtensionsString=(TEXT, POINTER, INT),
+            glXGetProcAddress=(POINTER, TEXT),
+        )
         extensions = library.glXQueryExtensionsString(x_display, 0) or b""
-        return SyncControl(library, x_display, drawable) if SYNC_EXTENSION in extensions.split() else None
+        return (
+            SyncControl(library, x_display, drawable)
+            if SYNC_EXTENSION in extensions.split()
+            else None
+        )
     except (OSError, AttributeError):
         return None
 
@@ -223,12 +263,15 @@ def back_buffer(address_of: Callable[[str], Any]) -> BackBuffer:
 
     def integer(name: str, *arguments: int) -> int:
         value = ctypes.c_int()
-        function = ctypes.CFUNCTYPE(None, *[ctypes.c_uint] * len(arguments), ctypes.POINTER(ctypes.c_int))(address_of(name))
+        function = ctypes.CFUNCTYPE(
+            None, *[ctypes.c_uint] * len(arguments), ctypes.POINTER(ctypes.c_int)
+        )(address_of(name))
         function(*arguments, ctypes.byref(value))
         return value.value
 
     bits = (
-        integer("glGetFramebufferAttachmentParameteriv", GL_DRAW_FRAMEBUFFER, GL_BACK_LEFT, size) for size in GL_COLOUR_SIZES
+        integer("glGetFramebufferAttachmentParameteriv", GL_DRAW_FRAMEBUFFER, GL_BACK_LEFT, size)
+        for size in GL_COLOUR_SIZES
     )
     return BackBuffer(min(bits), integer("glGetIntegerv", GL_SAMPLES))
 

@@ -31,7 +31,13 @@ from hilstar.instruments.assess.bench_effects import (
     seen_cost,
     slices_of,
 )
-from hilstar.instruments.assess.budget import Axes, Decomposed, DecomposedRun, assess_run, axes_of_variance
+from hilstar.instruments.assess.budget import (
+    Axes,
+    Decomposed,
+    DecomposedRun,
+    assess_run,
+    axes_of_variance,
+)
 from hilstar.instruments.assess.clock import CoarseClock, coarse_offset, speed_offsets
 from hilstar.instruments.assess.components import MIN_ROWS
 from hilstar.instruments.assess.places import Scale
@@ -118,7 +124,9 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
         if len(inner) and commanded.at(inner).known.mean() > 0.5:
             length_s, rows = gap_s - cycle_s, after - before - 1
             lost = length_s > LOST_CYCLES * cycle_s
-            outages.append(Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum())))
+            outages.append(
+                Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum()))
+            )
     # After each appearance of the sky during the telemetry, and after each loss of the lock.
     acquisitions = []
     shown = np.flatnonzero(np.diff(np.r_[False, commanded.joined].astype(int)) == 1)
@@ -128,7 +136,9 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
         if last > t_s[0] and first < t_s[-1]:
             first = max(first, t_s[0])  # what the tracker did before its first row is unknown
             inside = answers[(answers >= first) & (answers <= last)]
-            acquisitions.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
+            acquisitions.append(
+                Acquisition(float(first), float(inside[0] - first) if len(inside) else None)
+            )
     acquisitions += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
     return Lock(
         cycle_s=cycle_s,
@@ -192,7 +202,9 @@ class RunLedger:
         """The bench by its text in the ledger; the files that it names have to be where they
         were. Raises InputError.
         """
-        return bench_file_of(Path(self.head.get("bench_file", "bench.toml")), self.head.get("bench_text", ""))
+        return bench_file_of(
+            Path(self.head.get("bench_file", "bench.toml")), self.head.get("bench_text", "")
+        )
 
 
 def read_ledger(path: Path) -> RunLedger:
@@ -202,15 +214,25 @@ def read_ledger(path: Path) -> RunLedger:
     head, run = read_head(path), read_commanded(path)
     shown = run.commanded.shown
     if shown.sum() < 2:
-        why = "operators' keys or a hidden window changed all of them" if run.changed else "none of them has an attitude"
-        raise InputError(f"{path}: {len(shown)} frames, and {why}; give the ledger of a run that was sent attitudes")
+        why = (
+            "operators' keys or a hidden window changed all of them"
+            if run.changed
+            else "none of them has an attitude"
+        )
+        raise InputError(
+            f"{path}: {len(shown)} frames, and {why}; give the ledger of a run that was sent attitudes"
+        )
     config = config_of(head)
     if config is None:
-        raise InputError(f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger")
+        raise InputError(
+            f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger"
+        )
     # A moment stands for an exposure about it; a refresh period more, for it is known to some
     # milliseconds.
     reach_s = config.tracker.exposure_s / 2 + 1 / config.monitor.refresh_hz
-    return RunLedger(path, head, config, replace(run, commanded=run.commanded.over_exposures(reach_s)))
+    return RunLedger(
+        path, head, config, replace(run, commanded=run.commanded.over_exposures(reach_s))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,12 +278,20 @@ class Assessment:
     @property
     def missed_line(self) -> str:
         """The run's missed frames and what they do to the budget, in words."""
-        missed, held_s, hold_s = self.run.run.missed, self.run.commanded.held_s, self.run.commanded.hold_s
+        missed, held_s, hold_s = (
+            self.run.run.missed,
+            self.run.commanded.held_s,
+            self.run.commanded.hold_s,
+        )
         if not missed:
             return "none"
         share = 100 * missed / (missed + len(self.run.commanded.t_s))
         longest = int(np.argmax(hold_s)) if len(hold_s) else -1
-        where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s" if longest >= 0 else ""
+        where = (
+            f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"
+            if longest >= 0
+            else ""
+        )
         touched = f"{len(self.found.held)} answers looked while a frame was held for them"
         return f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure but the availability"
 
@@ -289,15 +319,25 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
     """
     records = list(answer_records(ledger))
     if not any(record.valid and record.q is not None for record in records):
-        has = f"{len(records)} answers, none of them with an attitude" if records else "no answers of a tracker"
-        raise InputError(f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with [answers]")
+        has = (
+            f"{len(records)} answers, none of them with an attitude"
+            if records
+            else "no answers of a tracker"
+        )
+        raise InputError(
+            f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with [answers]"
+        )
     on_run_ns = _on_run_ns(records)
     stamped = stamp != "arrival" and all(record.t_ns is not None for record in records)
     t_ns = np.array([record.t_ns for record in records] if stamped else on_run_ns, dtype=np.int64)
-    clock_set = stamped and _clock_was_set(t_ns, np.array([record.host_ns for record in records], dtype=np.int64))
+    clock_set = stamped and _clock_was_set(
+        t_ns, np.array([record.host_ns for record in records], dtype=np.int64)
+    )
     if clock_set or not stamped:
         t_ns, stamp = on_run_ns, "middle"
-    overtaken = int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum()) if stamped and not clock_set else 0
+    overtaken = (
+        int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum()) if stamped and not clock_set else 0
+    )
     # By their times, for a datagram may be overtaken; of one time the first that came.
     rising_ns, order = np.unique(t_ns, return_index=True)
     kept = [records[k] for k in order.tolist()]
@@ -315,8 +355,13 @@ def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
     judged = [record for record in records if record.verdict != "unjudged"]
     late_ns = [record.host_ns - record.middle_ns for record in judged]
     usual_ns = int(np.median(late_ns)) if late_ns else 0
-    to_light_ns = [record.light_ns - record.middle_ns for record in judged if record.light_ns is not None]
-    middle_ns = [record.host_ns - usual_ns if record.verdict == "unjudged" else record.middle_ns for record in records]
+    to_light_ns = [
+        record.light_ns - record.middle_ns for record in judged if record.light_ns is not None
+    ]
+    middle_ns = [
+        record.host_ns - usual_ns if record.verdict == "unjudged" else record.middle_ns
+        for record in records
+    ]
     return np.array(middle_ns, dtype=np.int64) + (int(np.median(to_light_ns)) if to_light_ns else 0)
 
 
@@ -338,7 +383,11 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     fault of either.
     """
     run = read_ledger(ledger)
-    zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
+    zero_ns, start_s, end_s = (
+        run.run.zero_ns,
+        float(run.commanded.t_s[0]),
+        float(run.commanded.t_s[-1]),
+    )
     centroids: Sequence[Centroids] = ()
     overlap, out_of_order, clock_set = True, 0, False
     if telemetry is None:
@@ -349,16 +398,31 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
         # The telemetry's times from the run's zero where the two overlap, else from their own
         # first.
-        overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
+        overlap = (
+            answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
+        )
         base_ns = zero_ns if overlap else int(answers.t_ns[0])
     base_s = (base_ns - zero_ns) / NS_PER_S
-    tau_s = (answers.t_ns - base_ns) / NS_PER_S + TO_MIDDLE[stamp] * run.config.tracker.exposure_s - settings.latency_s
+    tau_s = (
+        (answers.t_ns - base_ns) / NS_PER_S
+        + TO_MIDDLE[stamp] * run.config.tracker.exposure_s
+        - settings.latency_s
+    )
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
-        raise InputError(f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry")
+        raise InputError(
+            f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry"
+        )
     coarse = matched(run, answers, tau_s[valid], answers.q[valid])
     try:
-        found = assess_run(run.commanded, tau_s[valid], answers.q[valid], coarse, run.scale, np.random.default_rng(SEED))
+        found = assess_run(
+            run.commanded,
+            tau_s[valid],
+            answers.q[valid],
+            coarse,
+            run.scale,
+            np.random.default_rng(SEED),
+        )
     except InputError as refusal:
         raise InputError(f"{telemetry}: {refusal}") from refusal
     t_s = start_s + (tau_s - found.clock.offset_s - start_s) / (1 + found.clock.drift)
@@ -370,23 +434,35 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     parts = found.components
     error = parts.fov.fitted + parts.pixel.fitted + parts.left
     freedom = parts.fov.freedom + parts.pixel.freedom + 1
-    by_rate = slices_of(np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom)
+    by_rate = slices_of(
+        np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom
+    )
     by_magnitude: tuple[Slice, ...] = ()
     display = limit = glass = certificate = None
     try:
         file = run.bench_file()
         certificate = bench_certificate(file)
-        by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
+        by_magnitude = slices_of(
+            field_magnitudes(file, found.commanded_q), parts.left, error, freedom
+        )
         limit = noise_limit(file, found.commanded_q)
-        glass, told_by = _glass_of(file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ())
+        glass, told_by = _glass_of(
+            file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ()
+        )
         notes += told_by
         if settings.display_attitudes:
-            some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
+            some = np.unique(
+                np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int)
+            )
             display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
             if display is None:
-                notes.append("the display shows too few stars at once for an attitude: its own error was not found")
+                notes.append(
+                    "the display shows too few stars at once for an attitude: its own error was not found"
+                )
     except HilstarError as refusal:
-        notes.append(f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}")
+        notes.append(
+            f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}"
+        )
     noise_arcsec, said = _without_display(found, display)
     return Assessment(
         run=run,
@@ -396,7 +472,12 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         offset_s=found.clock.offset_s + base_s,
         lock=lock_of(run.commanded, t_s, right, wrong),
         wrong=tuple(
-            WrongAnswer(int(answers.line[at]), int(answers.t_ns[at]) / 1e9, float(t_s[at]), float(off_deg[k]))
+            WrongAnswer(
+                int(answers.line[at]),
+                int(answers.t_ns[at]) / 1e9,
+                float(t_s[at]),
+                float(off_deg[k]),
+            )
             for k, at in zip(found.wrong, valid[found.wrong], strict=True)
         ),
         display=display,
@@ -411,7 +492,9 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     )
 
 
-def _glass_of(file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroids]) -> tuple[GlassCost | None, list[str]]:
+def _glass_of(
+    file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroids]
+) -> tuple[GlassCost | None, list[str]]:
     """What the glass costs, by the stars of the right answers where these have enough; a note
     where the PSF file tells it.
     """
@@ -419,7 +502,11 @@ def _glass_of(file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroi
     cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
     if cost is None or cost.source != FILE:
         return cost, []
-    has = "name too few stars" if centroids else "hold only attitudes, which cannot tell colour from distortion"
+    has = (
+        "name too few stars"
+        if centroids
+        else "hold only attitudes, which cannot tell colour from distortion"
+    )
     return cost, [f"the answers {has}: what the glass costs is told by the PSF file"]
 
 
@@ -450,7 +537,10 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
         off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
         if abs(np.linalg.det(nearest) - 1) <= 1e-9 and off <= NEAR_AXES_RAD:
             signs = ["-" if row.sum() < 0 else "+" for row in nearest]
-            axes = ", ".join(f"{own} = {sign}{'xyz'[k]}" for own, sign, k in zip("xyz", signs, column, strict=True))
+            axes = ", ".join(
+                f"{own} = {sign}{'xyz'[k]}"
+                for own, sign, k in zip("xyz", signs, column, strict=True)
+            )
             cure = "write them for x right, y down in the image, z boresight"
             raise InputError(f"{turned}: they fit axes with {axes} of hilstar's; {cure}")
     offsets = [] if coarse is None else [coarse.offset_s]
@@ -472,9 +562,17 @@ def _refuse(run: RunLedger, telemetry: Telemetry, t_s: FloatArray, q: FloatArray
     if moments.known.sum() < max(MIN_PAIRS, 0.1 * len(t_s)):
         return
     rows = np.flatnonzero(moments.known)
-    pairs = Pairs(telemetry.path, telemetry.line[telemetry.valid][rows], moments.q[rows], q[rows], names=COMMANDED)
+    pairs = Pairs(
+        telemetry.path,
+        telemetry.line[telemetry.valid][rows],
+        moments.q[rows],
+        q[rows],
+        names=COMMANDED,
+    )
     try:
-        refuse_conventions(pairs, float(np.arctan(0.5 * np.hypot(*run.scale.resolution_px) / run.scale.focal_px)))
+        refuse_conventions(
+            pairs, float(np.arctan(0.5 * np.hypot(*run.scale.resolution_px) / run.scale.focal_px))
+        )
     except InputError as refusal:
         if "wild" not in str(refusal) and "out of view" not in str(refusal):
             raise
@@ -503,9 +601,13 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
     near = step_s < 1.0
     if len(found.row) >= MIN_ROWS and near.any():
         change = np.linalg.norm(np.diff(ARCSEC_PER_RAD * found.rate_rad_s, axis=0)[near], axis=1)
-        bent = float(np.percentile(change / step_s[near], 99)) * run.config.tracker.exposure_s**2 / 24
+        bent = (
+            float(np.percentile(change / step_s[near], 99)) * run.config.tracker.exposure_s**2 / 24
+        )
         if bent >= BENT_ARCSEC:
-            notes.append(f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec")
+            notes.append(
+                f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec"
+            )
     # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the
     # bumps do.
     rows = len(parts.left) // TOGETHER * TOGETHER
@@ -534,5 +636,11 @@ def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Ax
         return without, []
     size = f"{display.cross_arcsec:.2g} arcsec across the boresight and {display.roll_arcsec:.2g} about it"
     says = f"the answers show {display.seen:.2f} +- {display.sigma_seen:.2f} of it"
-    done = f"{100 * share:.0f} % of its variance are subtracted from the noise" if share else "nothing is subtracted"
-    return without, [f"the display's own error is not small beside the noise: {size}; {says}, and {done}"]
+    done = (
+        f"{100 * share:.0f} % of its variance are subtracted from the noise"
+        if share
+        else "nothing is subtracted"
+    )
+    return without, [
+        f"the display's own error is not small beside the noise: {size}; {says}, and {done}"
+    ]

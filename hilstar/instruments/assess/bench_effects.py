@@ -60,7 +60,9 @@ class Slice:
     rms_roll_arcsec: float
 
 
-def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: float) -> tuple[Slice, ...]:
+def slices_of(
+    value: FloatArray, left: FloatArray, error: FloatArray, freedom: float
+) -> tuple[Slice, ...]:
     """Up to five slices with equal numbers of answers, by a value (n,), of noise (n, 3) and errors
     about the bias (n, 3).
 
@@ -73,7 +75,11 @@ def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: f
         return ()
     growth = len(known) / max(len(known) - freedom, 1.0)
     spread = float(np.ptp(value))
-    bins = min(BINS, count // MIN_IN_BIN) if spread > 1e-3 * max(abs(float(np.median(value))), 1e-6) else 1
+    bins = (
+        min(BINS, count // MIN_IN_BIN)
+        if spread > 1e-3 * max(abs(float(np.median(value))), 1e-6)
+        else 1
+    )
     edges = np.unique(np.quantile(value, np.linspace(0, 1, bins + 1)))
     if len(edges) < 2:
         edges = np.array([value.min(), value.max()])
@@ -83,7 +89,11 @@ def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: f
         rows = place == k
         if rows.sum() >= MIN_IN_BIN:
             noise, whole = growth * (left[rows] ** 2).mean(axis=0), (error[rows] ** 2).mean(axis=0)
-            axes = [float(np.sqrt(part)) for each in (noise, whole) for part in ((each[0] + each[1]) / 2, each[2])]
+            axes = [
+                float(np.sqrt(part))
+                for each in (noise, whole)
+                for part in ((each[0] + each[1]) / 2, each[2])
+            ]
             found.append(Slice(float(edges[k]), float(edges[k + 1]), int(rows.sum()), *axes))
     return tuple(found)
 
@@ -103,7 +113,8 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     reach = 2 * np.sin(min(camera.field_radius_rad(0.0), np.pi / 2) / 2)
     light = np.zeros(len(some))
     near: list[IntArray] = [
-        np.array(each, dtype=np.intp) for each in cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
+        np.array(each, dtype=np.intp)
+        for each in cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
     ]
     for k, each in enumerate(near):
         x_px, y_px = camera.project(stars.vectors[each] @ axes[k].T)
@@ -136,7 +147,10 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
         finder = star_finder(twin.bench, twin.monitor_px_per_px)
         for number, q in enumerate(q_icrs_to_cam):
             field = twin.field(q, number)
-            sky, shown = (finder.match(image, field.x_px, field.y_px) for image in (field.sky_e, field.shown_e))
+            sky, shown = (
+                finder.match(image, field.x_px, field.y_px)
+                for image in (field.sky_e, field.shown_e)
+            )
             both = (sky.index >= 0) & (shown.index >= 0)
             if both.sum() >= MIN_STARS:
                 i, j = sky.index[both], shown.index[both]
@@ -155,7 +169,9 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
     cross -= np.swapaxes(cross, 1, 2)
     root = np.sqrt(weight)[:, None]
-    found, *_ = np.linalg.lstsq((cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None)
+    found, *_ = np.linalg.lstsq(
+        (cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None
+    )
     return np.asarray(found)
 
 
@@ -193,7 +209,11 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     psf, camera = tracker_psf(tracker, file.folder), tracker_camera(tracker, file.folder)
     if not isinstance(psf, GlassPsf):
         return None
-    stars, glass, kind = bench_stars(file.config, file.folder), StarGlass(file, psf), file.config.verify.judge or "window"
+    stars, glass, kind = (
+        bench_stars(file.config, file.folder),
+        StarGlass(file, psf),
+        file.config.verify.judge or "window",
+    )
     reach = math.ceil(4 * max(1.0, *psf.width_px))
     some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, GLASS_FIELDS).astype(int))
     for q in normalise(q_icrs_to_cam[some]):
@@ -208,15 +228,27 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     return _cost(FILE, kind, camera, fields)
 
 
-def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]) -> GlassCost | None:
+def seen_cost(
+    file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]
+) -> GlassCost | None:
     """The same by the stars that answers name, [x_px, y_px, dn, hip], against the bench's camera at
     their attitudes (n, 4).
 
     The tracker's noise is in it. None for too few stars.
     """
-    camera, stars, fields = tracker_camera(file.config.tracker, file.folder), bench_stars(file.config, file.folder), []
-    named = [k for k, own in enumerate(centroids) if sum(bool(star[3]) for star in own) >= MIN_STARS]
-    for k in (named[j] for j in np.unique(np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int)) if named):
+    camera, stars, fields = (
+        tracker_camera(file.config.tracker, file.folder),
+        bench_stars(file.config, file.folder),
+        [],
+    )
+    named = [
+        k for k, own in enumerate(centroids) if sum(bool(star[3]) for star in own) >= MIN_STARS
+    ]
+    for k in (
+        named[j]
+        for j in np.unique(np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int))
+        if named
+    ):
         at = {star[3]: star[:2] for star in centroids[k] if star[3]}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])
         rows = rows[np.isin(rows["hip"], list(at))]
@@ -228,12 +260,19 @@ def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Ce
     # a star by another's name is no error of places
     usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)
     near = [np.hypot(*off.T) < usual_px for _, off in fields]
-    kept = [(rows[good], off[good]) for (rows, off), good in zip(fields, near, strict=True) if good.sum() >= MIN_STARS]
+    kept = [
+        (rows[good], off[good])
+        for (rows, off), good in zip(fields, near, strict=True)
+        if good.sum() >= MIN_STARS
+    ]
     return _cost("answers' stars", "tracker", camera, kept)
 
 
 def _cost(
-    source: str, kind: str, camera: Camera, fields: Sequence[tuple[npt.NDArray[np.void], FloatArray]]
+    source: str,
+    kind: str,
+    camera: Camera,
+    fields: Sequence[tuple[npt.NDArray[np.void], FloatArray]],
 ) -> GlassCost | None:
     """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for
     too few stars.
@@ -241,7 +280,9 @@ def _cost(
     if sum(len(rows) for rows, _ in fields) < MIN_SPLIT_STARS:
         return None
     rows, errors = (np.concatenate(parts) for parts in zip(*fields, strict=True))
-    split = split_errors(np.stack([rows["x_px"], rows["y_px"]], axis=1), rows["bv"], errors, camera.resolution_px)
+    split = split_errors(
+        np.stack([rows["x_px"], rows["y_px"]], axis=1), rows["bv"], errors, camera.resolution_px
+    )
     parts = {
         "total": split.total,
         "without_distortion": split.total - split.distortion,
@@ -251,7 +292,12 @@ def _cost(
     ends = np.cumsum([len(each) for each, _ in fields])[:-1]
     fov = {}
     for name, off in parts.items():
-        turns = np.array([_field_turn(camera, each, px) for (each, _), px in zip(fields, np.split(off, ends), strict=True)])
+        turns = np.array(
+            [
+                _field_turn(camera, each, px)
+                for (each, _), px in zip(fields, np.split(off, ends), strict=True)
+            ]
+        )
         fov[name] = axes_of_variance(turns.var(axis=0))
     rms_px = {name: float(np.sqrt((off**2).sum(axis=1).mean())) for name, off in parts.items()}
     return GlassCost(source, kind, len(rows), len(fields), rms_px, fov)
@@ -259,7 +305,10 @@ def _cost(
 
 def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) -> FloatArray:
     """The attitude's error (3,), arcsec, by stars whose places are off by `off_px` (n, 2)."""
-    true, seen = (normalise(camera.rays(rows["x_px"] + dx, rows["y_px"] + dy)) for dx, dy in ((0.0, 0.0), off_px.T))
+    true, seen = (
+        normalise(camera.rays(rows["x_px"] + dx, rows["y_px"] + dy))
+        for dx, dy in ((0.0, 0.0), off_px.T)
+    )
     return ARCSEC_PER_RAD * turn_between(true, seen, rows["electrons_per_s"])
 
 

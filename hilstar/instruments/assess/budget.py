@@ -11,7 +11,14 @@ from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
-from hilstar.instruments.assess.clock import CUT_SIGMAS, FLOOR_ARCSEC, ClockFit, ClockSolver, CoarseClock, weights_of
+from hilstar.instruments.assess.clock import (
+    CUT_SIGMAS,
+    FLOOR_ARCSEC,
+    ClockFit,
+    ClockSolver,
+    CoarseClock,
+    weights_of,
+)
 from hilstar.instruments.assess.components import MIN_ROWS, Component, Components, components_of
 from hilstar.instruments.assess.places import Scale
 from hilstar.server.record.commanded import Commanded
@@ -81,7 +88,12 @@ class DecomposedRun(Decomposed):
 
 
 def assess_run(
-    commanded: Commanded, tau_s: FloatArray, reported: FloatArray, coarse: CoarseClock, scale: Scale, rng: np.random.Generator
+    commanded: Commanded,
+    tau_s: FloatArray,
+    reported: FloatArray,
+    coarse: CoarseClock,
+    scale: Scale,
+    rng: np.random.Generator,
 ) -> DecomposedRun:
     """The budget of answers (n, 4) at rising times (n,), s of the tracker's clock, against the
     attitudes that a run commanded.
@@ -94,7 +106,9 @@ def assess_run(
     known, held = clock.moments.known, clock.moments.known & (clock.moments.held_s > 0)
     free = known & ~held
     if known.sum() < MIN_ROWS:
-        raise InputError(f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer telemetry")
+        raise InputError(
+            f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer telemetry"
+        )
     if free.sum() < MIN_ROWS:
         raise InputError(
             f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers looked while one was held,"
@@ -104,16 +118,22 @@ def assess_run(
         raise InputError(
             f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())} agree with one rotation"
         )
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max())
+    spread = MAD_TO_SIGMA * float(
+        np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max()
+    )
     if spread > MAX_SPREAD_ARCSEC:
-        raise InputError(f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run")
+        raise InputError(
+            f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run"
+        )
     total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     right, parts = _right_answers(total, clock.moments.q, clock.used, scale)
     intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
     found = _decomposed(parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s)
     astray = held & _beyond_turn(clock, parts)
     wrong = np.sort(np.append(found.wrong, np.flatnonzero(astray)))
-    return DecomposedRun(**{**vars(found), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray))
+    return DecomposedRun(
+        **{**vars(found), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray)
+    )
 
 
 def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
@@ -125,7 +145,11 @@ def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
 
 
 def assess_cases(
-    commanded: FloatArray, reported: FloatArray, scale: Scale, rng: np.random.Generator, rate_rad_s: FloatArray | None = None
+    commanded: FloatArray,
+    reported: FloatArray,
+    scale: Scale,
+    rng: np.random.Generator,
+    rate_rad_s: FloatArray | None = None,
 ) -> Decomposed:
     """The budget of cases: reported attitudes (n, 4), NaN where there is none, against the
     commanded ones (n, 4).
@@ -137,11 +161,15 @@ def assess_cases(
     if known.sum() < MIN_ROWS:
         raise InputError(f"{int(known.sum())} answers, and {MIN_ROWS} are needed; plan more cases")
     error = np.full((len(reported), 3), np.nan)
-    error[known] = ARCSEC_PER_RAD * to_rotation_vector(multiply(reported[known], conjugate(commanded[known])))
+    error[known] = ARCSEC_PER_RAD * to_rotation_vector(
+        multiply(reported[known], conjugate(commanded[known]))
+    )
     used = known.copy()
     used[known] = weights_of(error[known])[1] > 0
     if 2 * used.sum() <= known.sum():
-        raise InputError(f"half or more of the answers are wild: {int(used.sum())} of {int(known.sum())} agree")
+        raise InputError(
+            f"half or more of the answers are wild: {int(used.sum())} of {int(known.sum())} agree"
+        )
     rate = np.zeros_like(error) if rate_rad_s is None else rate_rad_s
     right, parts = _right_answers(error, commanded, used, scale)
     return _decomposed(parts, intervals_of(parts, rng), known, right, commanded, rate)
@@ -163,7 +191,12 @@ def _right_answers(
 
 
 def _decomposed(
-    parts: Components, intervals: Intervals, known: npt.NDArray[np.bool_], row: IntArray, q: FloatArray, rate: FloatArray
+    parts: Components,
+    intervals: Intervals,
+    known: npt.NDArray[np.bool_],
+    row: IntArray,
+    q: FloatArray,
+    rate: FloatArray,
 ) -> Decomposed:
     right = np.zeros(len(known), dtype=bool)
     right[row] = True
@@ -203,7 +236,9 @@ def _told(part: Component) -> Axes:
     return Axes(None, None) if part.reason else axes_of_variance(part.variance)
 
 
-def intervals_of(parts: Components, rng: np.random.Generator, sigma_bias_arcsec: FloatArray | None = None) -> Intervals:
+def intervals_of(
+    parts: Components, rng: np.random.Generator, sigma_bias_arcsec: FloatArray | None = None
+) -> Intervals:
     """The intervals of components by the block bootstrap (Kuensch 1989): errors of neighbouring
     answers go together.
 
@@ -228,7 +263,8 @@ def intervals_of(parts: Components, rng: np.random.Generator, sigma_bias_arcsec:
     freedom = n - 1 - fov.freedom - pixel.freedom
     noise = sums(left**2)[drawn].sum(axis=1) / rows * (n / max(freedom, 1.0))
     repeating = [
-        np.maximum(sums(each.fitted**2)[drawn].sum(axis=1) / rows - each.freedom / n * noise, 0.0) for each in (fov, pixel)
+        np.maximum(sums(each.fitted**2)[drawn].sum(axis=1) / rows - each.freedom / n * noise, 0.0)
+        for each in (fov, pixel)
     ]
     return Intervals(
         bias=np.stack([parts.mean - HALF_OF_95 * spread, parts.mean + HALF_OF_95 * spread]),

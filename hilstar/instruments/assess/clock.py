@@ -29,7 +29,14 @@ from scipy import fft, linalg, optimize, sparse
 from scipy.spatial import cKDTree
 
 from hilstar.basics.arrays import BoolArray, FloatArray
-from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_matrix,
+    to_rotation_vector,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.instruments.assess.places import Scale, bumps_at, centres_of, places_of
 from hilstar.server.record.commanded import Commanded, Moments
@@ -82,7 +89,9 @@ class CoarseClock:
         return float(2 * np.arctan2(np.linalg.norm(self.rotation[1:]), abs(self.rotation[0])))
 
 
-def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> CoarseClock | None:
+def coarse_offset(
+    commanded: Commanded, t_s: FloatArray, reported: FloatArray
+) -> CoarseClock | None:
     """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset
     gives an overlap.
     """
@@ -90,7 +99,10 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     t, q = t_s[few], reported[few]
     # Starts or ends together, and where speeds or attitudes agree.
     tried = [_spread_at(commanded, t, q, float(commanded.t_s[end] - t_s[end])) for end in (0, -1)]
-    for peaks, reach_s in (_by_speed(commanded, t_s, reported), _by_attitude(commanded, t_s, reported)):
+    for peaks, reach_s in (
+        _by_speed(commanded, t_s, reported),
+        _by_attitude(commanded, t_s, reported),
+    ):
         tried += [_nearby(commanded, t, q, float(offset_s), reach_s) for offset_s in peaks]
     known = [each for each in tried if each is not None]
     if not known:
@@ -112,7 +124,9 @@ def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
 
 
-def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
+def _nearby(
+    commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float
+) -> CoarseClock | None:
     first = _spread_at(commanded, t_s, reported, offset_s)
     if first is None:
         return first
@@ -122,12 +136,16 @@ def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_
         return np.pi if found is None else found.spread_rad
 
     low, high = offset_s - reach_s, offset_s + reach_s
-    better = optimize.minimize_scalar(spread, bounds=(low, high), method="bounded", options={"maxiter": 12})
+    better = optimize.minimize_scalar(
+        spread, bounds=(low, high), method="bounded", options={"maxiter": 12}
+    )
     found = _spread_at(commanded, t_s, reported, float(better.x))
     return found if found is not None and found.spread_rad < first.spread_rad else first
 
 
-def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float) -> CoarseClock | None:
+def _spread_at(
+    commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float
+) -> CoarseClock | None:
     moments = commanded.at(t_s + offset_s)
     if moments.known.sum() < max(3, MIN_OVERLAP * len(t_s)):
         return None
@@ -149,7 +167,9 @@ def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
     return rotations[chosen[best]], float(half[best])
 
 
-def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
+def _by_attitude(
+    commanded: Commanded, t_s: FloatArray, reported: FloatArray
+) -> tuple[FloatArray, float]:
     """The offsets at which attitudes are nearest to the commanded ones, and the step of the
     scan.
     """
@@ -168,7 +188,9 @@ def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) ->
     return _peaks(-angle, reach), float(reach[1] - reach[0])
 
 
-def _by_speed(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
+def _by_speed(
+    commanded: Commanded, t_s: FloatArray, reported: FloatArray
+) -> tuple[FloatArray, float]:
     """The offsets at which angular speeds correlate best, and the step of the grid."""
     cycle_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     step_s = max(STEP_S, 2 * cycle_s, 2 * commanded.interval_s)
@@ -183,7 +205,9 @@ def _by_speed(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tu
     return _peaks(score, commanded.t_s[0] - t_s[0] + step_s * lag), step_s
 
 
-def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_s: float) -> FloatArray:
+def _speeds(
+    t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_s: float
+) -> FloatArray:
     """The median angular speed, rad/s, in each bin of a grid, over turns of about one step; NaN
     in an empty bin.
     """
@@ -230,7 +254,9 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         spread_a = over_lags(a * a, weight_b) - sum_a**2 / count
         spread_b = over_lags(weight_a, b * b) - sum_b**2 / count
         floor = 1e-9 * max(float((a * a).sum()), 1e-300)
-        r = np.where((spread_a > floor) & (spread_b > floor), covariance / np.sqrt(spread_a * spread_b), 0.0)
+        r = np.where(
+            (spread_a > floor) & (spread_b > floor), covariance / np.sqrt(spread_a * spread_b), 0.0
+        )
     enough = count >= max(MIN_BINS, MIN_OVERLAP * min(weight_a.sum(), weight_b.sum()))
     r = np.clip(np.where(enough, np.nan_to_num(r), 0.0), 0.0, 1 - 1e-9)
     lag = np.arange(size)
@@ -286,7 +312,9 @@ class ClockSolver:
     bias.
     """
 
-    def __init__(self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale) -> None:
+    def __init__(
+        self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale
+    ) -> None:
         self.commanded, self.tau_s, self.reported, self.scale = commanded, tau_s, reported, scale
         self.start_s = float(commanded.t_s[0])
         self.span_s = max(float(commanded.t_s[-1]) - self.start_s, 1e-9)
@@ -296,7 +324,9 @@ class ClockSolver:
         self.rotation, self.delay_s, self.stretch_s = coarse.rotation, -coarse.offset_s, 0.0
         self._align()
         used = self._robust(-coarse.offset_s)
-        covariance = np.linalg.inv(self._prior(0.0)[0] + np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2)
+        covariance = np.linalg.inv(
+            self._prior(0.0)[0] + np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2
+        )
         for _ in range(REFINED):
             used = used & self.free
             if used.sum() < MIN_USED:
@@ -325,14 +355,19 @@ class ClockSolver:
         if step is not None:
             turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
             self.rotation = normalise(multiply(turn, self.rotation))
-            self.delay_s, self.stretch_s = self.delay_s + float(step[3]), self.stretch_s + float(step[4])
+            self.delay_s, self.stretch_s = (
+                self.delay_s + float(step[3]),
+                self.stretch_s + float(step[4]),
+            )
         plain = self.tau_s - self.delay_s
         self.share = (plain - self.start_s) / self.span_s
         self.t_s = plain - self.stretch_s * self.share
         self.moments = self.commanded.at(self.t_s)
         known = self.moments.known
         self.free = known & (self.moments.held_s == 0)
-        turn = multiply(multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation))
+        turn = multiply(
+            multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation)
+        )
         self.residual = np.full((len(self.t_s), 3), np.nan)
         self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
 
@@ -351,7 +386,9 @@ class ClockSolver:
     def _prior(self, delay_s: float) -> tuple[FloatArray, FloatArray]:
         """The prior's precision (5, 5), and its pull (5,) towards it."""
         precision = np.array([0, 0, 0, 1 / OFFSET_PRIOR_S**2, 1 / (DRIFT_PRIOR * self.span_s) ** 2])
-        return np.diag(precision), precision * np.array([0, 0, 0, delay_s - self.delay_s, -self.stretch_s])
+        return np.diag(precision), precision * np.array(
+            [0, 0, 0, delay_s - self.delay_s, -self.stretch_s]
+        )
 
     def _robust(self, begun_s: float) -> BoolArray:
         """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not
@@ -368,7 +405,10 @@ class ClockSolver:
             normal, right = self._prior(begun_s)
             for axis in range(3):
                 scaled = design[axis] * (weight / sigma[axis] ** 2)[:, None]
-                normal, right = normal + scaled.T @ design[axis], right + scaled.T @ residual[:, axis]
+                normal, right = (
+                    normal + scaled.T @ design[axis],
+                    right + scaled.T @ residual[:, axis],
+                )
             step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
             self._align(step)
             if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
@@ -403,7 +443,9 @@ def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> Floa
     """
     centre = centres_of(place, PART_PX)
     _, part = cKDTree(centre).query(place)
-    sums = np.stack([np.bincount(part, column, minlength=len(centre)) for column in pulls.T], axis=1)
+    sums = np.stack(
+        [np.bincount(part, column, minlength=len(centre)) for column in pulls.T], axis=1
+    )
     sums = sums - sums.mean(axis=0)
     spread = covariance @ (sums.T @ sums) @ covariance
     growth = np.sqrt(np.maximum(np.diag(spread) / np.diag(covariance), 1.0))

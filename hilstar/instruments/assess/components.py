@@ -107,7 +107,9 @@ class Components:
     extent_px: float
 
 
-def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Components:
+def components_of(
+    residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale
+) -> Components:
     """The parts of residuals (n, 3), cam, at the commanded attitudes (n, 4)."""
     mean = residual_arcsec.mean(axis=0)
     about = residual_arcsec - mean
@@ -132,7 +134,9 @@ def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale:
 def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -> Component:
     """The fit of functions to (n, 3), and its variance less the noise in it."""
     n, fitted = len(wanted), functions.fit(wanted)
-    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(n - 1 - functions.freedom - other_freedom, 1.0)
+    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(
+        n - 1 - functions.freedom - other_freedom, 1.0
+    )
     variance = ((fitted**2).sum(axis=0) - functions.freedom * noise) / n
     return Component(np.maximum(variance, 0.0), fitted, functions.freedom)
 
@@ -143,7 +147,10 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
     """
     n = len(place)
     if extent_px < MIN_EXTENT_PX:
-        return None, f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
+        return (
+            None,
+            f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias",
+        )
     spacing = FINEST_PX
     while spacing <= COARSEST_SHARE * min(scale.resolution_px):
         centre = centres_of(place, spacing)
@@ -155,14 +162,20 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
 
 
 def _waves(
-    about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale, extent_px: float, bumps: Projector | None
+    about: FloatArray,
+    q_icrs_to_cam: FloatArray,
+    scale: Scale,
+    extent_px: float,
+    bumps: Projector | None,
 ) -> tuple[Projector | None, Component]:
     """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can
     be told.
     """
     none = Component(NOTHING, np.zeros_like(about), 0.0)
     if extent_px < MIN_EXTENT_OF_PIXEL_PX:
-        reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
+        reason = (
+            f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
+        )
         return None, replace(none, reason=reason)
     tried = [*global_phases(about, q_icrs_to_cam, scale)]
     if bumps is not None and max(_apart(phases.columns(), bumps) for phases in tried) < APART:
@@ -189,23 +202,32 @@ def _waves(
         edges = edges_of(best, base, about)
         if edges.shape[1]:
             waves = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
-            found = replace(_component(waves, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
+            found = replace(
+                _component(waves, about, freedom),
+                detail=f"{found.detail}, with {edges.shape[1]} {EDGES}",
+            )
     return waves, found
 
 
-def _best_of(tried: "list[Phases]", about: FloatArray, freedom: float) -> "tuple[Projector | None, Component, Phases | None]":
+def _best_of(
+    tried: "list[Phases]", about: FloatArray, freedom: float
+) -> "tuple[Projector | None, Component, Phases | None]":
     """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise;
     None where none does.
     """
     power, waves, best = 0.0, None, None
     found = Component(NOTHING, np.zeros_like(about), 0.0)
     # With answers enough those of an error that jumps from pixel to pixel are tried as well.
-    kinds = [(HARMONICS, ""), (SHARP_HARMONICS, SHARP)][: 1 + (len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP)]
+    kinds = [(HARMONICS, ""), (SHARP_HARMONICS, SHARP)][
+        : 1 + (len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP)
+    ]
     for phases in tried:
         for harmonics, sharp in kinds:
             mine = Projector(sparse.csr_matrix(phases.columns(harmonics)))
             fit = replace(_component(mine, about, freedom), detail=f"{phases.name}{sharp}")
-            explained = _surely(fit, about, freedom, SURE_OF_MANY if phases.name == SOUGHT else SURE)
+            explained = _surely(
+                fit, about, freedom, SURE_OF_MANY if phases.name == SOUGHT else SURE
+            )
             if explained > power:
                 power, waves, found, best = explained, mine, fit, phases
     return waves, found, best
@@ -260,7 +282,10 @@ def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
     highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
     spectrum[: highest + 1] = 0.0  # these are in the base
     power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
-    bin_of = [np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1) for u in phases.place_px.T]
+    bin_of = [
+        np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1)
+        for u in phases.place_px.T
+    ]
     for _ in range(MAX_EDGES):
         fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
         left = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
@@ -298,9 +323,15 @@ def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) ->
         if (boresight @ direction).min() > MIN_FORWARD:
             yield phases_of(direction, axes, scale, name)
     turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
-    yield Phases("the phase of the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
+    yield Phases(
+        "the phase of the turn from the start",
+        scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1),
+    )
     # Right ascension times the cosine of the mean declination, and declination.
-    ra, dec = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0])), np.arcsin(np.clip(boresight[:, 2], -1, 1))
+    ra, dec = (
+        np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0])),
+        np.arcsin(np.clip(boresight[:, 2], -1, 1)),
+    )
     place_px = scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
     yield Phases("the phase of the boresight's right ascension and declination", place_px)
     direction = best_direction(about, axes, scale)
@@ -317,11 +348,16 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
     near = bumps_at(place, centre, spacing_px).tocoo()
     seen = np.einsum("nij,nj->ni", axes[near.row], direction[near.col])
     phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
-    parts = [sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape) for column in phase.T]
+    parts = [
+        sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape)
+        for column in phase.T
+    ]
     return sparse.csr_matrix(sparse.hstack(parts))
 
 
-def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) -> FloatArray | None:
+def best_direction(
+    residual_arcsec: FloatArray, axes: FloatArray, scale: Scale
+) -> FloatArray | None:
     """The direction (3,), ICRS, whose waves explain most of residuals (n, 3); None if the
     boresights share no half sky.
     """
@@ -340,13 +376,25 @@ def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) 
     margin = 0.5 * max(scale.resolution_px) / scale.focal_px
     low, high = trace.min(axis=0) - margin, trace.max(axis=0) + margin
     step = (high - low) / (GRID - 1)
-    best = np.stack(np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1).reshape(-1, 2)
+    best = np.stack(
+        np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1
+    ).reshape(-1, 2)
     value = residual_arcsec / np.maximum(residual_arcsec.std(axis=0), 1e-9)
     steps = axes[1:] @ np.swapaxes(axes[:-1], 1, 2)
     roll_rad = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])
     for level in range(LEVELS):
-        start, rows = _stretches(roll_rad, float(np.max(step)) * scale.focal_px, FINE_ANSWERS if level else COARSE_ANSWERS)
-        score = _wave_power(value[rows], axes[rows], normalise(np.c_[best, np.ones(len(best))] @ frame), scale, start)
+        start, rows = _stretches(
+            roll_rad,
+            float(np.max(step)) * scale.focal_px,
+            FINE_ANSWERS if level else COARSE_ANSWERS,
+        )
+        score = _wave_power(
+            value[rows],
+            axes[rows],
+            normalise(np.c_[best, np.ones(len(best))] @ frame),
+            scale,
+            start,
+        )
         best = best[np.argsort(-score)[: KEPT if level < LEVELS - 1 else 1]]
         if float(np.max(step)) * scale.focal_px < FOUND_TO_PX:
             break
@@ -356,7 +404,9 @@ def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) 
     return normalise(np.append(best[0], 1.0) @ frame)
 
 
-def _wave_power(value: FloatArray, axes: FloatArray, directions: FloatArray, scale: Scale, start: IntArray) -> FloatArray:
+def _wave_power(
+    value: FloatArray, axes: FloatArray, directions: FloatArray, scale: Scale, start: IntArray
+) -> FloatArray:
     """The power (k,) of each direction's waves in values (n, 3), summed over stretches that
     begin at `start` (m,).
     """
@@ -383,13 +433,17 @@ def _stretches(roll_rad: FloatArray, cell_px: float, answers: int) -> tuple[IntA
     by_roll = np.floor(roll_rad / (PHASE_CYCLES / cell_px)).astype(np.int64)
     by_count = np.arange(total) // (total if cell_px < 1 else MAX_STRETCH)
     kept = [0]
-    for each in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[1:].tolist():
+    for each in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[
+        1:
+    ].tolist():
         if each - kept[-1] >= MIN_STRETCH:
             kept.append(each)
     start = np.array(kept)
     if answers >= total:
         return start, np.arange(total)
     end = np.append(start[1:], total)
-    chosen = np.unique(np.linspace(0, len(start) - 1, max(4, round(len(start) * answers / total))).astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(start) - 1, max(4, round(len(start) * answers / total))).astype(int)
+    )
     rows = np.concatenate([np.arange(start[k], end[k]) for k in chosen])
     return np.concatenate([[0], np.cumsum((end - start)[chosen])[:-1]]), rows

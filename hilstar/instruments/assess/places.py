@@ -79,7 +79,9 @@ def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> sparse
 
     The bumps of a sample add to 1, so a constant fits up to the edge.
     """
-    near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
+    near = cKDTree(place).sparse_distance_matrix(
+        cKDTree(centre), REACH * spacing_px, output_type="ndarray"
+    )
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)
     total = np.bincount(near["i"], value, minlength=len(place))

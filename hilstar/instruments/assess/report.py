@@ -59,10 +59,22 @@ def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]
     and that over the bias.
     """
     bias = np.abs(parts.bias_arcsec)
-    found: dict[str, Any] = {"certificate": certificate.number, "off_arcsec": None, "share_of_bias": None}
+    found: dict[str, Any] = {
+        "certificate": certificate.number,
+        "off_arcsec": None,
+        "share_of_bias": None,
+    }
     if certificate.attitude_arcsec is not None:
-        sizes = zip(("cross", "roll"), certificate.attitude_arcsec, (float(np.hypot(*bias[:2])), float(bias[2])), strict=True)
-        each = {name: (own, min(own / measured, 1.0) if measured else 1.0) for name, own, measured in sizes}
+        sizes = zip(
+            ("cross", "roll"),
+            certificate.attitude_arcsec,
+            (float(np.hypot(*bias[:2])), float(bias[2])),
+            strict=True,
+        )
+        each = {
+            name: (own, min(own / measured, 1.0) if measured else 1.0)
+            for name, own, measured in sizes
+        }
         found["off_arcsec"] = {name: own for name, (own, _) in each.items()}
         found["share_of_bias"] = {name: share for name, (_, share) in each.items()}
     return found
@@ -85,12 +97,24 @@ def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRo
     """
     for k, axis in enumerate("xyz"):
         value = None if parts is None else float(parts.bias_arcsec[k])
-        yield FigureRow("bias", axis, value, "arcsec", *([] if parts is None else parts.intervals.bias[:, k].tolist()))
+        yield FigureRow(
+            "bias",
+            axis,
+            value,
+            "arcsec",
+            *([] if parts is None else parts.intervals.bias[:, k].tolist()),
+        )
     for part, name in PARTS.items():
-        axes = noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
+        axes = (
+            noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
+        )
         for k, axis in enumerate(("cross", "roll")):
             value = getattr(axes, axis)
-            ends = [] if parts is None or value is None else getattr(parts.intervals, part)[:, k].tolist()
+            ends = (
+                []
+                if parts is None or value is None
+                else getattr(parts.intervals, part)[:, k].tolist()
+            )
             yield FigureRow(name, axis, value, "arcsec", *ends)
 
 
@@ -115,7 +139,9 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
     ):
-        yield FigureRow(name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma)
+        yield FigureRow(
+            name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
+        )
     lock = found.lock
     yield FigureRow("availability", "", lock.availability)
     yield FigureRow("answers due", "", lock.due)
@@ -140,32 +166,51 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
 def write_tables(directory: Path, found: Assessment) -> None:
     """Write budget.csv, slices.csv, wrong.csv and outages.csv. Raises InputError."""
     write_csv(directory / "budget.csv", FigureRow._fields, [_plain(row) for row in rows_of(found)])
-    slices = [("rate_deg_s", each) for each in found.by_rate] + [("field_v_mag", each) for each in found.by_magnitude]
+    slices = [("rate_deg_s", each) for each in found.by_rate] + [
+        ("field_v_mag", each) for each in found.by_magnitude
+    ]
     names = ["by", *(field.name for field in fields(Slice))]
-    write_csv(directory / "slices.csv", names, [_plain((by, *astuple(each))) for by, each in slices])
+    write_csv(
+        directory / "slices.csv", names, [_plain((by, *astuple(each))) for by, each in slices]
+    )
     write_csv(
         directory / "wrong.csv",
         ("row", "t_s", "run_s", "off_deg"),
-        [(each.row, repr(each.t_s), f"{each.run_s:.6f}", f"{each.off_deg:.6g}") for each in found.wrong],
+        [
+            (each.row, repr(each.t_s), f"{each.run_s:.6f}", f"{each.off_deg:.6g}")
+            for each in found.wrong
+        ],
     )
     write_csv(
         directory / "outages.csv",
         ("run_s", "length_s", "lost", "rows", "wrong"),
-        [(f"{o.start_s:.6f}", f"{o.length_s:.6f}", int(o.lost), o.rows, o.wrong) for o in found.lock.outages],
+        [
+            (f"{o.start_s:.6f}", f"{o.length_s:.6f}", int(o.lost), o.rows, o.wrong)
+            for o in found.lock.outages
+        ],
     )
 
 
 def _plain(row: tuple[object, ...]) -> list[object]:
-    return ["" if value is None else f"{value:.9g}" if isinstance(value, float) else value for value in row]
+    return [
+        "" if value is None else f"{value:.9g}" if isinstance(value, float) else value
+        for value in row
+    ]
 
 
 def lines_of(found: Assessment) -> list[tuple[str, str]]:
     """The lines of the assessment on the terminal: name and text."""
     parts, lock, clock, display = found.found, found.lock, found.found.clock, found.display
     x, y, z = parts.bias_arcsec.tolist()
-    named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (", ..." if len(found.wrong) > MAX_NAMED else "")
+    named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (
+        ", ..." if len(found.wrong) > MAX_NAMED else ""
+    )
     where = "on lines" if found.telemetry.of_lines else "attitudes"
-    offset = f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms" if clock.offset_told else "unknown"
+    offset = (
+        f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms"
+        if clock.offset_told
+        else "unknown"
+    )
     drift = f"{1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"
     share, wait_s = lock.acquisition_probability, lock.acquisition_s
     wait = "-" if wait_s is None else f"{wait_s:.3g}"
@@ -174,7 +219,11 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         own = f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the boresight,"
         own += f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of it in the answers"
     answers = f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and {len(found.telemetry.t_ns)} rows"
-    answers += f"; {found.out_of_order} came out of order, sorted by their stamps" if found.out_of_order else ""
+    answers += (
+        f"; {found.out_of_order} came out of order, sorted by their stamps"
+        if found.out_of_order
+        else ""
+    )
     return [
         ("answers", answers),
         ("missed frames", found.missed_line),
@@ -182,8 +231,16 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("field-of-view error", _text(parts.fov_arcsec, parts.intervals.fov)),
         ("pixel error", _text(parts.pixel_arcsec, parts.intervals.pixel)),
         ("noise", _text(found.noise_arcsec, parts.intervals.noise)),
-        ("clock", f"offset {offset}, fast by {drift}" if clock.drift_told else "cannot be told: the run does not turn enough"),
-        ("availability", f"{100 * lock.availability:.2f} % of {lock.due} answers due, one each {1e3 * lock.cycle_s:.4g} ms"),
+        (
+            "clock",
+            f"offset {offset}, fast by {drift}"
+            if clock.drift_told
+            else "cannot be told: the run does not turn enough",
+        ),
+        (
+            "availability",
+            f"{100 * lock.availability:.2f} % of {lock.due} answers due, one each {1e3 * lock.cycle_s:.4g} ms",
+        ),
         ("lock lost", f"{len(lock.lost)} times"),
         ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {wait} s"),
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
@@ -214,7 +271,9 @@ def _text(axes: Axes, interval: FloatArray) -> str:
 
 def write_page(path: Path, found: Assessment) -> None:
     """Write the page of an assessment as one file that needs no other. Raises InputError."""
-    budget: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
+    budget: list[tuple[object, ...]] = [
+        (*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)
+    ]
     pixel = found.found.components.pixel
     body = [
         *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
@@ -226,17 +285,39 @@ def write_page(path: Path, found: Assessment) -> None:
         f"<p>Pixel error: {escaped(pixel.detail or pixel.reason)}.</p>",
         "<h2>Noise</h2>" + _histogram(found),
     ]
-    for name, unit, slices in (("rate", "deg/s", found.by_rate), ("magnitude of the field", "V mag", found.by_magnitude)):
-        header = (f"from, {unit}", "to", "answers", "noise across", "noise about", "error across, rms", "error about, rms")
+    for name, unit, slices in (
+        ("rate", "deg/s", found.by_rate),
+        ("magnitude of the field", "V mag", found.by_magnitude),
+    ):
+        header = (
+            f"from, {unit}",
+            "to",
+            "answers",
+            "noise across",
+            "noise about",
+            "error across, rms",
+            "error about, rms",
+        )
         if slices:
             table = table_of([astuple(each) for each in slices], header)
-            body.append(f"<h2>By {name}</h2>{table}<p>Arcsec; the error's rms is about the bias.</p>")
+            body.append(
+                f"<h2>By {name}</h2>{table}<p>Arcsec; the error's rms is about the bias.</p>"
+            )
     if found.wrong:
-        wrong = table_of([astuple(each) for each in found.wrong[:MAX_ROWS]], ("row", "t_s", "run s", "off by, deg"))
+        wrong = table_of(
+            [astuple(each) for each in found.wrong[:MAX_ROWS]],
+            ("row", "t_s", "run s", "off by, deg"),
+        )
         body.append("<h2>Wrong answers</h2>" + wrong)
     if found.lock.outages:
-        outages = [(o.start_s, o.length_s, "yes" if o.lost else "", o.rows, o.wrong) for o in found.lock.outages[:MAX_ROWS]]
-        body.append("<h2>Outages</h2>" + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong")))
+        outages = [
+            (o.start_s, o.length_s, "yes" if o.lost else "", o.rows, o.wrong)
+            for o in found.lock.outages[:MAX_ROWS]
+        ]
+        body.append(
+            "<h2>Outages</h2>"
+            + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong"))
+        )
     title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
     write_whole(path, page_of(title, body))
 
@@ -249,15 +330,30 @@ def _over_time(found: Assessment) -> str:
     repeating = parts.fov.fitted + parts.pixel.fitted
     rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
     finding = f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g} about the boresight"
-    note = (
-        "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost. Dotted lines: wrong answers."
-    )
+    note = "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost. Dotted lines: wrong answers."
     with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
         for axes, name, k in zip(panels, AXES, range(3), strict=True):
-            axes.plot(t_s[some], (repeating + parts.left)[some, k], ".", ms=3.5, color=MUTED, rasterized=True)
-            axes.plot(t_s[some], parts.fov.fitted[some, k], ".", ms=2.5, color=BLUE, rasterized=True, label="repeats")
+            axes.plot(
+                t_s[some],
+                (repeating + parts.left)[some, k],
+                ".",
+                ms=3.5,
+                color=MUTED,
+                rasterized=True,
+            )
+            axes.plot(
+                t_s[some],
+                parts.fov.fitted[some, k],
+                ".",
+                ms=2.5,
+                color=BLUE,
+                rasterized=True,
+                label="repeats",
+            )
             for each in found.lock.lost:
-                axes.axvspan(each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.3, lw=0)
+                axes.axvspan(
+                    each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.3, lw=0
+                )
             for wrong in found.wrong:
                 axes.axvline(wrong.run_s, color=INK, lw=1, ls=":")
             axes.set_ylabel(f"{name} [arcsec]")
@@ -274,7 +370,10 @@ def _field_map(found: Assessment) -> str:
     size = float(np.linalg.norm(mean))
     seen = axes[some] @ (mean / max(size, 1e-9))
     if parts.fov.reason or seen[:, 2].min() < 0.3:
-        reason = parts.fov.reason or "the run goes over too much of the sky for one map: see the chart over time"
+        reason = (
+            parts.fov.reason
+            or "the run goes over too much of the sky for one map: see the chart over time"
+        )
         return f"<p>{escaped(reason)}.</p>"
     place = scale.focal_px * seen[:, :2] / seen[:, 2:]
     largest = np.abs(parts.fov.fitted).max(axis=0)
@@ -282,9 +381,16 @@ def _field_map(found: Assessment) -> str:
     with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
         for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
             value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
-            look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "rasterized": True}
+            look: dict[str, Any] = {
+                "cmap": "RdBu_r",
+                "vmin": -limit,
+                "vmax": limit,
+                "rasterized": True,
+            }
             drawn = panel.scatter(place[:, 0], place[:, 1], c=value, s=6, edgecolors="none", **look)
-            panel.figure.colorbar(drawn, ax=panel, orientation="horizontal", label=f"{name} [arcsec]")
+            panel.figure.colorbar(
+                drawn, ax=panel, orientation="horizontal", label=f"{name} [arcsec]"
+            )
             panel.set_aspect("equal", adjustable="datalim")
             panel.set_xlabel("star field x [px]")
             panel.invert_yaxis()
@@ -302,7 +408,12 @@ def _histogram(found: Assessment) -> str:
             sigma = max(float(sigmas[k]), 1e-9)
             edges = np.linspace(-5, 5, 61) * sigma
             axes.hist(left[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
-            axes.plot(edges, np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)), color=INK, lw=1.2)
+            axes.plot(
+                edges,
+                np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
+                color=INK,
+                lw=1.2,
+            )
             axes.set_yscale("log")
             axes.set_ylim(1e-6 / sigma, 1 / sigma)
             axes.set_xlabel(f"{name} [arcsec]")

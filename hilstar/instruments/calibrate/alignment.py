@@ -20,9 +20,23 @@ from msgspec.structs import replace
 import hilstar
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import conjugate, from_matrix, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_matrix,
+    multiply,
+    normalise,
+    to_matrix,
+    to_rotation_vector,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.display.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
+from hilstar.display.geometry import (
+    ErrorTable,
+    MadeTable,
+    Notes,
+    load_geometry,
+    load_notes,
+    write_geometry,
+)
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.attitude_pairs import (
     Pairs,
@@ -45,9 +59,7 @@ FLOOR_RAD = 1e-3 / ARCSEC_PER_RAD  # smallest noise: quaternions are rounded
 MIN_EXPLAINED = 0.5  # share of the residual's squares that a named cause explains
 MIN_ATTITUDES = 6  # minimum from which a cause is sought
 MAX_NAMED = 10  # wild rows
-ONE_ATTITUDE = (
-    "one attitude: it determines the rotation, but does not tell what changes with attitude; take several, all over the sky"
-)
+ONE_ATTITUDE = "one attitude: it determines the rotation, but does not tell what changes with attitude; take several, all over the sky"
 NO_REPEATS = "no attitude was repeated: the residual cannot be told from the tracker's noise; take some attitudes several times"
 
 
@@ -124,7 +136,9 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
     """
     if len(pairs) < MIN_PAIRS:
         skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
-        raise InputError(f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more attitudes")
+        raise InputError(
+            f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more attitudes"
+        )
     refuse_conventions(pairs, camera.field_radius_rad(0.0))
     fit = fit_rotation(multiply(pairs.reported, conjugate(pairs.commanded)))
     used = fit.used
@@ -163,17 +177,27 @@ def groups_of(commanded: FloatArray) -> IntArray:
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1]).reshape(-1)
 
 
-def residual_of(commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray) -> Residual:
+def residual_of(
+    commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray
+) -> Residual:
     """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
     group = groups_of(commanded)
     cross, roll = residual_rad[:, :2], residual_rad[:, 2:]
     dof = max(1.0 - 1.0 / len(group), 0.5)
-    rms = AxesArcsec(*(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll)))
+    rms = AxesArcsec(
+        *(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll))
+    )
     repeat = unexplained = None
     if len(group) - group.max() - 1 >= MIN_REPEATS:
         judged = (_against_repeats(part, group) for part in (cross, roll))
         repeat, unexplained = (AxesArcsec(*of_axes) for of_axes in zip(*judged, strict=True))
-    return Residual(rms, repeat, unexplained, int(group.max()) + 1, _causes(commanded, rate_rad_s, residual_rad, q, group))
+    return Residual(
+        rms,
+        repeat,
+        unexplained,
+        int(group.max()) + 1,
+        _causes(commanded, rate_rad_s, residual_rad, q, group),
+    )
 
 
 def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
@@ -186,7 +210,9 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
     within = max(within, FLOOR_RAD**2)
     if groups < 2:
         return repeat, 0.0
-    between = float((count[:, None] * (means - part.mean(axis=0)) ** 2).sum()) / (axes * (groups - 1))
+    between = float((count[:, None] * (means - part.mean(axis=0)) ** 2).sum()) / (
+        axes * (groups - 1)
+    )
     if between / within <= _f_limit(axes * (groups - 1), axes * (pairs - groups)):
         return repeat, 0.0
     usual = (pairs - float((count**2).sum()) / pairs) / (groups - 1)
@@ -194,7 +220,11 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
 
 
 def _causes(
-    commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray, group: IntArray
+    commanded: FloatArray,
+    rate_rad_s: FloatArray | None,
+    residual_rad: FloatArray,
+    q: FloatArray,
+    group: IntArray,
 ) -> tuple[str, ...]:
     """Causes that explain most of the residual: a turned reference frame, a clock's offset, a
     drift.
@@ -210,7 +240,9 @@ def _causes(
     means = _means(residual_rad, group)
     causes = []
     # A turn n of the reference frame: C R(n) C* is a turn by C n in cam.
-    frames = np.stack([to_matrix(each) for each in commanded[np.unique(group, return_index=True)[1]]])
+    frames = np.stack(
+        [to_matrix(each) for each in commanded[np.unique(group, return_index=True)[1]]]
+    )
     turn = _explained(means, frames)
     if turn is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(turn))
@@ -220,16 +252,23 @@ def _causes(
     if rate_rad_s is not None:
         late = _explained(means, -_means(rate_rad_s @ to_matrix(q).T, group)[:, :, None])
         if late is not None:
-            causes.append(f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s")
+            causes.append(
+                f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s"
+            )
     drift = _explained(means, _means(row, group)[:, :, None] * np.eye(3))
     if drift is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(drift))
-        causes.append(f"a drift by {size:.3g} arcsec from the first row to the last explains most of it: did the mount move?")
+        causes.append(
+            f"a drift by {size:.3g} arcsec from the first row to the last explains most of it: did the mount move?"
+        )
     return tuple(causes)
 
 
 def _means(values: FloatArray, group: IntArray) -> FloatArray:
-    return np.stack([np.bincount(group, column) for column in values.T], axis=1) / np.bincount(group)[:, None]
+    return (
+        np.stack([np.bincount(group, column) for column in values.T], axis=1)
+        / np.bincount(group)[:, None]
+    )
 
 
 def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | None:
@@ -245,7 +284,12 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
     found, _, rank, _ = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)
     free = 3 * pairs - 3 - rank
     whole, left = float((wanted**2).sum()), float(((wanted.ravel() - design @ found) ** 2).sum())
-    if rank < amounts or free < 3 or left > (1 - MIN_EXPLAINED) * whole or whole < pairs * (FLOOR_RAD / cross) ** 2:
+    if (
+        rank < amounts
+        or free < 3
+        or left > (1 - MIN_EXPLAINED) * whole
+        or whole < pairs * (FLOOR_RAD / cross) ** 2
+    ):
         return None
     ratio = (whole - left) / amounts / max(left / free, 1e-30)
     return np.asarray(found) if ratio > _f_limit(amounts, free) else None
@@ -258,13 +302,19 @@ def _f_limit(above: float, below: float) -> float:
     return float(fdtri(above, below, 1 - FALSE_ALARM))
 
 
-def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: MonitorIdentity | None = None) -> None:
+def write_alignment(
+    path: Path, found: Aligned, file: BenchFile, identity: MonitorIdentity | None = None
+) -> None:
     """Write the bench's present geometry with the alignment that was found. Raises InputError
     where it cannot be written.
     """
     name = file.config.collimator.geometry
     if name is None:
-        camera, notes, lens_of = found.camera, Notes({}, ErrorTable(model="ideal lens"), MadeTable()), "the bench file"
+        camera, notes, lens_of = (
+            found.camera,
+            Notes({}, ErrorTable(model="ideal lens"), MadeTable()),
+            "the bench file",
+        )
     else:
         # As the file has it: the bench's own camera is bounded to what this screen needs.
         camera = load_geometry(file.folder / name, found.camera.resolution_px)
@@ -290,7 +340,9 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: Monit
         alignment_dof=float(found.dof),
     )
     sigma = notes.sigma | dict(zip(axes, found.sigma_arcsec, strict=True))
-    write_geometry(path, camera, found.q_cam_to_mon, Notes(sigma, error, made, identity or notes.identity))
+    write_geometry(
+        path, camera, found.q_cam_to_mon, Notes(sigma, error, made, identity or notes.identity)
+    )
 
 
 def summary_of(found: Aligned) -> dict[str, Any]:
@@ -312,7 +364,9 @@ def summary_of(found: Aligned) -> dict[str, Any]:
         "sigma_arcsec": found.sigma_arcsec,
         "residual_arcsec": asdict(residual.rms),
         "repeat_arcsec": None if residual.repeat is None else asdict(residual.repeat),
-        "unexplained_arcsec": None if residual.unexplained is None else asdict(residual.unexplained),
+        "unexplained_arcsec": None
+        if residual.unexplained is None
+        else asdict(residual.unexplained),
         "q_cam_to_mon": found.q_cam_to_mon.tolist(),
         "notes": remarks_of(found),
     }
@@ -328,8 +382,12 @@ def remarks_of(found: Aligned) -> tuple[str, ...]:
         remarks.append(NO_REPEATS)
     elif unexplained.cross > 0 or unexplained.roll > 0:
         parts = (("across", unexplained.cross), ("about", unexplained.roll))
-        excess = " and ".join(f"{value:.3g} arcsec rms {where} the boresight" for where, value in parts if value > 0)
-        remarks.append(f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar calibrate geometric)")
+        excess = " and ".join(
+            f"{value:.3g} arcsec rms {where} the boresight" for where, value in parts if value > 0
+        )
+        remarks.append(
+            f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar calibrate geometric)"
+        )
     return (*remarks, *residual.causes)
 
 
@@ -348,7 +406,10 @@ def lines_of(found: Aligned) -> list[str]:
         ("residual", _both(residual.rms)),
     ]
     if residual.repeat is not None and residual.unexplained is not None:
-        rows += [("repeats of an attitude", _both(residual.repeat)), ("not a rotation", _both(residual.unexplained))]
+        rows += [
+            ("repeats of an attitude", _both(residual.repeat)),
+            ("not a rotation", _both(residual.unexplained)),
+        ]
     width = max(len(name) for name, _ in rows) + 2
     return [f"{name:{width}}{text}" for name, text in rows] + list(remarks_of(found))
 

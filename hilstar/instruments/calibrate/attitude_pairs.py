@@ -25,7 +25,14 @@ from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_matrix,
+    to_rotation_vector,
+)
 from hilstar.basics.text_tables import finite_numbers, is_valid, read_rows
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
 from hilstar.server.record.commanded import read_commanded
@@ -90,7 +97,10 @@ def read_pairs(path: Path) -> Pairs:
         numbers.append(finite_numbers(path, line, columns, cells[:-1], SKIP))
         if len(lines) > MAX_ROWS:
             raise InputError(f"{path}: more than {MAX_ROWS} rows; write fewer")
-    line_of, both = np.array(lines, dtype=np.intp), np.array(numbers).reshape(len(lines), len(columns))
+    line_of, both = (
+        np.array(lines, dtype=np.intp),
+        np.array(numbers).reshape(len(lines), len(columns)),
+    )
     commanded = _unit(path, line_of, both[:, :4], COMMANDED)
     return Pairs(path, line_of, commanded, _unit(path, line_of, both[:, 4:], REPORTED), skipped)
 
@@ -181,8 +191,15 @@ def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     for candidate in rotations[chosen]:
         cosine = np.abs(rotations @ candidate)
         # The chord is exact for tiny angles, where the cosine is not.
-        chord = np.linalg.norm(rotations - np.where((rotations @ candidate)[:, None] < 0, -1.0, 1.0) * candidate, axis=1)
-        angle = np.where(cosine > 0.5, 4 * np.arcsin(np.minimum(chord / 2, 1.0)), 2 * np.arccos(np.minimum(cosine, 1.0)))
+        chord = np.linalg.norm(
+            rotations - np.where((rotations @ candidate)[:, None] < 0, -1.0, 1.0) * candidate,
+            axis=1,
+        )
+        angle = np.where(
+            cosine > 0.5,
+            4 * np.arcsin(np.minimum(chord / 2, 1.0)),
+            2 * np.arccos(np.minimum(cosine, 1.0)),
+        )
         half = float(np.quantile(angle, 0.5, method="higher"))
         if half < reach:
             best, angles, reach = candidate, angle, half
@@ -245,12 +262,14 @@ def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]
     for axis, signs in (("x", (1, 1, -1, -1)), ("y", (1, -1, 1, -1)), ("z", (1, -1, -1, 1))):
         cure = f"are mirrored in {axis}: write them for right-handed axes, x right and y down in the image"
         yield _as_is, partial(np.multiply, np.array(signs, dtype=np.float64)), f"{tracker} {cure}"
-    both = (
-        "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the tracker's reference frame is not"
-    )
+    both = "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the tracker's reference frame is not"
     yield conjugate, conjugate, f"{both} ICRS; write q_icrs_to_cam, scalar first, in ICRS"
     yield _scalar_last, _as_is, "the commanded quaternions have the scalar last; write w first"
-    yield _scalar_last, conjugate, f"the commanded quaternions have the scalar last, and the tracker's {inverse}"
+    yield (
+        _scalar_last,
+        conjugate,
+        f"the commanded quaternions have the scalar last, and the tracker's {inverse}",
+    )
 
 
 def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
@@ -272,7 +291,9 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     cure = next((cure for reach, cure in found if reach <= SIMPLER * best), "")
     agrees = spread <= AGREE_RAD
     if cure and (not agrees or out_of_view or (spread > CLEARLY_RAD and CLEARLY * best < spread)):
-        raise InputError(f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes; {cure}")
+        raise InputError(
+            f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes; {cure}"
+        )
     if not agrees:
         raise InputError(
             f"{pairs.source}: half or more of the reported attitudes are wild: no more than half of {len(pairs)} agree within"

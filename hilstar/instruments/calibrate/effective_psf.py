@@ -19,7 +19,12 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.charts import chart
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.geometric.calibration import SEED, dot_sigma_px, matched, nominal_of
+from hilstar.instruments.calibrate.geometric.calibration import (
+    SEED,
+    dot_sigma_px,
+    matched,
+    nominal_of,
+)
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX, MIN_DOTS, read_plan
 from hilstar.instruments.calibrate.geometric.fit import MatchedDots
 from hilstar.instruments.calibrate.geometric.match import first_look
@@ -84,7 +89,13 @@ class Effective:
     knots_px: FloatArray
     spline: FloatArray
 
-    def of(self, x_px: FloatArray, y_px: FloatArray, offsets: tuple[FloatArray, FloatArray], side_px: FloatArray) -> FloatArray:
+    def of(
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        offsets: tuple[FloatArray, FloatArray],
+        side_px: FloatArray,
+    ) -> FloatArray:
         """Shares (n, h, w) of pixels at offsets (n, w), (n, h) from squares of `side_px` (n,), 0
         or more, at places (n,).
         """
@@ -126,7 +137,9 @@ def _quadrature(side_px: float) -> tuple[FloatArray, FloatArray]:
     return nodes, vectors[0] ** 2
 
 
-def gaussians(x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_px: FloatArray) -> FloatArray:
+def gaussians(
+    x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_px: FloatArray
+) -> FloatArray:
     """Shares (n, h, w) of pixels at offsets (n, w), (n, h): Gaussians of covariance xx, xy, yy
     (n, 3), over squares (n,).
     """
@@ -135,7 +148,10 @@ def gaussians(x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_p
     most = 0.95 * np.sqrt(xx * yy)
     xy = np.clip(xy, -most, most)
     determinant = xx * yy - xy**2
-    nodes, weights = (np.stack(part) for part in zip(*(_quadrature(float(side)) for side in np.round(side_px, 3)), strict=True))
+    nodes, weights = (
+        np.stack(part)
+        for part in zip(*(_quadrature(float(side)) for side in np.round(side_px, 3)), strict=True)
+    )
     x, y = ((off[:, :, None] + nodes[:, None]).reshape(len(nodes), -1) for off in (x_px, y_px))
     scale = -0.5 / determinant
     light = (2 * scale * -xy)[:, None, None] * y[:, :, None] * x[:, None]
@@ -161,7 +177,9 @@ def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray)
     return np.asarray((high - low) / (2 * half))
 
 
-def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int) -> "Found":
+def effective_psf(
+    file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int
+) -> "Found":
     """The effective PSF from a tracker's images of planned dots. Raises InputError."""
     config = file.config
     nominal = nominal_of(file)
@@ -170,7 +188,9 @@ def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Pat
     look = first_look(dots, nominal, seen, np.random.default_rng(SEED))
     _, data = matched(dots, nominal, seen, look)
     if len(np.unique(data.dot)) < MIN_DOTS:
-        raise InputError(f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more dots or frames")
+        raise InputError(
+            f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more dots or frames"
+        )
     under = None if dark is None else read_image(dark, config.tracker.resolution_px)
     sides = _dot_sides(data, dots.x_px, dots.y_px)
     cut = cut_out(numbered(images), config.tracker.resolution_px, under, data, sides)
@@ -206,10 +226,14 @@ def cut_out(
     _, which = np.unique(np.stack([data.seen.pose, data.dot]), axis=1, return_inverse=True)
     which = which.ravel()
     count = np.bincount(which)
-    x_px, y_px, side_px = (np.bincount(which, part) / count for part in (data.seen.x_px, data.seen.y_px, sides_px))
+    x_px, y_px, side_px = (
+        np.bincount(which, part) / count for part in (data.seen.x_px, data.seen.y_px, sides_px)
+    )
     reach = MAX_HALF_PX
     column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
-    total, squares, lit = (np.zeros((len(count), *size)) for size in ((2 * reach + 1,) * 2, (2 * reach + 1,) * 2, ()))
+    total, squares, lit = (
+        np.zeros((len(count), *size)) for size in ((2 * reach + 1,) * 2, (2 * reach + 1,) * 2, ())
+    )
     steps = np.arange(-reach, reach + 1)
     for (frame, pose), path in paths.items():
         here = np.flatnonzero((data.seen.frame == frame) & (data.seen.pose == pose))
@@ -218,9 +242,14 @@ def cut_out(
         image = read_image(path, resolution_px)
         image = np.pad(image if dark is None else image - dark, reach, constant_values=np.nan)
         x, y = data.seen.x_px[here], data.seen.y_px[here]
-        apart = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) + np.where(np.eye(len(here)), np.inf, 0)
+        apart = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) + np.where(
+            np.eye(len(here)), np.inf, 0
+        )
         alone = which[here[apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX]]
-        found = image[(row[alone, None] + reach + steps)[:, :, None], (column[alone, None] + reach + steps)[:, None, :]]
+        found = image[
+            (row[alone, None] + reach + steps)[:, :, None],
+            (column[alone, None] + reach + steps)[:, None, :],
+        ]
         total[alone] += found
         squares[alone] += found**2
         lit[alone] += 1
@@ -232,12 +261,16 @@ def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px
     where they are too few.
     """
     padded = np.pad(image, MAX_HALF_PX, constant_values=np.nan)
-    apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px)) + np.where(np.eye(len(x_px)), np.inf, 0)
+    apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px)) + np.where(
+        np.eye(len(x_px)), np.inf, 0
+    )
     column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
     steps = np.arange(2 * MAX_HALF_PX + 1)
     found = padded[(row[:, None] + steps)[:, :, None], (column[:, None] + steps)[:, None, :]]
     lit = np.where(apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX, 1.0, 0.0)
-    return _of_frames((found, found**2, lit), (column, row, x_px, y_px, np.full(len(x_px), side_px)))
+    return _of_frames(
+        (found, found**2, lit), (column, row, x_px, y_px, np.full(len(x_px), side_px))
+    )
 
 
 def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[Any, ...]) -> Dots:
@@ -273,7 +306,9 @@ def _variance(mean: FloatArray, spread: FloatArray, lit: FloatArray) -> FloatArr
     own = light[again].ravel()
     dim = own < np.median(own) + 0.1 * np.ptp(own)
     flat = max(float(unbiased[dim].mean()), QUANTISED_DN2)
-    slope = max(float(((unbiased - flat) * own)[~dim].sum() / max((own[~dim] ** 2).sum(), 1e-300)), 0.0)
+    slope = max(
+        float(((unbiased - flat) * own)[~dim].sum() / max((own[~dim] ** 2).sum(), 1e-300)), 0.0
+    )
     return flat + slope * light.clip(min=0)
 
 
@@ -281,7 +316,9 @@ def _half_px(dots: Dots) -> int:
     """Half the side of the square beyond which the dots have no light."""
     side = dots.images.shape[1]
     ring = np.abs(np.indices((side, side)) - side // 2).max(axis=0).ravel()
-    flux = (dots.images - dots.images[:, :1].mean(axis=(1, 2), keepdims=True)).reshape(len(dots.images), -1)
+    flux = (dots.images - dots.images[:, :1].mean(axis=(1, 2), keepdims=True)).reshape(
+        len(dots.images), -1
+    )
     flux, variance = flux.sum(axis=0), dots.variance.reshape(len(dots.images), -1).sum(axis=0)
     size = np.bincount(ring)
     mean, sigma = np.bincount(ring, flux) / size, np.sqrt(np.bincount(ring, variance)) / size
@@ -321,21 +358,40 @@ def fit_effective(dots: Dots, per_px: int) -> Found:
     for dots that are none.
     """
     place = np.stack([dots.x_px, dots.y_px], axis=1)
-    middle, scale = (place.max(axis=0) + place.min(axis=0)) / 2, max(float(np.ptp(place, axis=0).max()) / 2, 1.0)
+    middle, scale = (
+        (place.max(axis=0) + place.min(axis=0)) / 2,
+        max(float(np.ptp(place, axis=0).max()) / 2, 1.0),
+    )
     dots, covariance = _each_gaussian(dots)
-    degrees = [d for d in range(MAX_DEGREE + 1) if (d + 1) * (d + 2) // 2 * DOTS_A_TERM <= len(place)]
+    degrees = [
+        d for d in range(MAX_DEGREE + 1) if (d + 1) * (d + 2) // 2 * DOTS_A_TERM <= len(place)
+    ]
     counts = [(d + 1) * (d + 2) // 2 for d in degrees]
     start = Effective(middle, scale, np.zeros((counts[-1], 3)), _knots(dots), np.zeros((0, 0, 0)))
     fold = np.random.default_rng(SEED).permutation(len(place)) % FOLDS
-    models = [_held_out(start, dots, covariance, fold, 0), *(_held_out(start, dots, covariance, fold, n) for n in counts)]
+    models = [
+        _held_out(start, dots, covariance, fold, 0),
+        *(_held_out(start, dots, covariance, fold, n) for n in counts),
+    ]
     gaussian, best = models[0], min(models[1:], key=lambda model: float(model.chi2.mean()))
     gain = gaussian.chi2 - best.chi2
     asks = bool(gain.mean() > ASKS_SIGMAS * gain.std(ddof=1) / np.sqrt(len(gain)))
     chosen = best if asks else gaussian
     final, _ = _fitted(start, dots, covariance, counts[models.index(best) - 1] if asks else 0)
     half = dots.images.shape[1] // 2
-    found, variance = _glass(final, place, half, per_px), final.covariance[0, [0, 2]].clip(min=MIN_VARIANCE_PX2)
-    return Found(found, models, chosen, asks, (float(variance[0] ** 0.5), float(variance[1] ** 0.5)), len(place), half)
+    found, variance = (
+        _glass(final, place, half, per_px),
+        final.covariance[0, [0, 2]].clip(min=MIN_VARIANCE_PX2),
+    )
+    return Found(
+        found,
+        models,
+        chosen,
+        asks,
+        (float(variance[0] ** 0.5), float(variance[1] ** 0.5)),
+        len(place),
+        half,
+    )
 
 
 def _knots(dots: Dots) -> FloatArray:
@@ -351,7 +407,9 @@ def _each_gaussian(dots: Dots) -> tuple[Dots, FloatArray]:
     covariance = np.tile([0.5, 0.0, 0.5], (len(dots.x_px), 1))
     for _ in range(FIT_ROUNDS):
         own = gaussians(*dots.offsets, covariance, dots.side_px)
-        slopes = [(gaussians(*moved, covariance, dots.side_px) - own) / STEP_PX for moved in _moved(dots)]
+        slopes = [
+            (gaussians(*moved, covariance, dots.side_px) - own) / STEP_PX for moved in _moved(dots)
+        ]
         for k in range(3):
             more = covariance.copy()
             more[:, k] += STEP_PX2
@@ -370,11 +428,15 @@ def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
     return (x - STEP_PX, y), (x, y - STEP_PX)
 
 
-def _amplitudes(dots: Dots, own: FloatArray, slopes: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _amplitudes(
+    dots: Dots, own: FloatArray, slopes: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Light and background (n, 2) of dots by weighted least squares, and steps (n, k) along
     `slopes` of the model.
     """
-    columns = np.stack([own, np.ones_like(own), *slopes], axis=1).reshape(len(own), 2 + len(slopes), -1)
+    columns = np.stack([own, np.ones_like(own), *slopes], axis=1).reshape(
+        len(own), 2 + len(slopes), -1
+    )
     weight = 1 / dots.variance.reshape(len(own), 1, -1)
     normal = (columns * weight) @ columns.transpose(0, 2, 1)
     size = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-300))
@@ -391,7 +453,9 @@ def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]
     x_px, y_px = dots.x_px, dots.y_px
     for _ in range(PLACE_ROUNDS):
         own = model.of(x_px, y_px, dots.offsets, dots.side_px)
-        slopes = [(model.of(x_px, y_px, moved, dots.side_px) - own) / STEP_PX for moved in _moved(dots)]
+        slopes = [
+            (model.of(x_px, y_px, moved, dots.side_px) - own) / STEP_PX for moved in _moved(dots)
+        ]
         _, steps = _amplitudes(dots, own, slopes)
         steps = np.clip(steps, -0.3, 0.3)
         dots = replace(dots, x_px=dots.x_px + steps[:, 0], y_px=dots.y_px + steps[:, 1])
@@ -399,7 +463,9 @@ def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]
     return dots, own, _amplitudes(dots, own, ())[0]
 
 
-def _fitted(start: Effective, dots: Dots, covariance: FloatArray, count: int) -> tuple[Effective, Dots]:
+def _fitted(
+    start: Effective, dots: Dots, covariance: FloatArray, count: int
+) -> tuple[Effective, Dots]:
     """A model of dots: the Gaussian's covariance over the field, and a spline with `count` terms
     over the field.
     """
@@ -410,7 +476,8 @@ def _fitted(start: Effective, dots: Dots, covariance: FloatArray, count: int) ->
     coefficients = start.covariance
     for _ in range(5):
         coefficients = np.asarray(
-            np.linalg.lstsq(terms * weight[:, None], covariance * weight[:, None], rcond=None)[0], np.float64
+            np.linalg.lstsq(terms * weight[:, None], covariance * weight[:, None], rcond=None)[0],
+            np.float64,
         )
         off = np.abs(covariance - terms @ coefficients).max(axis=1)
         weight = 1 / np.maximum(1.0, off / max(2 * float(np.median(off)), 1e-9))
@@ -419,7 +486,9 @@ def _fitted(start: Effective, dots: Dots, covariance: FloatArray, count: int) ->
         return model, dots
     for _ in range(SPLINE_ROUNDS):
         dots, _, amplitudes = _placed(model, dots)
-        model = replace(model, spline=_spline(replace(model, spline=start.spline), dots, amplitudes, count))
+        model = replace(
+            model, spline=_spline(replace(model, spline=start.spline), dots, amplitudes, count)
+        )
     return model, dots
 
 
@@ -432,7 +501,9 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
     flux, background = amplitudes.T[:, :, None, None]
     flux = np.maximum(flux, 1e-9)
     sigma = np.sqrt(dots.variance) / flux
-    rest = (dots.images - background) / flux - gaussian.of(dots.x_px, dots.y_px, dots.offsets, dots.side_px)
+    rest = (dots.images - background) / flux - gaussian.of(
+        dots.x_px, dots.y_px, dots.offsets, dots.side_px
+    )
     across, down = (_functions(gaussian.knots_px, off, dots.side_px) for off in dots.offsets)
     place = (np.stack([dots.x_px, dots.y_px], axis=1) - gaussian.middle_px) / gaussian.scale_px
     terms, size = terms_of(place, count), len(gaussian.knots_px)
@@ -445,12 +516,23 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
         of_dot = down.transpose(0, 2, 1) @ (values.reshape(sigma.shape) / sigma) @ across
         return np.asarray(np.tensordot(terms.T, of_dot, axes=1).ravel())
 
-    operator = LinearOperator((sigma.size, count * size * size), matvec=forward, rmatvec=backward, dtype=np.float64)
-    found = lsqr(operator, (rest / sigma).ravel(), damp=1 / PRIOR_SHARE, iter_lim=SPLINE_STEPS, atol=1e-5, btol=1e-5)[0]
+    operator = LinearOperator(
+        (sigma.size, count * size * size), matvec=forward, rmatvec=backward, dtype=np.float64
+    )
+    found = lsqr(
+        operator,
+        (rest / sigma).ravel(),
+        damp=1 / PRIOR_SHARE,
+        iter_lim=SPLINE_STEPS,
+        atol=1e-5,
+        btol=1e-5,
+    )[0]
     return np.asarray(found.reshape(count, size, size))
 
 
-def _held_out(start: Effective, dots: Dots, covariance: FloatArray, fold: IntArray, count: int) -> HeldOut:
+def _held_out(
+    start: Effective, dots: Dots, covariance: FloatArray, fold: IntArray, count: int
+) -> HeldOut:
     """How far a model is off dots that it was not fitted to; only their places, light and
     background are.
     """
@@ -460,11 +542,18 @@ def _held_out(start: Effective, dots: Dots, covariance: FloatArray, fold: IntArr
         model, _ = _fitted(start, dots.at(known), covariance[known], count)
         own, shares, amplitudes = _placed(model, dots.at(held))
         flux, background = amplitudes.T[:, :, None, None]
-        off, peak = own.images - background - flux * shares, np.abs(flux[:, 0, 0]) * shares.max(axis=(1, 2))
+        off, peak = (
+            own.images - background - flux * shares,
+            np.abs(flux[:, 0, 0]) * shares.max(axis=(1, 2)),
+        )
         chi2[held] = (off**2 / own.variance).mean(axis=(1, 2))
         rms[held] = np.sqrt((off**2).mean(axis=(1, 2))) / peak
         noise[held] = np.sqrt(own.variance.mean(axis=(1, 2))) / peak
-    name = f"spline, {('constant', 'linear', 'quadratic')[(1, 3, 6).index(count)]} over the field" if count else "Gaussian"
+    name = (
+        f"spline, {('constant', 'linear', 'quadratic')[(1, 3, 6).index(count)]} over the field"
+        if count
+        else "Gaussian"
+    )
     return HeldOut(name, float(np.sqrt(np.mean(rms**2))), float(np.sqrt(np.mean(noise**2))), chi2)
 
 
@@ -485,34 +574,46 @@ def _glass(model: Effective, place: FloatArray, half_px: int, per_px: int) -> Gl
         f"hilstar calibrate psf: {len(place)} dots",
         "collimator and tracker together, without the dots' squares; centroids in the middle",
     )
-    return glass_of(Stack(images, at, facts_of(len(at)), per_px, pixel_integrated=True), history=history)
+    return glass_of(
+        Stack(images, at, facts_of(len(at)), per_px, pixel_integrated=True), history=history
+    )
 
 
 def draw_effective(path: Path, found: Found) -> None:
     """Draw the PSFs at the corners, edges and middle of the field."""
     images = found.glass.images[:, 0, 0]
-    finding = (
-        f"Held-out dots: {found.chosen.name} is off by {found.chosen.rms:.2%} of the peak, noise by {found.chosen.noise:.2%}"
-    )
+    finding = f"Held-out dots: {found.chosen.name} is off by {found.chosen.rms:.2%} of the peak, noise by {found.chosen.noise:.2%}"
     with chart(path, finding, height_inch=6.6) as (axes,):
         picked = images.reshape(POINTS, POINTS, *images.shape[1:])[:: POINTS // 2, :: POINTS // 2]
         # points are sorted by x, then y
         picture = picked.transpose(1, 2, 0, 3).reshape(3 * images.shape[1], -1)
         axes.imshow(np.sqrt(picture.clip(min=0)), cmap="viridis", interpolation="nearest")
-        axes.set(xticks=[], yticks=[], xlabel="left, middle and right of the dots' field", ylabel="bottom, middle, top")
+        axes.set(
+            xticks=[],
+            yticks=[],
+            xlabel="left, middle and right of the dots' field",
+            ylabel="bottom, middle, top",
+        )
         axes.grid(visible=False)
 
 
 def summary_of(found: Found) -> dict[str, Any]:
     """The figures of an effective PSF, by the keys of --json."""
-    models = [{"name": m.name, "rms": m.rms, "noise": m.noise, "reduced_chi2": float(m.chi2.mean())} for m in found.models]
+    models = [
+        {"name": m.name, "rms": m.rms, "noise": m.noise, "reduced_chi2": float(m.chi2.mean())}
+        for m in found.models
+    ]
     return {
         "dots": found.dots,
         "half_px": found.half_px,
         "sigma_px": list(found.sigma_px),
         "model": found.chosen.name,
         "more_than_gaussian": found.asks_for_more,
-        "held_out": {"rms": found.chosen.rms, "noise": found.chosen.noise, "reduced_chi2": float(found.chosen.chi2.mean())},
+        "held_out": {
+            "rms": found.chosen.rms,
+            "noise": found.chosen.noise,
+            "reduced_chi2": float(found.chosen.chi2.mean()),
+        },
         "models": models,
         "components": len(found.glass.basis),
     }
@@ -523,7 +624,10 @@ def lines_of(found: Found) -> list[str]:
     x, y = found.sigma_px
     rows = [
         ("dots", f"{found.dots}, each within {2 * found.half_px + 1} x {2 * found.half_px + 1} px"),
-        ("Gaussian", f"sigma {x:.3f} and {y:.3f} px in the middle of the field, without dot and pixel"),
+        (
+            "Gaussian",
+            f"sigma {x:.3f} and {y:.3f} px in the middle of the field, without dot and pixel",
+        ),
         *(
             (
                 m.name,
@@ -531,7 +635,10 @@ def lines_of(found: Found) -> list[str]:
             )
             for m in found.models
         ),
-        ("chosen", found.chosen.name + ("" if found.asks_for_more else ": the data ask for no more")),
+        (
+            "chosen",
+            found.chosen.name + ("" if found.asks_for_more else ": the data ask for no more"),
+        ),
     ]
     width = max(len(name) for name, _ in rows) + 2
     return [f"{name:{width}}{text}" for name, text in rows]

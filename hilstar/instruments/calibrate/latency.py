@@ -22,7 +22,13 @@ from hilstar.basics.text_tables import read_rows
 from hilstar.basics.units import ERROR_OF_MEDIAN, NS_PER_MS, NS_PER_S, NS_PER_US
 from hilstar.server.bench.bench_file import with_key
 from hilstar.server.bench.config import BenchConfig, Monitor
-from hilstar.server.record.ledger_records import NO_FRAMES, FrameRecord, config_of, read_head, run_records
+from hilstar.server.record.ledger_records import (
+    NO_FRAMES,
+    FrameRecord,
+    config_of,
+    read_head,
+    run_records,
+)
 from hilstar.server.sync import beat, exposures_of
 
 INT64 = range(-(2**63), 2**63)
@@ -48,9 +54,15 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
     delay stays in the latency. Raises InputError where there are too few.
     """
     lines = read_lines(port, baud, seconds)
-    found = [(host_ns, match) for host_ns, line in lines if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))]
+    found = [
+        (host_ns, match)
+        for host_ns, line in lines
+        if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))
+    ]
     if len(found) < MIN_EDGES:
-        raise InputError(f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}")
+        raise InputError(
+            f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}"
+        )
     host_ns = np.array([host for host, _ in found], dtype=np.int64)
     level = np.array([int(match[1]) for _, match in found], dtype=np.int64)
     if all(match[2] is not None for _, match in found):
@@ -67,7 +79,9 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
 def read_edges(path: Path) -> Edges:
     """Read edges from a CSV file with the columns host_ns and level. Raises InputError."""
     rows = []
-    for line, cells in read_rows(path, ("host_ns", "level"), f"{EDGE_FORM} under that header", MAX_EDGE_BYTES, ()):
+    for line, cells in read_rows(
+        path, ("host_ns", "level"), f"{EDGE_FORM} under that header", MAX_EDGE_BYTES, ()
+    ):
         try:
             rows.append((int(cells[0]), int(cells[1])))
             if rows[-1][0] not in INT64:
@@ -76,14 +90,18 @@ def read_edges(path: Path) -> Edges:
             wrong = f"not a file of edges ({shortened(repr(error))}); {EDGE_FORM} under that header"
             raise InputError(f"{path}:{line}: {wrong}") from error
     if len(rows) < MIN_EDGES or any(level not in {0, 1} for _, level in rows):
-        raise InputError(f"{path}: at least {MIN_EDGES} edges are needed, each of level 0 or 1; {EDGE_FORM}")
+        raise InputError(
+            f"{path}: at least {MIN_EDGES} edges are needed, each of level 0 or 1; {EDGE_FORM}"
+        )
     table = np.array(rows, dtype=np.int64)
     return Edges(table[:, 0], table[:, 1])
 
 
 def save_edges(path: Path, edges: Edges) -> None:
     """Write edges as `read_edges` reads them. Raises InputError where that cannot be done."""
-    write_csv(path, ("host_ns", "level"), zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True))
+    write_csv(
+        path, ("host_ns", "level"), zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True)
+    )
 
 
 def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
@@ -119,7 +137,9 @@ def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
     """Match each edge to its frame by the most frequent latency, within half a period. Raises
     InputError if too few agree.
     """
-    inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS)
+    inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (
+        seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS
+    )
     host_ns, level = seen.host_ns[inside], seen.level[inside]
     guess_ns, ambiguous = _likely_latency_ns(Edges(host_ns, level), shown)
     latency, kept = [], []
@@ -156,7 +176,9 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
         begin = np.searchsorted(causes, mine - MAX_LATENCY_NS)
         end = np.searchsorted(causes, mine + MAX_EARLY_NS, side="right")
         for edge_ns, a, b in zip(mine, begin, end, strict=True):
-            np.add.at(counts, np.minimum((edge_ns - causes[a:b] + MAX_EARLY_NS) // BIN_NS, bins - 1), 1)
+            np.add.at(
+                counts, np.minimum((edge_ns - causes[a:b] + MAX_EARLY_NS) // BIN_NS, bins - 1), 1
+            )
     smooth = np.convolve(counts, np.ones(3, dtype=np.int64), mode="same")
     likely = np.flatnonzero(smooth >= LIKELY_SHARE * smooth.max())
     first = likely[likely <= likely[0] + 2]
@@ -218,10 +240,17 @@ def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> Non
     that cannot be changed.
     """
     value = checked_delay_ms(panel_delay_ms)
-    text = with_key(read_text(path, "give the path of a bench file", MAX_TOML_BYTES), "monitor", "panel_delay_ms", value)
+    text = with_key(
+        read_text(path, "give the path of a bench file", MAX_TOML_BYTES),
+        "monitor",
+        "panel_delay_ms",
+        value,
+    )
     text = with_key(text, "certify", "panel_delay_u_ms", float(f"{error_ms:.3g}"))
     if parse_toml(path, text).get("monitor", {}).get("panel_delay_ms") != value:
-        raise InputError(f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form")
+        raise InputError(
+            f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form"
+        )
     write_whole(path, text)
 
 
@@ -236,7 +265,9 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[
     """
     config = config_of(read_head(ledger))
     if config is None:
-        raise InputError(f"{ledger}: its header has no bench file that can be read; record the run again")
+        raise InputError(
+            f"{ledger}: its header has no bench file that can be read; record the run again"
+        )
     swap_ns, level, seen = array("q"), array("b"), False
     for record in run_records(ledger):
         if isinstance(record, FrameRecord):
@@ -247,7 +278,9 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[
     if not seen:
         raise InputError(f"the run {NO_FRAMES}")
     if not level:
-        raise InputError("the run has no photodiode square; set [monitor] photodiode_px and run it on a screen")
+        raise InputError(
+            "the run has no photodiode square; set [monitor] photodiode_px and run it on a screen"
+        )
     shown = edges_of(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
     if not len(shown.host_ns):
         raise InputError(f"{ledger}: its photodiode square never changed; record a longer run")
@@ -264,7 +297,10 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
     every = "none" if turn["period_s"] is None else f"every {turn['period_s']:.3g} s"
     worst = turn["worst_arcsec_per_deg_s"]
     cost = "-" if worst is None else f"at most {worst:.2g} arcsec at 1 deg/s"
-    rise, fall = ("-" if value is None else f"{value:.2f}" for value in (summary["rise_ms"], summary["fall_ms"]))
+    rise, fall = (
+        "-" if value is None else f"{value:.2f}"
+        for value in (summary["rise_ms"], summary["fall_ms"])
+    )
     figures = {
         "edges": f"{summary['edges']} paired, {summary['unmatched']} without a frame",
         "swap to light": f"{latency['p1']:.2f} / {latency['p50']:.2f} / {latency['p99']:.2f} ms (p1 / p50 / p99)",
@@ -275,7 +311,9 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
         "panel_delay_ms": f"{summary['panel_delay_ms']:.3f} +- {summary['panel_delay_u_ms']:.3f}",
     }
     if summary["ambiguous"]:
-        figures["note"] = 'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code" tells which'
+        figures["note"] = (
+            'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code" tells which'
+        )
     return [f"{what:24}{how_much}" for what, how_much in figures.items()]
 
 

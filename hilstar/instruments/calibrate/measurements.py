@@ -128,11 +128,15 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     raw = read_bytes(path, ADVICE, MAX_BYTES)
     rows = list(_rows(path))
     if not rows:
-        raise InputError(f"{path}: it has no measurement; write code,channel,value rows below the header")
+        raise InputError(
+            f"{path}: it has no measurement; write code,channel,value rows below the header"
+        )
     codes = np.array([row.code for row in rows], dtype=np.intp)
     bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
     if codes.max() >= 2**bits:
-        raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits")
+        raise InputError(
+            f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits"
+        )
     channel = np.array([row.channel for row in rows])
     reading = np.array([row.value for row in rows])
     exposure_s = np.array([row.exposure_s for row in rows])
@@ -140,9 +144,14 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     common = np.array([row.common for row in rows]).reshape(len(rows), -1) / exposure_s[:, None]
     given = [row.t_s for row in rows if row.t_s is not None]
     if given and len(given) < len(rows):
-        raise InputError(f"{path}: t_s is empty in some rows; give it in every row or leave the column out")
+        raise InputError(
+            f"{path}: t_s is empty in some rows; give it in every row or leave the column out"
+        )
     time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
-    clipped = {name: _clipped(codes[channel == name], reading[channel == name]) for name in set(channel.tolist())}
+    clipped = {
+        name: _clipped(codes[channel == name], reading[channel == name])
+        for name in set(channel.tolist())
+    }
     digest = hashlib.sha256(raw).hexdigest()
     return Measurements(
         source=str(path),
@@ -181,20 +190,28 @@ def _columns(table: TextTable) -> dict[str, Chosen]:
         if chosen is not None:
             columns[name] = chosen
         elif name in NEEDED:
-            raise InputError(f"{place}: the column {name} is missing; the header is code,channel,value")
+            raise InputError(
+                f"{place}: the column {name} is missing; the header is code,channel,value"
+            )
     if len(columns) < len(table.columns):
         known = ", ".join(COLUMNS)
-        raise InputError(f"{place}: unknown or repeated column in {shortened(table.names)}; known are {known}")
+        raise InputError(
+            f"{place}: unknown or repeated column in {shortened(table.names)}; known are {known}"
+        )
     return columns
 
 
 def _row(place: str, cells: dict[str, str]) -> _Row:
     if not cells["value"]:
-        raise InputError(f"{place}: value is empty; measure the patch and fill it in, or delete the row")
+        raise InputError(
+            f"{place}: value is empty; measure the patch and fill it in, or delete the row"
+        )
     try:
         code = int(cells["code"])
     except ValueError as error:
-        raise InputError(f"{place}: code = {shortened(cells['code'])}; write a whole number") from error
+        raise InputError(
+            f"{place}: code = {shortened(cells['code'])}; write a whole number"
+        ) from error
     if not 0 <= code < 2**16:
         raise InputError(f"{place}: code = {shortened(cells['code'])}; write 0 to 65535")
     if cells["channel"] not in CHANNELS:
@@ -297,7 +314,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
     """
     place = f"{measured.source}: channel {channel}"
     if levels.code[0] != 0:
-        raise InputError(f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times")
+        raise InputError(
+            f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times"
+        )
     if levels.code[-1] != measured.white:
         raise InputError(
             f"{place}: white, code {measured.white} of {measured.bits} bits, is not measured; add it or say --bits"
@@ -307,7 +326,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
             f"{place}: {len(levels.code)} distinct codes; measure {MIN_CODES} or more, 32 for 1 % (calibrate plan)"
         )
     if not levels.mean[-1] > levels.mean[0]:
-        raise InputError(f"{place}: white is not brighter than code 0; check that the instrument looks at the patch")
+        raise InputError(
+            f"{place}: white is not brighter than code 0; check that the instrument looks at the patch"
+        )
     relative = levels.relative_noise
     if math.isnan(relative):
         relative = 0.0 if levels.has_errors else ASSUMED_NOISE
@@ -325,7 +346,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
         )
 
 
-def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLevels, error: FloatArray) -> None:
+def _check_saturation(
+    measured: Measurements, channel: str, levels: MeasuredLevels, error: FloatArray
+) -> None:
     """Refuse (InputError) a saturated top: one flatter than the S-curve sin^2, which falls by 3
     (1 - code / white)^2 there.
     """
@@ -350,7 +373,9 @@ def drift_over_run(measured: Measurements) -> tuple[float, float]:
     Both are nan where nothing was repeated. Code 0 is left out: its noise is not that of light.
     """
     lit = (measured.code > 0) & (measured.value > 0)
-    key = measured.code[lit] * len(CHANNELS) + np.array([CHANNELS.index(str(name)) for name in measured.channel[lit]])
+    key = measured.code[lit] * len(CHANNELS) + np.array(
+        [CHANNELS.index(str(name)) for name in measured.channel[lit]]
+    )
     _, place, count = np.unique(key, return_inverse=True, return_counts=True)
     log_light, time = np.log(measured.value[lit]), measured.time[lit]
     within = [values - (np.bincount(place, values) / count)[place] for values in (log_light, time)]

@@ -36,7 +36,13 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import MAG_PER_RELATIVE
-from hilstar.display.calibration import CalibrationHead, ErrorsTable, NotesTable, load_calibration, write_calibration
+from hilstar.display.calibration import (
+    CalibrationHead,
+    ErrorsTable,
+    NotesTable,
+    load_calibration,
+    write_calibration,
+)
 from hilstar.display.identity import MonitorIdentity
 from hilstar.display.response import srgb_light
 from hilstar.instruments.calibrate import measurements
@@ -166,7 +172,9 @@ def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit
     try:
         return fit_levels(levels, measured.white)
     except np.linalg.LinAlgError as error:
-        raise InputError(f"{measured.source}: channel {channel}: no smooth response fits these values; check them") from error
+        raise InputError(
+            f"{measured.source}: channel {channel}: no smooth response fits these values; check them"
+        ) from error
 
 
 def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
@@ -263,7 +271,9 @@ def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float
     return min(solutions, key=lambda solution: solution.minus_log_evidence)
 
 
-def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float) -> _Problem:
+def _problem(
+    shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float
+) -> _Problem:
     codes = np.arange(1, white + 1) / white
     at = levels.code[1:] / white
     low, high = shape.coordinate(codes[[0, -1]])
@@ -301,7 +311,9 @@ def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, nois
 def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatArray:
     """Cubic B-splines (places, knots + 2) over 0 to 1, or a derivative of them."""
     padded = np.concatenate([np.zeros(3), knots, np.ones(3)])
-    return np.asarray(BSpline(padded, np.eye(len(knots) + 2), 3)(np.clip(place, 0, 1), nu=derivative))
+    return np.asarray(
+        BSpline(padded, np.eye(len(knots) + 2), 3)(np.clip(place, 0, 1), nu=derivative)
+    )
 
 
 def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
@@ -313,7 +325,9 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
     moved = math.inf
     start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
     normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
-    theta = np.asarray(np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels)))
+    theta = np.asarray(
+        np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels))
+    )
     causes = np.zeros(problem.common.shape[1])
     first = len(theta)
     for step in range(MAX_STEPS):
@@ -335,11 +349,23 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
         if moved < SETTLED and step >= 2:
             break
     return _Solution(
-        problem, shape, theta, causes, black, evidence, np.asarray(covariance), design, misfit, above, moved < SETTLED
+        problem,
+        shape,
+        theta,
+        causes,
+        black,
+        evidence,
+        np.asarray(covariance),
+        design,
+        misfit,
+        above,
+        moved < SETTLED,
     )
 
 
-def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:
+def _evidence(
+    problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float
+) -> tuple[float, FloatArray]:
     """Minus twice the log marginal likelihood of the linearised problem, up to a constant, and
     the posterior precision.
     """
@@ -402,22 +428,38 @@ def calibrate_photometric(
     black = float(np.mean([fits[name].black for name in names]))
     columns = {name: black + fits[name].white * fits[name].light for name in names}
     noise = max(fits[name].levels.reading_noise(fits[name].noise_relative) for name in columns)
-    drift_note = "not known: nothing was repeated" if math.isnan(drift) else f"{100 * drift:+.2f} % over the run"
+    drift_note = (
+        "not known: nothing was repeated"
+        if math.isnan(drift)
+        else f"{100 * drift:+.2f} % over the run"
+    )
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
     if output.with_suffix(".csv").resolve() == measured.resolve():
-        raise InputError(f"{output}: its response would be written over {measured}; choose another name")
+        raise InputError(
+            f"{output}: its response would be written over {measured}; choose another name"
+        )
     stated = {name: text or NOT_STATED for name, text in asdict(provenance or Provenance()).items()}
     if stated["when"] == NOT_STATED:
         stated["when"] = datetime.date.today().isoformat()
-    head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
+    head = CalibrationHead(
+        kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated
+    )
     table = write_calibration(
-        output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity, errors=errors_of(fits)
+        output,
+        head,
+        columns,
+        noise,
+        NotesTable(drift=drift_note, text=text),
+        identity=identity,
+        errors=errors_of(fits),
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
     # r + g + b against w, above black: at white and codes decades below it
     additivity, crosstalk, unsure = None, None, None
     if len(fits) == len(measurements.CHANNELS):
-        together = np.sum([fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0)
+        together = np.sum(
+            [fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0
+        )
         more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
         additivity = float(more[-1])
         decades = {f"1e-{decade}": place for decade, place in _decades(fits["w"]).items()}
@@ -429,7 +471,10 @@ def calibrate_photometric(
         for name, one in fits.items():
             white_error = one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1]
             off[name] = np.hypot(one.error[at], white_error)
-        errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in measurements.PRIMARIES]
+        errors = [
+            fits[name].white * fits[name].light[at] / together[at] * off[name]
+            for name in measurements.PRIMARIES
+        ]
         error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
         unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
     return channels[next(iter(columns))] | {
@@ -475,9 +520,13 @@ def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
     """
     channels = data.channels
     if "w" not in channels and channels != measurements.PRIMARIES:
-        raise InputError(f"{data.source}: only channel {', '.join(channels)}; measure w, or all of r, g and b")
+        raise InputError(
+            f"{data.source}: only channel {', '.join(channels)}; measure w, or all of r, g and b"
+        )
     if len(channels) not in {1, 3, 4}:
-        raise InputError(f"{data.source}: channels {', '.join(channels)}; measure w alone, or all of r, g and b")
+        raise InputError(
+            f"{data.source}: channels {', '.join(channels)}; measure w alone, or all of r, g and b"
+        )
     return {name: fit_channel(data, name) for name in channels}
 
 
@@ -503,7 +552,9 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
         "lack_of_fit": fit.lack_of_fit,
         "shape": fit.shape,
         "parameters": fit.parameters,
-        "error_percent": {f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in _decades(fit).items()},
+        "error_percent": {
+            f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in _decades(fit).items()
+        },
         "holdout": held_out(fit),
     }
 
@@ -515,7 +566,11 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
     sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
-    found = {"rms": np.sqrt((residual**2).mean()), "p95": np.percentile(residual, 95), "max": residual.max()}
+    found = {
+        "rms": np.sqrt((residual**2).mean()),
+        "p95": np.percentile(residual, 95),
+        "max": residual.max(),
+    }
     percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
     mag = {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
     return percent | mag | {"p95_sigmas": sigmas}
@@ -544,11 +599,21 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     with chart(path, finding, panels=2, note=note) as (response, residual):
         for name, fit in fits.items():
             colour, code, white = COLOURS[name], fit.levels.code[1:], fit.white
-            level, black = (fit.levels.mean[1:] - fit.black) / white, max(fit.black / white, MIN_DRAWN_LIGHT)
+            level, black = (
+                (fit.levels.mean[1:] - fit.black) / white,
+                max(fit.black / white, MIN_DRAWN_LIGHT),
+            )
             codes = np.arange(len(fit.light))
-            response.plot(codes[1:], np.maximum(fit.light[1:], MIN_DRAWN_LIGHT), color=colour, label=NAMES[name])
+            response.plot(
+                codes[1:],
+                np.maximum(fit.light[1:], MIN_DRAWN_LIGHT),
+                color=colour,
+                label=NAMES[name],
+            )
             kept = level > MIN_DRAWN_LIGHT
-            response.plot(code[kept], level[kept], "o", color=colour, markersize=4, label="_measured")
+            response.plot(
+                code[kept], level[kept], "o", color=colour, markersize=4, label="_measured"
+            )
             response.axhline(black, color=colour, linewidth=0.8, linestyle=":", label="_black")
             shown, held = fit.light >= 1e-3, fit.light[code] >= 1e-3
             error = 100 * fit.error[shown]

@@ -53,14 +53,20 @@ class PlanSettings:
     channels: str = "w"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.bits <= 16 or not 2 <= self.levels <= 2**self.bits or not 1 <= self.repeats <= 1000:
+        if (
+            not 1 <= self.bits <= 16
+            or not 2 <= self.levels <= 2**self.bits
+            or not 1 <= self.repeats <= 1000
+        ):
             raise InputError(
                 f"plan of {self.levels} levels, {self.repeats} repeats, {self.bits} bits; write 1 to 16 bits, 2 to 2^bits"
                 " levels and 1 to 1000 repeats"
             )
         channels = set(self.channels)
         if not channels or channels - set(CHANNELS) or len(channels) < len(self.channels):
-            raise InputError(f"channels = {self.channels}; write one or more of w, r, g and b, each once")
+            raise InputError(
+                f"channels = {self.channels}; write one or more of w, r, g and b, each once"
+            )
 
 
 def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch]:
@@ -73,9 +79,16 @@ def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch
     codes, white = planned_codes(settings.bits, settings.levels), 2**settings.bits - 1
     light = (np.array(codes) / white) ** 2.2
     faint = [code for code, is_faint in zip(codes, light < FAINT_LIGHT, strict=True) if is_faint]
-    drawn = [Patch(code, name) for name in settings.channels for code in [*codes, *faint] for _ in range(settings.repeats)]
+    drawn = [
+        Patch(code, name)
+        for name in settings.channels
+        for code in [*codes, *faint]
+        for _ in range(settings.repeats)
+    ]
     shuffled = [drawn[place] for place in rng.permutation(len(drawn))]
-    references = [Patch(code, name) for name in settings.channels for code in (0, white // 2, white)]
+    references = [
+        Patch(code, name) for name in settings.channels for code in (0, white // 2, white)
+    ]
     at_once = PATCHES_PER_REFERENCE * len(settings.channels)
     patches: list[Patch] = []
     for start in range(0, len(shuffled), at_once):
@@ -103,7 +116,9 @@ def write_plan(path: Path, patches: list[Patch]) -> None:
     """Write PLAN.csv, order,code,channel,value with value left empty. Raises InputError where it
     cannot be written.
     """
-    rows = [f"{order},{patch.code},{patch.channel}," for order, patch in enumerate(patches, start=1)]
+    rows = [
+        f"{order},{patch.code},{patch.channel}," for order, patch in enumerate(patches, start=1)
+    ]
     write_whole(path, "\n".join(["order,code,channel,value", *rows]) + "\n")
 
 
@@ -122,7 +137,9 @@ PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 log = logging.getLogger(__name__)
 
 
-def patch_image(patch: Patch, resolution_px: tuple[int, int], bits: int) -> npt.NDArray[np.uint8 | np.uint16]:
+def patch_image(
+    patch: Patch, resolution_px: tuple[int, int], bits: int
+) -> npt.NDArray[np.uint8 | np.uint16]:
     """A square patch in the middle of a black screen: (height, width) for w, (height, width, 3)
     for one primary.
     """
@@ -143,7 +160,9 @@ def in_channel(codes: npt.NDArray[Level], channel: str) -> npt.NDArray[Level]:
     return colours
 
 
-def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[int, int], bits: int) -> None:
+def write_patches(
+    folder: Path, planned: Sequence[Patch], resolution_px: tuple[int, int], bits: int
+) -> None:
     """Write a PNG of `resolution_px` (width, height) for each different patch. Raises InputError
     where that cannot be done.
     """
@@ -158,7 +177,9 @@ def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[i
         write_codes_png(path, patch_image(patch, resolution_px, bits), bits)
 
 
-def show_patches(planned: Sequence[Patch], bits: int, display: int | str, seconds: float | None) -> int:
+def show_patches(
+    planned: Sequence[Patch], bits: int, display: int | str, seconds: float | None
+) -> int:
     """Show each patch on a display until space is pressed, or for `seconds`; q quits. Returns how
     many were shown.
 
@@ -175,9 +196,17 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
         presenter = Presenter(level_texture(window_context(), square), view)
         for shown, patch in enumerate(planned):
             triples = nothing.copy()
-            triples[1, [PRIMARIES.index(patch.channel)] if patch.channel in PRIMARIES else [0, 1, 2]] = patch.code
+            triples[
+                1, [PRIMARIES.index(patch.channel)] if patch.channel in PRIMARIES else [0, 1, 2]
+            ] = patch.code
             presenter.set_triples(triples)
-            log.warning("patch %d of %d: code %d, channel %s", shown + 1, len(planned), patch.code, patch.channel)
+            log.warning(
+                "patch %d of %d: code %d, channel %s",
+                shown + 1,
+                len(planned),
+                patch.code,
+                patch.channel,
+            )
             if not stays_until_key(window, presenter, seconds):
                 return shown
     return len(planned)

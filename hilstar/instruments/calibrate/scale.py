@@ -94,20 +94,28 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
     """
     detector = bench.config.tracker.detector
     if exposure_s <= 0:
-        raise InputError(f"an exposure of {exposure_s:g} s; write --exposure S, as the tracker exposed")
+        raise InputError(
+            f"an exposure of {exposure_s:g} s; write --exposure S, as the tracker exposed"
+        )
     ratios = []
     for reading in readings:
         place = np.flatnonzero(bench.stars.hip == reading.hip)
         named = f"--reading {reading.hip}"
         if not len(place):
-            raise InputError(f"{named}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag")
+            raise InputError(
+                f"{named}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag"
+            )
         rate = float(bench.stars.electrons_per_s[place[0]])
         if rate * bench.psf.peak_share > bench.flux_at_white_e_per_s:
             raise InputError(f"{named}: the star clips on the monitor; take a fainter one")
         if rate < bench.faintest_shown_e_per_s:
-            raise InputError(f"{named}: the star is too faint for the monitor to show; take a brighter one")
+            raise InputError(
+                f"{named}: the star is too faint for the monitor to show; take a brighter one"
+            )
         ratios.append(reading.dn * detector.gain_e_per_dn / (rate * exposure_s))
-    noise_mag = np.array([MAG_PER_RELATIVE * reading.sigma_dn / max(reading.dn, 1e-9) for reading in readings])
+    noise_mag = np.array(
+        [MAG_PER_RELATIVE * reading.sigma_dn / max(reading.dn, 1e-9) for reading in readings]
+    )
     return scale_of(bench.flux_at_white_e_per_s, np.array(ratios), noise_mag)
 
 
@@ -118,11 +126,17 @@ def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> N
     Raises InputError where that cannot be done.
     """
     if output.resolve().parent != file.path.resolve().parent:
-        raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}")
+        raise InputError(
+            f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}"
+        )
     key, flux_at_white_e_per_s = "flux_at_white_e_per_s", found.flux_at_white_e_per_s
-    text = with_key(file.text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
+    text = with_key(
+        file.text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",)
+    )
     if found.relative_error is not None:
-        text = with_key(text, "certify", "flux_at_white_relative", float(f"{found.relative_error:.3g}"))
+        text = with_key(
+            text, "certify", "flux_at_white_relative", float(f"{found.relative_error:.3g}")
+        )
         text = with_key(text, "certify", "flux_at_white_dof", float(len(found.ratios) - 1))
     write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:

@@ -62,13 +62,24 @@ GAIN_UNITS: dict[str, Callable[[float], float]] = {"dn/e-": lambda value: 1 / va
 ELECTRONS: dict[str, Callable[[float], float]] = {"e-": float, "ke-": lambda value: 1000 * value}
 SHARES: dict[str, Callable[[float], float]] = {"%": lambda value: value / 100, "1": float}
 QUANTITIES = (
-    Quantity(("k", "overallsystemgain", "systemgain", "conversiongain"), "gain_e_per_dn", GAIN_UNITS),
+    Quantity(
+        ("k", "overallsystemgain", "systemgain", "conversiongain"), "gain_e_per_dn", GAIN_UNITS
+    ),
     Quantity(("1/k", "inverseofoverallsystemgain"), "gain_e_per_dn", {"e-/dn": float}),
-    Quantity(("sigmad", "sigma.d", "temporaldarknoise", "readnoise"), "read_noise_e", ELECTRONS, "dn"),
-    Quantity(("mue.sat", "muesat", "saturationcapacity", "fullwell"), "full_well_e", ELECTRONS, "dn"),
+    Quantity(
+        ("sigmad", "sigma.d", "temporaldarknoise", "readnoise"), "read_noise_e", ELECTRONS, "dn"
+    ),
+    Quantity(
+        ("mue.sat", "muesat", "saturationcapacity", "fullwell"), "full_well_e", ELECTRONS, "dn"
+    ),
     Quantity(("dsnu1288", "dsnu"), "dsnu_e", ELECTRONS, "dn"),
     Quantity(("prnu1288", "prnu"), "prnu", SHARES),
-    Quantity(("mui", "mui.mean", "darkcurrent"), "dark_e_per_s", {"e-/s": float, "ke-/s": lambda value: 1000 * value}, "dn/s"),
+    Quantity(
+        ("mui", "mui.mean", "darkcurrent"),
+        "dark_e_per_s",
+        {"e-/s": float, "ke-/s": lambda value: 1000 * value},
+        "dn/s",
+    ),
     Quantity(("muy.dark", "muydark", "darksignal"), "offset_dn", {"dn": float}),
     Quantity(("bits", "bitdepth"), "bits", {"bit": round, "bits": round}),
     Quantity(("temperature",), "temperature_k", {"k": float, "degc": lambda value: value + ICE_K}),
@@ -169,7 +180,9 @@ def import_emva(path: Path) -> SensorFile:
         keys["dark_reference_temperature_k"] = keys["temperature_k"]
     if (doubling_k := keys.pop("doubling_k", 0.0)) > 0:
         kelvin = keys.get("temperature_k", DetectorSettings().temperature_k)
-        keys["dark_activation_ev"] = math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
+        keys["dark_activation_ev"] = (
+            math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
+        )
     notes = (f"not used: {', '.join(map(shortened, unused))}",) if unused else ()
     return _checked(path, SensorFile(keys, {}, tuple(sorted(efficiency)), notes))
 
@@ -183,7 +196,9 @@ def _reading(place: str, name: str, quantity: Quantity, value: float, unit: str)
         return Reading(place, name, quantity, value, True)
     convert = quantity.units.get(plain)
     if convert is None or (quantity.key == "gain_e_per_dn" and not value > 0):
-        raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(quantity.units)}")
+        raise InputError(
+            f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(quantity.units)}"
+        )
     return Reading(place, name, quantity, convert(value), False)
 
 
@@ -203,10 +218,14 @@ def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
         if key not in keys:
             keys[key], first[key] = value, reading
             continue
-        rounded = ROUNDED_ALIKE if reading.in_dn or reading.quantity is not first[key].quantity else 0.0
+        rounded = (
+            ROUNDED_ALIKE if reading.in_dn or reading.quantity is not first[key].quantity else 0.0
+        )
         if abs(value - keys[key]) > rounded * abs(keys[key]):
             other = f"{first[key].place.rpartition(':')[2]} has {first[key].name} for {keys[key]:g}"
-            raise InputError(f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave one of them")
+            raise InputError(
+                f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave one of them"
+            )
     return {key: keys[key] for key in dict.fromkeys(reading.quantity.key for reading in readings)}
 
 
@@ -228,14 +247,29 @@ def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
     columns = ("quantity", "value", "unit")
     if path.suffix.lower() == ".json":
         try:
-            table = msgspec.json.decode(read_text(path, EMVA_ADVICE, MAX_EMVA_BYTES), type=list[dict[str, str | float]])
+            table = msgspec.json.decode(
+                read_text(path, EMVA_ADVICE, MAX_EMVA_BYTES), type=list[dict[str, str | float]]
+            )
         except msgspec.MsgspecError as error:
-            raise InputError(f"{path}: {shortened(str(error))}; write a list of objects with quantity, value, unit") from error
-        rows = [(number, [str(row.get(name, "")) for name in columns]) for number, row in enumerate(table, start=1)]
+            raise InputError(
+                f"{path}: {shortened(str(error))}; write a list of objects with quantity, value, unit"
+            ) from error
+        rows = [
+            (number, [str(row.get(name, "")) for name in columns])
+            for number, row in enumerate(table, start=1)
+        ]
     else:
-        rows = [(line, cells[:3]) for line, cells in read_rows(path, columns, EMVA_ADVICE, MAX_EMVA_BYTES)]
+        rows = [
+            (line, cells[:3])
+            for line, cells in read_rows(path, columns, EMVA_ADVICE, MAX_EMVA_BYTES)
+        ]
     for line, (name, value, unit) in rows:
-        yield f"{path}:{line}", name, finite_numbers(path, line, ("value",), [value], EMVA_ADVICE)[0], unit
+        yield (
+            f"{path}:{line}",
+            name,
+            finite_numbers(path, line, ("value",), [value], EMVA_ADVICE)[0],
+            unit,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +291,9 @@ class Levels:
         """
         weight = math.sqrt(math.prod(self.shape)) / np.maximum(error, 1e-9)
         place = np.nan_to_num(self.exposure_s) ** power
-        values, covariance = np.polyfit(place, getattr(self, name), int(self.timed), w=weight, cov="unscaled")
+        values, covariance = np.polyfit(
+            place, getattr(self, name), int(self.timed), w=weight, cov="unscaled"
+        )
         return values, np.sqrt(np.diag(covariance))
 
     @property
@@ -276,20 +312,31 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
     Raises InputError.
     """
     if not paths or len(paths) % 2:
-        raise InputError(f"{what}: {len(paths)} frames; give two of each exposure, one after the other")
+        raise InputError(
+            f"{what}: {len(paths)} frames; give two of each exposure, one after the other"
+        )
     rows, largest_dn, shape = [], 0.0, read_image(paths[0], advice=FRAME_ADVICE).shape
     for first, second in zip(paths[::2], paths[1::2], strict=True):
         (a, seconds), (b, again) = _exposed(first), _exposed(second)
-        if not (a.shape == b.shape == shape and (seconds == again or (math.isnan(seconds) and math.isnan(again)))):
-            raise InputError(f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure")
+        if not (
+            a.shape == b.shape == shape
+            and (seconds == again or (math.isnan(seconds) and math.isnan(again)))
+        ):
+            raise InputError(
+                f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure"
+            )
         pattern = float(np.mean((a - a.mean()) * (b - b.mean())))
         if not math.isfinite(pattern):
-            raise InputError(f"{second}: it or {first} has pixels that are no finite number; give raw frames")
+            raise InputError(
+                f"{second}: it or {first} has pixels that are no finite number; give raw frames"
+            )
         rows.append(((a.mean() + b.mean()) / 2, float((a - b).var()) / 2, pattern, seconds))
         largest_dn = max(largest_dn, float(a.max()), float(b.max()))
     mean, temporal, spatial, exposure_s = np.array(sorted(rows)).T
     if 0 < np.isnan(exposure_s).sum() < len(exposure_s):
-        raise InputError(f"{what}: some frames say no exposure and some do; write {EXPOSURE_KEY} into all of them")
+        raise InputError(
+            f"{what}: some frames say no exposure and some do; write {EXPOSURE_KEY} into all of them"
+        )
     return Levels(mean, temporal, spatial, exposure_s, largest_dn, shape)
 
 
@@ -325,30 +372,50 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     mean, mean_error = dark.line("mean_dn", 1, noise_dn)
     temporal, temporal_error = dark.line("temporal_dn2", 1, math.sqrt(2) * dark.temporal_dn2)
     spatial, spatial_error = dark.line("spatial_dn2", 2, dark.pattern_error_dn2)
-    signal, variance = light.mean_dn - np.polyval(mean, flat_s), light.temporal_dn2 - np.polyval(temporal, flat_s)
+    signal, variance = (
+        light.mean_dn - np.polyval(mean, flat_s),
+        light.temporal_dn2 - np.polyval(temporal, flat_s),
+    )
     top = int(light.temporal_dn2.argmax())
-    usable = np.flatnonzero((signal > 0) & (light.temporal_dn2 > 0) & (signal <= LINEAR_SHARE * signal[top]))
+    usable = np.flatnonzero(
+        (signal > 0) & (light.temporal_dn2 > 0) & (signal <= LINEAR_SHARE * signal[top])
+    )
     weight = pixels / 2 * (signal[usable] / light.temporal_dn2[usable]) ** 2
-    k_dn_per_e = float((variance[usable] / signal[usable]) @ weight / weight.sum()) if len(usable) else 0.0
+    k_dn_per_e = (
+        float((variance[usable] / signal[usable]) @ weight / weight.sum()) if len(usable) else 0.0
+    )
     if not k_dn_per_e > 0:
-        raise InputError("FLATS: no noise that grows with light; give raw frames of one sensor from dark to saturation")
+        raise InputError(
+            "FLATS: no noise that grows with light; give raw frames of one sensor from dark to saturation"
+        )
     k_error = float(weight.sum()) ** -0.5 / k_dn_per_e
     half = int(usable[np.abs(signal[usable] - signal[top] / 2).argmin()])
     keys: dict[str, Any] = {"gain_e_per_dn": 1 / k_dn_per_e, "offset_dn": float(mean[-1])}
     sigmas = {"gain_e_per_dn": k_error / k_dn_per_e, "offset_dn": float(mean_error[-1])}
 
-    def add(key: str, value: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error) -> None:
-        keys[key], sigmas[key] = max(float(value), 0.0) / unit, math.hypot(error, max(value, 0.0) * unit_error) / unit
+    def add(
+        key: str, value: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error
+    ) -> None:
+        keys[key], sigmas[key] = (
+            max(float(value), 0.0) / unit,
+            math.hypot(error, max(value, 0.0) * unit_error) / unit,
+        )
 
-    def add_root(key: str, square: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error) -> None:
+    def add_root(
+        key: str, square: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error
+    ) -> None:
         root = math.sqrt(max(square, 0.0))
         add(key, root, error / (2 * root) if square > error else math.sqrt(error), unit, unit_error)
 
     add_root("read_noise_e", temporal[-1] - ROUNDING_DN2, temporal_error[-1])
     add_root("dsnu_e", spatial[-1], spatial_error[-1])
     pattern_dn2 = light.spatial_dn2[half] - np.polyval(spatial, flat_s[half] ** 2)
-    add_root("prnu", pattern_dn2, light.pattern_error_dn2[half] / math.sqrt(pixels), signal[half], 0.0)
-    notes = [f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is not even counts as PRNU"]
+    add_root(
+        "prnu", pattern_dn2, light.pattern_error_dn2[half] / math.sqrt(pixels), signal[half], 0.0
+    )
+    notes = [
+        f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is not even counts as PRNU"
+    ]
     if dark.timed:
         add("dark_e_per_s", mean[0], mean_error[0])
         add_root("dsnu_e_per_s", spatial[0], spatial_error[0])
@@ -369,13 +436,25 @@ def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
     files. Raises InputError.
     """
     settings = sensor.settings
-    curve, chart = output.with_name(f"{output.stem}_qe.csv"), output.with_name(f"{output.stem}_curves")
-    lines, many = [f"# {source}", *(f"# {note}" for note in sensor.notes)], len(sensor.efficiency) > 1
+    curve, chart = (
+        output.with_name(f"{output.stem}_qe.csv"),
+        output.with_name(f"{output.stem}_curves"),
+    )
+    lines, many = (
+        [f"# {source}", *(f"# {note}" for note in sensor.notes)],
+        len(sensor.efficiency) > 1,
+    )
     if sensor.efficiency:
-        lines += ["[tracker]", f"quantum_efficiency = {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}"]
+        lines += [
+            "[tracker]",
+            f"quantum_efficiency = {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}",
+        ]
     if many:
         charts.write_csv(curve, ("wavelength_nm", "value"), sensor.efficiency)
-    lines += ["[tracker.detector]", *(f"{line.replace(' +- ', '  # +- ')}" for line in sensor.lines)]
+    lines += [
+        "[tracker.detector]",
+        *(f"{line.replace(' +- ', '  # +- ')}" for line in sensor.lines),
+    ]
     write_whole(output, "\n".join(lines) + "\n")
     draw_curves(chart, settings, sensor)
     return [output, *([curve] if many else []), *(chart.with_suffix(end) for end in charts.ENDINGS)]
@@ -387,11 +466,17 @@ def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> N
     """
     gain, measured = settings.gain_e_per_dn, sensor.transfer is not None and sensor.dark is not None
     finding = f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at {settings.full_well_e:.0f} e-"
-    signal_dn = np.array([0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()])
-    seconds = np.array([0.0, 1.0 if sensor.dark is None else max(float(sensor.dark[0].max()), 1e-3)])
+    signal_dn = np.array(
+        [0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()]
+    )
+    seconds = np.array(
+        [0.0, 1.0 if sensor.dark is None else max(float(sensor.dark[0].max()), 1e-3)]
+    )
     with charts.chart(path, finding, 1, 2, share_x=False) as (transfer, dark):
         transfer.plot(signal_dn, signal_dn / gain, label="shot noise")
-        dark.plot(seconds, settings.offset_dn + settings.dark_e_per_s * seconds / gain, label="mean dark")
+        dark.plot(
+            seconds, settings.offset_dn + settings.dark_e_per_s * seconds / gain, label="mean dark"
+        )
         for axes, points in ((transfer, sensor.transfer), (dark, sensor.dark)):
             if measured and points is not None:
                 axes.plot(*points, "o", color=charts.ORANGE, label="measured")

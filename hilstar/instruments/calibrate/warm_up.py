@@ -111,7 +111,9 @@ class _Law:
 
     @property
     def criterion(self) -> float:
-        return len(self.residual) * math.log(float(np.mean(self.residual**2)) + FLOOR**2) + 2 * len(self.parameters)
+        return len(self.residual) * math.log(float(np.mean(self.residual**2)) + FLOOR**2) + 2 * len(
+            self.parameters
+        )
 
     @property
     def is_refused(self) -> bool:
@@ -119,8 +121,13 @@ class _Law:
             return True
         steps, n = np.diff(self.residual), len(self.residual)
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
-        ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (float(self.residual @ self.residual) / self.dof + FLOOR**2)
-        return ratio < 1 - ALIKE_SIGMAS / math.sqrt(n) or float(np.abs(steps).max()) > JUMP_SIGMAS * scatter + 10 * FLOOR
+        ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (
+            float(self.residual @ self.residual) / self.dof + FLOOR**2
+        )
+        return (
+            ratio < 1 - ALIKE_SIGMAS / math.sqrt(n)
+            or float(np.abs(steps).max()) > JUMP_SIGMAS * scatter + 10 * FLOOR
+        )
 
     @property
     def noise(self) -> float:
@@ -128,7 +135,10 @@ class _Law:
 
     def died_away(self, at_s: float) -> bool:
         """Whether an exponential is far below a reading's noise by a time."""
-        return len(self.parameters) == 3 and abs(self.parameters[1]) * math.exp(-at_s / self.parameters[2]) < self.noise / 3
+        return (
+            len(self.parameters) == 3
+            and abs(self.parameters[1]) * math.exp(-at_s / self.parameters[2]) < self.noise / 3
+        )
 
     def foretold(self, span_s: float, limit: float) -> tuple[list[float], list[float]]:
         """At `span_s`: slope, 1/s, and change in the next ten minutes, relative; when white is
@@ -137,8 +147,15 @@ class _Law:
         at = self._figures(self.parameters, span_s, limit)
         # small where an error is: the figures are linear there
         steps = 1e-4 * np.sqrt(np.diag(self.covariance))
-        slopes = np.stack([(self._figures(self.parameters + step, span_s, limit) - at) / step.sum() for step in np.diag(steps)])
-        return at.tolist(), np.sqrt(np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)).tolist()
+        slopes = np.stack(
+            [
+                (self._figures(self.parameters + step, span_s, limit) - at) / step.sum()
+                for step in np.diag(steps)
+            ]
+        )
+        return at.tolist(), np.sqrt(
+            np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)
+        ).tolist()
 
     @staticmethod
     def _figures(parameters: FloatArray, span_s: float, limit: float) -> FloatArray:
@@ -153,7 +170,10 @@ class _Law:
 
 
 def watch_white(
-    read: Callable[[], float], clock_ns: Callable[[], int], wait: Callable[[float], object], longest_s: float = LONGEST_S
+    read: Callable[[], float],
+    clock_ns: Callable[[], int],
+    wait: Callable[[float], object],
+    longest_s: float = LONGEST_S,
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,), s from the first, and readings (n,) of white, every EVERY_S until it is stable or
     `longest_s` are over.
@@ -170,10 +190,14 @@ def watch_white(
         ended_ns = clock_ns()
         t_s.append(((begun_ns + ended_ns) / 2 - first_ns) / NS_PER_S)
         if not (math.isfinite(value) and value > 0):
-            raise InputError(f"white reads {value:g} after {t_s[-1]:.0f} s; look at what the instrument sees")
+            raise InputError(
+                f"white reads {value:g} after {t_s[-1]:.0f} s; look at what the instrument sees"
+            )
         light.append(value)
         over = (ended_ns - first_ns) / NS_PER_S + EVERY_S > longest_s
-        if len(light) >= MIN_READINGS and (over or judge_warm_up(np.array(t_s), np.array(light)).is_stable):
+        if len(light) >= MIN_READINGS and (
+            over or judge_warm_up(np.array(t_s), np.array(light)).is_stable
+        ):
             return np.array(t_s), np.array(light)
         wait(max(EVERY_S - (ended_ns - begun_ns) / NS_PER_S, 1e-3))
 
@@ -182,13 +206,24 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
     """When white is stable to `limit`, by readings (n,) at times (n,). Raises InputError for
     fewer than 12, or no readings.
     """
-    if len(light) < MIN_READINGS or not (np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()):
-        raise InputError(f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at rising times")
+    if len(light) < MIN_READINGS or not (
+        np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()
+    ):
+        raise InputError(
+            f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at rising times"
+        )
     for first in (part * len(light) // PARTS for part in range(PARTS)):
         if len(light) - first < MIN_READINGS:
             break
-        laws = sorted((law for law in _laws(t_s[first:], light[first:]) if not law.is_refused), key=lambda law: law.criterion)
-        found = [_judged(law, t_s[first:], light[first:], limit) for law in laws if law.criterion < laws[0].criterion + LIKELY]
+        laws = sorted(
+            (law for law in _laws(t_s[first:], light[first:]) if not law.is_refused),
+            key=lambda law: law.criterion,
+        )
+        found = [
+            _judged(law, t_s[first:], light[first:], limit)
+            for law in laws
+            if law.criterion < laws[0].criterion + LIKELY
+        ]
         if found:  # white is stable only if it is by each law that is likely
             return replace(found[0], is_stable=all(each.is_stable for each in found))
     return WarmUp("none", False, limit)
@@ -201,7 +236,9 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
     # the readings does.
     end = _line(t_s[half:], light[half:]) if law.died_away(float(t_s[half] - t_s[0])) else law
     (_, _, stable_s), (_, _, stable_error_s) = law.foretold(span_s, limit)
-    (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(span_s if end is law else 0.0, limit)
+    (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(
+        span_s if end is law else 0.0, limit
+    )
     linear = len(law.parameters) == 2
     stable_s = (0.0 if abs(ahead) < limit else math.inf) if linear else max(stable_s, 0.0)
     return WarmUp(
@@ -240,7 +277,9 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
         residual = _law(time, value, math.exp(log_tau)).residual
         return float(residual @ residual)
 
-    tried = np.linspace(math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS)
+    tried = np.linspace(
+        math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS
+    )
     best = int(np.argmin([misfit(each) for each in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
     log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
@@ -265,4 +304,9 @@ def _law(time: FloatArray, value: FloatArray, tau: float | None = None) -> _Law:
     dof, size = len(value) - columns.shape[1], np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     scaled = columns / size
     noise2 = float(residual @ residual) / dof + FLOOR**2
-    return _Law(found, noise2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(size, size), residual, dof)
+    return _Law(
+        found,
+        noise2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(size, size),
+        residual,
+        dof,
+    )

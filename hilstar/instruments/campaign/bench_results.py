@@ -22,7 +22,13 @@ def bench_summary(table: Path) -> dict[str, Any]:
     cases = read_cases(table)
     numbers, some = cases.numbers, np.flatnonzero(np.nan_to_num(cases.numbers["wrong"]) > 0)
     wrong = [
-        (int(numbers["case"][k]), int(numbers["order"][k]), cases.texts["begun_utc"][k], int(numbers["wrong"][k]), off_deg)
+        (
+            int(numbers["case"][k]),
+            int(numbers["order"][k]),
+            cases.texts["begun_utc"][k],
+            int(numbers["wrong"][k]),
+            off_deg,
+        )
         for k in some
         if np.isfinite(off_deg := float(numbers["wrong_deg"][k]))
     ]
@@ -40,12 +46,23 @@ def bench_lines(summary: dict[str, Any]) -> list[str]:
     lines = [f"{summary['no_answer']} cases without an answer"] if summary["no_answer"] else []
     wrong, drift = summary["wrong_cases"], summary["drift"]
     if wrong:
-        named = ", ".join(f"case {each['case']} by {each['off_deg']:.3g} deg" for each in wrong[:MAX_NAMED])
-        lines.append(f"wrong answers in {len(wrong)} cases: {named}{', ...' if len(wrong) > MAX_NAMED else ''}")
+        named = ", ".join(
+            f"case {each['case']} by {each['off_deg']:.3g} deg" for each in wrong[:MAX_NAMED]
+        )
+        lines.append(
+            f"wrong answers in {len(wrong)} cases: {named}{', ...' if len(wrong) > MAX_NAMED else ''}"
+        )
     if drift is not None:
-        parts = [f"{value:.3g}{_sigma(sigma)}" for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True)]
-        mag = "" if drift["mag"] is None else f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
-        lines.append(f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by {drift['checks']} check cases")
+        parts = [
+            f"{value:.3g}{_sigma(sigma)}"
+            for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True)
+        ]
+        mag = (
+            "" if drift["mag"] is None else f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
+        )
+        lines.append(
+            f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by {drift['checks']} check cases"
+        )
     return lines
 
 

@@ -59,7 +59,14 @@ BRIGHTEST = 5  # reported stars whose light is a case's signal
 MAX_SILENCE_S = 1.0  # at the end of a case: a tracker that said nothing for longer is silent
 NO_ANSWER = "no-answer"
 RUNS, NOW, CHECKS = "runs.csv", "now.json", "checks.csv"
-CHECK_COLUMNS = ("check", "begun_utc", "run", "answers", *(f"error_{axis}_arcsec" for axis in AXES), "signal_mag")
+CHECK_COLUMNS = (
+    "check",
+    "begun_utc",
+    "run",
+    "answers",
+    *(f"error_{axis}_arcsec" for axis in AXES),
+    "signal_mag",
+)
 
 
 class OpenDisplay(NamedTuple):
@@ -85,13 +92,17 @@ class BenchOrder:
         self.plan, self.maker, self.cases = plan, maker, cases
         self._design, self._every = design, plan.check_every
         self._keys = [
-            key for key in (each.key for each in maker.parameters) if key.split(".")[0] in ("sky", "render", "spacecraft")
+            key
+            for key in (each.key for each in maker.parameters)
+            if key.split(".")[0] in ("sky", "render", "spacecraft")
         ]
         self._keys += [SCENARIO] if any(each.key == SCENARIO for each in maker.parameters) else []
         order = np.random.default_rng((plan.seed, ORDER_STREAM)).permutation(cases)
         if self._keys:
             group: dict[str, int] = {}
-            rank = np.array([group.setdefault(self.renderer(int(number)), len(group)) for number in order])
+            rank = np.array(
+                [group.setdefault(self.renderer(int(number)), len(group)) for number in order]
+            )
             order = order[np.argsort(rank, kind="stable")]
         self.order = order
         self._at_rest = self.case(0).first
@@ -105,14 +116,23 @@ class BenchOrder:
         """The case of a number; a check case is the attitude of case 0, at rest."""
         if number < self.cases:
             return self.maker.case(number, self._design.points(number, number + 1)[0])
-        return Case(number, {}, 0, View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns))
+        return Case(
+            number,
+            {},
+            0,
+            View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns),
+        )
 
     def renderer(self, number: int) -> str:
         """What a case's renderer depends on, as a text that is the same for all cases of one
         renderer.
         """
         values = self.case(number).values
-        return msgspec.json.encode([values.get(key) for key in self._keys]).decode() if self._keys else ""
+        return (
+            msgspec.json.encode([values.get(key) for key in self._keys]).decode()
+            if self._keys
+            else ""
+        )
 
     def turns(self) -> Iterator[tuple[str, int, int]]:
         """Renderer, number and place in the order of each case, check cases among them with the
@@ -160,11 +180,15 @@ class Tally:
             self.errors.append(judged.residual)
         else:
             self.wrong += 1
-            self.worst_deg = max(self.worst_deg or 0.0, float(np.linalg.norm(judged.residual)) / 3600)
+            self.worst_deg = max(
+                self.worst_deg or 0.0, float(np.linalg.norm(judged.residual)) / 3600
+            )
         self.answered = self.answered or judged
         if judged.answer.star_count is not None:
             self.stars.append(judged.answer.star_count)
-        light = sorted(star.dn for star in judged.answer.centroids if star.dn is not None and star.dn > 0)[-BRIGHTEST:]
+        light = sorted(
+            star.dn for star in judged.answer.centroids if star.dn is not None and star.dn > 0
+        )[-BRIGHTEST:]
         if light:
             self.signals.append(-2.5 * math.log10(sum(light)))
 
@@ -186,13 +210,21 @@ class BenchRun:
         on_done: Callable[[int], None],
     ) -> None:
         self.journal: Journal = directory.journal(order.cases + order.checks)
-        self._order, self._plan, self._maker, self._columns = order, order.plan, order.maker, columns
+        self._order, self._plan, self._maker, self._columns = (
+            order,
+            order.plan,
+            order.maker,
+            columns,
+        )
         self._source, self._rules, self._notices, self._on_done = source, rules, notices, on_done
         self._done = self.journal.done
         self._now_path, runs = directory.path / NOW, directory.path / RUNS
         begun = runs.read_text().splitlines()[1:] if runs.exists() else []
         self._run = len(begun) + 1
-        starts: list[list[Any]] = [*(line.split(",") for line in begun), [self._run, f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"]]
+        starts: list[list[Any]] = [
+            *(line.split(",") for line in begun),
+            [self._run, f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"],
+        ]
         write_csv(runs, ("run", "begun_utc"), starts)
         self._base = self._next = 0  # frame numbers go on from one renderer to the next
         self._frames: LitFrames | None = None
@@ -214,8 +246,12 @@ class BenchRun:
         ended the run first.
         """
         self._on_done(self._done)
-        missing = {number for block in range(self.journal.blocks) for number in self.journal.missing(block)}
-        for _, group in groupby((turn for turn in self._order.turns() if turn[1] in missing), lambda turn: turn[0]):
+        missing = {
+            number for block in range(self.journal.blocks) for number in self.journal.missing(block)
+        }
+        for _, group in groupby(
+            (turn for turn in self._order.turns() if turn[1] in missing), lambda turn: turn[0]
+        ):
             turns = [(number, place) for _, number, place in group]
             first = next((number for number, _ in turns if number < self._order.cases), 0)
             with display(self._maker.bench(self._order.case(first))) as opened:
@@ -238,7 +274,10 @@ class BenchRun:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
             self._judge = AnswerJudge(self._rules, self._frames)
         self._base = self._next
-        self._light_ns, self._file_sha256 = 0 if screen is None else screen.swap_to_light_ns, bench.file.sha256
+        self._light_ns, self._file_sha256 = (
+            0 if screen is None else screen.swap_to_light_ns,
+            bench.file.sha256,
+        )
         self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
         pacer = Pacer(period_ns) if screen is None else DisplayPacer(screen, self._notices)
         faults = self._faults(bench, turns)
@@ -265,7 +304,9 @@ class BenchRun:
             view = self._view(light_ns)
             if view is None:
                 return loop.draw(moment.slot, 0, None, moment)
-            attitude = Attitude(view.q_icrs_to_cam, 0, False, rate_cam_rad_s=view.turn.rate_cam_rad_s)
+            attitude = Attitude(
+                view.q_icrs_to_cam, 0, False, rate_cam_rad_s=view.turn.rate_cam_rad_s
+            )
             return loop.draw(moment.slot, view.t_ns or 0, attitude, moment)
 
         with stop_on_signal(loop.stop), loop.watch:
@@ -277,7 +318,14 @@ class BenchRun:
 
     def _faults(self, bench: Bench, turns: list[tuple[int, int]]) -> FaultyFrames | None:
         """The faults of the scenario that all of these cases have."""
-        scenario = next((s for number, _ in turns if (s := self._maker.scenario(self._order.case(number))) is not None), None)
+        scenario = next(
+            (
+                s
+                for number, _ in turns
+                if (s := self._maker.scenario(self._order.case(number))) is not None
+            ),
+            None,
+        )
         if scenario is None:
             return None
         view = display_view(bench, scenario)
@@ -291,7 +339,11 @@ class BenchRun:
 
     def _begin(self, number: int, place: int) -> None:
         case = self._order.case(number)
-        end_s = self._maker.fault_end_s(case, self._plan.limit_s) if number < self._order.cases else None
+        end_s = (
+            self._maker.fault_end_s(case, self._plan.limit_s)
+            if number < self._order.cases
+            else None
+        )
         self._now = Tally(case, place, fault_end_s=end_s)
         self._waiting = False
 
@@ -312,20 +364,34 @@ class BenchRun:
         assert self._frames is not None
         attitude, on_screen, now = shown.attitude, shown.on_screen, self._now
         seen = attitude is not None and not on_screen.operator and not on_screen.hidden
-        host_ns = shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
+        host_ns = (
+            shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
+        )
         q = attitude.q_icrs_to_cam if attitude is not None and seen else None
         number = self._base + shown.number
         self._next = number + 1
         self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
         self._shown_q = q if q is not None else self._shown_q
-        if now is not None and now.begun_ns is None and not on_screen.operator and not on_screen.hidden:
+        if (
+            now is not None
+            and now.begun_ns is None
+            and not on_screen.operator
+            and not on_screen.hidden
+        ):
             now.begun_ns, now.first_frame = host_ns, number
             now.begun_utc = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
             first = now.case.first
-            told = {"case": now.case.number, "order": now.place, "q_icrs_to_cam": first.q_icrs_to_cam.tolist()}
+            told = {
+                "case": now.case.number,
+                "order": now.place,
+                "q_icrs_to_cam": first.q_icrs_to_cam.tolist(),
+            }
             rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
             told |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
-            write_whole(self._now_path, msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}))
+            write_whole(
+                self._now_path,
+                msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}),
+            )
 
     def _listen(self, now_ns: int) -> None:
         """Take the answers that have come, and end the case that has enough of them or whose
@@ -339,7 +405,10 @@ class BenchRun:
             self._heard_ns, self._refused = now_ns, refused
             # the tracker is back: its case begins again
             if self._waiting and self._now is not None:
-                self._notices.tell("tracker-back", f"the tracker answers again; case {self._now.case.number} begins again")
+                self._notices.tell(
+                    "tracker-back",
+                    f"the tracker answers again; case {self._now.case.number} begins again",
+                )
                 self._begin(self._now.case.number, self._now.place)
         for answer in answers:
             self._count(self._judge.judge(answer), answer)
@@ -352,7 +421,10 @@ class BenchRun:
             silent_s = (now_ns - self._heard_ns) / NS_PER_S
             if min(MAX_SILENCE_S, plan.limit_s / 2) < silent_s < plan.silent_s:
                 if not self._waiting:
-                    self._notices.tell("tracker-silent", f"the tracker is silent: waited for, up to {plan.silent_s:g} s")
+                    self._notices.tell(
+                        "tracker-silent",
+                        f"the tracker is silent: waited for, up to {plan.silent_s:g} s",
+                    )
                 self._waiting = True
                 return
         self._keep(self._row(now))
@@ -372,7 +444,11 @@ class BenchRun:
             fault_end_s, seen_s = now.fault_end_s, (judged.middle_ns - now.begun_ns) / NS_PER_S
             if fault_end_s is not None and now.recovery_s is None and seen_s >= fault_end_s:
                 now.recovery_s = after_s - fault_end_s
-        settled = now.received > 0 or off is not None if plan.settle_s is None else after_s >= plan.settle_s
+        settled = (
+            now.received > 0 or off is not None
+            if plan.settle_s is None
+            else after_s >= plan.settle_s
+        )
         if settled and now.received < plan.asked:
             now.take(judged, right)
 
@@ -389,35 +465,69 @@ class BenchRun:
             return False
         if now.first_attitude_s is None and self._before_q is not None:
             before = float(np.linalg.norm(residual_arcsec(answer.q_icrs_to_cam, self._before_q)))
-            if before <= self._plan.wrong_above_arcsec and before < float(np.linalg.norm(judged.residual)):
+            if before <= self._plan.wrong_above_arcsec and before < float(
+                np.linalg.norm(judged.residual)
+            ):
                 now.late += 1
                 return False
         return True
 
     def _row(self, now: Tally) -> Row:
-        row = first_row(now.case, self._columns) | {"order": now.place, "run": self._run, "begun_utc": now.begun_utc}
-        row |= {"bench_sha256": self._file_sha256, "frames": self._plan.asked, "received": now.received, "late": now.late}
-        row |= {"solved": len(now.errors) + now.wrong, "wrong": now.wrong, "wrong_deg": now.worst_deg}
+        row = first_row(now.case, self._columns) | {
+            "order": now.place,
+            "run": self._run,
+            "begun_utc": now.begun_utc,
+        }
+        row |= {
+            "bench_sha256": self._file_sha256,
+            "frames": self._plan.asked,
+            "received": now.received,
+            "late": now.late,
+        }
+        row |= {
+            "solved": len(now.errors) + now.wrong,
+            "wrong": now.wrong,
+            "wrong_deg": now.worst_deg,
+        }
         row |= {"first_attitude_s": now.first_attitude_s}
         if "recovery_s" in row:
             row |= {"fault_end_s": now.fault_end_s, "recovery_s": now.recovery_s}
-        if now.answered is not None and now.answered.lit is not None and now.answered.answer.q_icrs_to_cam is not None:
-            row |= dict(zip((f"solved_{name}" for name in Q), now.answered.answer.q_icrs_to_cam.tolist(), strict=True))
-            row |= dict(zip((f"lit_{name}" for name in Q), now.answered.lit.q.tolist(), strict=True))
+        if (
+            now.answered is not None
+            and now.answered.lit is not None
+            and now.answered.answer.q_icrs_to_cam is not None
+        ):
+            row |= dict(
+                zip(
+                    (f"solved_{name}" for name in Q),
+                    now.answered.answer.q_icrs_to_cam.tolist(),
+                    strict=True,
+                )
+            )
+            row |= dict(
+                zip((f"lit_{name}" for name in Q), now.answered.lit.q.tolist(), strict=True)
+            )
         if now.stars:
             row["stars"] = float(np.mean(now.stars))
         if now.signals:
             row["signal_mag"] = float(np.mean(now.signals))
         if not row["solved"]:
             silent = (self._heard_ns or 0) < (now.begun_ns or 0)
-            row |= {"status": NO_ANSWER, "why": "the tracker was silent" if silent else "the tracker had no attitude"}
+            row |= {
+                "status": NO_ANSWER,
+                "why": "the tracker was silent" if silent else "the tracker had no attitude",
+            }
         return row | spread_row(now.errors)
 
 
 def write_checks(path: Path, rows: list[Row], cases: int) -> None:
     """Write the check cases' rows as checks.csv."""
     told = [(row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows]
-    write_csv(path, CHECK_COLUMNS, [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)])
+    write_csv(
+        path,
+        CHECK_COLUMNS,
+        [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)],
+    )
 
 
 def drift_of(path: Path) -> dict[str, Any] | None:
@@ -430,12 +540,18 @@ def drift_of(path: Path) -> dict[str, Any] | None:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     at_s = np.array([datetime.fromisoformat(row["begun_utc"]).timestamp() for row in rows])
-    found = {name: _line(at_s, [float(row[name]) if row[name] else None for row in rows]) for name in CHECK_COLUMNS[4:]}
+    found = {
+        name: _line(at_s, [float(row[name]) if row[name] else None for row in rows])
+        for name in CHECK_COLUMNS[4:]
+    }
     each = [line for axis in AXES if (line := found[f"error_{axis}_arcsec"]) is not None]
     if len(each) < len(AXES):
         return None
     mag = found["signal_mag"] or (None, None)
-    arcsec = {"arcsec": [change for change, _ in each], "sigma_arcsec": [sigma for _, sigma in each]}
+    arcsec = {
+        "arcsec": [change for change, _ in each],
+        "sigma_arcsec": [sigma for _, sigma in each],
+    }
     return {"checks": len(rows), **arcsec, "mag": mag[0], "sigma_mag": mag[1]}
 
 
@@ -446,7 +562,10 @@ def _line(at_s: FloatArray, values: list[float | None]) -> tuple[float, float | 
     known = np.array([value is not None for value in values])
     if known.sum() < 2:
         return None
-    t, y = at_s[known] - at_s[known].mean(), np.array([value for value in values if value is not None])
+    t, y = (
+        at_s[known] - at_s[known].mean(),
+        np.array([value for value in values if value is not None]),
+    )
     span, power = float(np.ptp(at_s)), float(t @ t)
     if not power:
         return None

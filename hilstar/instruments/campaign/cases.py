@@ -28,7 +28,14 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
+from hilstar.instruments.campaign.plan import (
+    SCENARIO,
+    Attitudes,
+    Parameter,
+    Plan,
+    changed_bench,
+    parameters,
+)
 from hilstar.instruments.campaign.solvers import CentroidErrors, SolverAnswer
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.batch import faulty_exposure, view_at
@@ -56,12 +63,39 @@ BEFORE = (
     *(*Q, "ra_deg", "dec_deg", "roll_deg"),
 )
 AFTER = (
-    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", "first_attitude_s", *(f"solved_{name}" for name in Q)),
+    *(
+        "frames",
+        "stars_in_view",
+        "limit_v_mag",
+        "solved",
+        "wrong",
+        "first_attitude_s",
+        *(f"solved_{name}" for name in Q),
+    ),
     *(f"{what}_{axis}_arcsec" for what in ("error", "scatter") for axis in AXES),
 )
-BENCH_BEFORE = ("case", "status", "why", "order", "run", "begun_utc", "bench_sha256", *BEFORE[BEFORE.index("t_ns") :])
+BENCH_BEFORE = (
+    "case",
+    "status",
+    "why",
+    "order",
+    "run",
+    "begun_utc",
+    "bench_sha256",
+    *BEFORE[BEFORE.index("t_ns") :],
+)
 BENCH_AFTER = (
-    *("frames", "received", "late", "solved", "wrong", "wrong_deg", "first_attitude_s", "stars", "signal_mag"),
+    *(
+        "frames",
+        "received",
+        "late",
+        "solved",
+        "wrong",
+        "wrong_deg",
+        "first_attitude_s",
+        "stars",
+        "signal_mag",
+    ),
     *(f"{what}_{name}" for what in ("solved", "lit") for name in Q),
     *AFTER[AFTER.index("error_x_arcsec") :],
 )
@@ -99,11 +133,19 @@ class CaseMaker:
     def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
         self.plan, self.file = plan, file
         self._tables = parse_toml(file.path, file.text)
-        self._log = None if plan.attitudes.log is None else _read_log(folder / plan.attitudes.log, file)
+        self._log = (
+            None if plan.attitudes.log is None else _read_log(folder / plan.attitudes.log, file)
+        )
         if self._log is not None:
             self.file = dated(file, self._log.scale, self._log.span_ns[0])
         self.parameters: list[Parameter] = parameters(plan, file)
-        named = [str(name) for parameter in self.parameters if parameter.key == SCENARIO for name in parameter.values if name]
+        named = [
+            str(name)
+            for parameter in self.parameters
+            if parameter.key == SCENARIO
+            for name in parameter.values
+            if name
+        ]
         self._scenarios = {name: read_scenario(folder / name) for name in named}
         _check_through(plan, self.parameters, file)
 
@@ -115,7 +157,10 @@ class CaseMaker:
     def case(self, number: int, point: FloatArray) -> Case:
         """The case of this number at a point (dimensions,) of the design."""
         look, rest = point[: self.attitude_dimensions], point[self.attitude_dimensions :]
-        values = {parameter.key: parameter.value(float(u)) for parameter, u in zip(self.parameters, rest, strict=True)}
+        values = {
+            parameter.key: parameter.value(float(u))
+            for parameter, u in zip(self.parameters, rest, strict=True)
+        }
         seed = values.get("noise_seed")
         if seed is None:
             state = np.random.SeedSequence((self.plan.seed, number)).generate_state(1, np.uint64)
@@ -147,7 +192,11 @@ class CaseMaker:
             if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
-        q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
+        q = (
+            propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S)
+            if step_ns
+            else first.q_icrs_to_cam
+        )
         return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
@@ -155,7 +204,11 @@ class CaseMaker:
         since its beginning.
         """
         scenario = self.scenario(case)
-        return None if scenario is None else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
+        return (
+            None
+            if scenario is None
+            else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
+        )
 
     @property
     def begin_ns(self) -> int:
@@ -180,12 +233,19 @@ class CaseMaker:
         rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
         across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
         if across:
-            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(0.0, 2 * math.pi)
+            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(
+                0.0, 2 * math.pi
+            )
             rate_rad_s += across * np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
         if self._log is not None:
             begin_ns, end_ns = self._log.span_ns
             t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
-            return View.exposure(view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
+            return View.exposure(
+                view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam,
+                rate_rad_s,
+                0.0,
+                t_ns,
+            )
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
         return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
 
@@ -197,15 +257,21 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
     low_deg, high_deg = attitudes.roll_deg
     roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
     if attitudes.kind == "all-sky" or attitudes.radec_deg is None:
-        return from_radec_roll_deg(360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg)
+        return from_radec_roll_deg(
+            360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg
+        )
     off = math.acos(1 - float(look[1]) * (1 - math.cos(math.radians(attitudes.radius_deg))))
     angle = 2 * math.pi * float(look[0])
     ra, dec = (math.radians(degrees) for degrees in attitudes.radec_deg)
     east = np.array([-math.sin(ra), math.cos(ra), 0.0])
     north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
     middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
-    x, y, z = math.cos(off) * middle + math.sin(off) * (math.sin(angle) * east + math.cos(angle) * north)
-    return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg)
+    x, y, z = math.cos(off) * middle + math.sin(off) * (
+        math.sin(angle) * east + math.cos(angle) * north
+    )
+    return from_radec_roll_deg(
+        math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg
+    )
 
 
 def _read_log(path: Path, file: BenchFile) -> _Log:
@@ -236,18 +302,32 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
                 f'[[vary]] key = "{parameter.key}": cannot be changed on a real bench; write a key of [sky], [render] or'
                 " [spacecraft], rate_deg_s.*, time_s or scenario, or leave it out"
             )
-        if plan.through == "tracker" and table in {"monitor", "collimator", "render", "verify", "misalignment_arcsec"}:
+        if plan.through == "tracker" and table in {
+            "monitor",
+            "collimator",
+            "render",
+            "verify",
+            "misalignment_arcsec",
+        }:
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": changes nothing for through = "tracker", which sees no display; write'
                 ' through = "display", or leave it out'
             )
         if plan.attitudes.kind == "log" and parameter.key == "time_s":
-            raise InputError('[[vary]] key = "time_s": with a log the times are the log\'s; leave it out')
+            raise InputError(
+                '[[vary]] key = "time_s": with a log the times are the log\'s; leave it out'
+            )
         if plan.through == "display" and parameter.key == SCENARIO:
-            raise InputError('[[vary]] key = "scenario": faults are of through = "tracker"; write that')
+            raise InputError(
+                '[[vary]] key = "scenario": faults are of through = "tracker"; write that'
+            )
         if parameter.key == SCENARIO and not parameter.values:
-            raise InputError('[[vary]] key = "scenario": is a file; write values = ["faults.toml", ""]')
-        if table == "misalignment_arcsec" and (file.config.collimator.geometry or file.config.verify.true_geometry):
+            raise InputError(
+                '[[vary]] key = "scenario": is a file; write values = ["faults.toml", ""]'
+            )
+        if table == "misalignment_arcsec" and (
+            file.config.collimator.geometry or file.config.verify.true_geometry
+        ):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own alignment counts; vary'
                 " verify.true_geometry over several files instead"
@@ -258,7 +338,9 @@ def bench_columns(parameters: list[Parameter]) -> dict[str, Kind]:
     """The columns of the rows of a campaign on the bench, in their order."""
     names = columns(parameters, False)
     varied = [name for name in names if name.startswith("vary.")]
-    kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {"stars": "float64"}
+    kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {
+        "stars": "float64"
+    }
     return kinds | {name: names[name] for name in (*varied, *RECOVERY) if name in names}
 
 
@@ -294,7 +376,13 @@ def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
     row: Row = dict.fromkeys(plan_columns)
     q = case.first.q_icrs_to_cam
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
-    row |= {"case": case.number, "status": DONE, "why": "", "noise_seed": case.noise_seed, "t_ns": case.first.t_ns}
+    row |= {
+        "case": case.number,
+        "status": DONE,
+        "why": "",
+        "noise_seed": case.noise_seed,
+        "t_ns": case.first.t_ns,
+    }
     row |= dict(zip(Q, q.tolist(), strict=True))
     row |= {"ra_deg": ra_deg, "dec_deg": dec_deg, "roll_deg": roll_deg}
     for key, value in case.values.items():
@@ -313,10 +401,16 @@ def spread_row(errors_arcsec: list[FloatArray]) -> Row:
     row: Row = {}
     if errors_arcsec:
         errors = np.array(errors_arcsec)
-        row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip(AXES, errors.mean(axis=0), strict=True)}
+        row |= {
+            f"error_{axis}_arcsec": float(value)
+            for axis, value in zip(AXES, errors.mean(axis=0), strict=True)
+        }
         if len(errors) > 1:
             scatter = errors.std(axis=0, ddof=1)
-            row |= {f"scatter_{axis}_arcsec": float(value) for axis, value in zip(AXES, scatter, strict=True)}
+            row |= {
+                f"scatter_{axis}_arcsec": float(value)
+                for axis, value in zip(AXES, scatter, strict=True)
+            }
     return row
 
 
@@ -358,7 +452,9 @@ class CaseTally:
             self.wrong += 1
         else:
             self.errors_arcsec.append(error)
-            self.first_attitude_s = end_s if self.first_attitude_s is None else self.first_attitude_s
+            self.first_attitude_s = (
+                end_s if self.first_attitude_s is None else self.first_attitude_s
+            )
             if (
                 self.fault_end_s is not None
                 and self.recovery_s is None
@@ -368,8 +464,16 @@ class CaseTally:
 
     def into(self, row: Row) -> Row:
         """The case's row with its results. Errors are those of answers that are not wrong."""
-        row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
-        row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
+        row = row | {
+            "why": self.why,
+            "image_sha256": self._digest.hexdigest(),
+            "frames": self.frames,
+        }
+        row |= {
+            "stars_in_view": self.stars_in_view,
+            "solved": self.wrong + len(self.errors_arcsec),
+            "wrong": self.wrong,
+        }
         row["first_attitude_s"] = self.first_attitude_s
         if "recovery_s" in row:
             row |= {"fault_end_s": self.fault_end_s, "recovery_s": self.recovery_s}
@@ -379,17 +483,24 @@ class CaseTally:
         return row | self._centroids() if self.with_centroids and self.star_errors else row
 
     def _centroids(self) -> Row:
-        dx_px, dy_px = (np.concatenate([getattr(seen, name) for seen in self.star_errors]) for name in ("dx_px", "dy_px"))
+        dx_px, dy_px = (
+            np.concatenate([getattr(seen, name) for seen in self.star_errors])
+            for name in ("dx_px", "dy_px")
+        )
         v_mag = np.concatenate([seen.v_mag for seen in self.star_errors])
         row: Row = {
-            name: sum(getattr(seen, name) for seen in self.star_errors) for name in ("stars", "found", "matched", "false")
+            name: sum(getattr(seen, name) for seen in self.star_errors)
+            for name in ("stars", "found", "matched", "false")
         }
         row["measured"] = len(dx_px)
         if len(dx_px):
             row |= {"centroid_dx_px": float(dx_px.mean()), "centroid_dy_px": float(dy_px.mean())}
             row["limit_v_mag"] = float(v_mag.max())
         if len(dx_px) > 1:
-            row |= {"centroid_sigma_x_px": float(dx_px.std(ddof=1)), "centroid_sigma_y_px": float(dy_px.std(ddof=1))}
+            row |= {
+                "centroid_sigma_x_px": float(dx_px.std(ddof=1)),
+                "centroid_sigma_y_px": float(dy_px.std(ddof=1)),
+            }
         return row
 
 

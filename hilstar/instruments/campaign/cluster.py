@@ -94,11 +94,17 @@ class Scheduler:
         if protocol == "tls":
             missing = [name for name in ("tls_ca_file", "tls_cert") if getattr(self, name) is None]
             if any(files) and missing:
-                raise InputError(f"{named}: --{missing[0].replace('_', '-')} is missing; {GIVE_TLS}")
+                raise InputError(
+                    f"{named}: --{missing[0].replace('_', '-')} is missing; {GIVE_TLS}"
+                )
         elif any(files):
-            raise InputError(f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT")
+            raise InputError(
+                f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT"
+            )
         elif not endpoint.loopback:
-            raise InputError(f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT")
+            raise InputError(
+                f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT"
+            )
         return f"{protocol}://{endpoint.address.removeprefix('tcp://')}"
 
     def security(self) -> Any:
@@ -109,14 +115,26 @@ class Scheduler:
 
         if not self.address.startswith("tls://"):
             return None
-        names = {"tls_ca_file": self.tls_ca_file, "tls_client_cert": self.tls_cert, "tls_client_key": self.tls_key}
+        names = {
+            "tls_ca_file": self.tls_ca_file,
+            "tls_client_cert": self.tls_cert,
+            "tls_client_key": self.tls_key,
+        }
         made: Any = Security
         try:
-            security = made(require_encryption=True, **{name: str(path) for name, path in names.items() if path is not None})
+            security = made(
+                require_encryption=True,
+                **{name: str(path) for name, path in names.items() if path is not None},
+            )
             context = security.get_connection_args("client").get("ssl_context")
         except (OSError, ValueError) as error:  # ssl's errors are among them
-            files = ", ".join(str(path) for path in names.values() if path is not None) or "Dask's configuration"
-            raise InputError(f"--scheduler {self.address}: {files}: {one_line(str(error))}; {GIVE_TLS}") from error
+            files = (
+                ", ".join(str(path) for path in names.values() if path is not None)
+                or "Dask's configuration"
+            )
+            raise InputError(
+                f"--scheduler {self.address}: {files}: {one_line(str(error))}; {GIVE_TLS}"
+            ) from error
         if context is None:
             raise InputError(f"--scheduler {self.address}: no certificate is named; {GIVE_TLS}")
         return security
@@ -143,7 +161,9 @@ class Cluster(Closing):
 
     task_s = TASK_S
 
-    def __init__(self, scheduler: Scheduler, job: Job, identity: Identity, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, scheduler: Scheduler, job: Job, identity: Identity, say: Callable[[str], None]
+    ) -> None:
         try:
             import distributed
         except ImportError as error:
@@ -162,7 +182,9 @@ class Cluster(Closing):
             named = {"set_as_default": False, "name": "hilstar-campaign", "security": security}
             self._client = client(address, timeout=CONNECT_S, **named)
         except ValueError as error:
-            raise InputError(f"--scheduler {address}: {one_line(str(error))}; write tcp://HOST:PORT") from error
+            raise InputError(
+                f"--scheduler {address}: {one_line(str(error))}; write tcp://HOST:PORT"
+            ) from error
         except (OSError, TimeoutError) as error:
             if "certificate" in str(error):
                 why = "the scheduler and this side do not have certificates of one CA; look at --tls-ca-file and --tls-cert"
@@ -208,7 +230,9 @@ class Cluster(Closing):
             return
         self._looked_s = time.monotonic()
         try:
-            present: dict[str, int] = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=ANSWER_S)
+            present: dict[str, int] = self._client.sync(
+                self._client.scheduler.ncores, workers=None, callback_timeout=ANSWER_S
+            )
         except (OSError, TimeoutError, asyncio.CancelledError, RuntimeError) as error:
             if time.monotonic() - self._answered_s < MAX_SILENCE_S:
                 return  # a busy one answers later
@@ -249,14 +273,22 @@ class Cluster(Closing):
         return future
 
     def _hand_out(self, backlog: Backlog) -> None:
-        good = {address: worker for address, worker in self._workers.items() if worker.checked and not worker.refused}
-        for depth in range(1, 1 + max((worker.threads for worker in good.values()), default=0) + SPARE_TASKS):
+        good = {
+            address: worker
+            for address, worker in self._workers.items()
+            if worker.checked and not worker.refused
+        }
+        for depth in range(
+            1, 1 + max((worker.threads for worker in good.values()), default=0) + SPARE_TASKS
+        ):
             for address, worker in good.items():
                 if len(worker.tasks) < min(depth, worker.threads + SPARE_TASKS):
                     task = backlog.take(sum(other.threads for other in good.values()))
                     if task is None:
                         return
-                    worker.tasks.append((self._submit(address, run_task, self._job, task.begin, task.points), task))
+                    worker.tasks.append(
+                        (self._submit(address, run_task, self._job, task.begin, task.points), task)
+                    )
 
     def _hear_examined(self) -> None:
         for future in [future for future in self._examined if future.done()]:
@@ -294,7 +326,9 @@ class Cluster(Closing):
                     done(task, answered)
                 elif future.status == "cancelled":  # with the scheduler's connection
                     backlog.give_back(task)
-                elif future.status == "error" and type(future.exception()).__name__ != "KilledWorker":
+                elif (
+                    future.status == "error" and type(future.exception()).__name__ != "KilledWorker"
+                ):
                     backlog.give_back(task)
                     if not worker.refused:
                         self._refuse(address, f"failed: {future.exception()}")
@@ -311,7 +345,9 @@ class Cluster(Closing):
         advice = f"start some: dask worker {self._address} --nthreads 1 --nworkers 8 {self._dask_words()}"
         if self._alone_since_s is None:
             self._alone_since_s = now_s
-            self._say(f"hilstar: --scheduler {self._address} has no worker for this campaign{refused}; {advice}")
+            self._say(
+                f"hilstar: --scheduler {self._address} has no worker for this campaign{refused}; {advice}"
+            )
         if now_s - self._alone_since_s > MAX_WITHOUT_WORKER_S:
             raise MachineError(
                 f"--scheduler {self._address}: no worker for this campaign in {MAX_WITHOUT_WORKER_S:g} s{refused}; {advice}"
@@ -320,7 +356,9 @@ class Cluster(Closing):
     def close(self) -> None:
         """Cancel what is still asked for, and let the scheduler go."""
         with contextlib.suppress(Exception):
-            self._client.cancel([future for worker in self._workers.values() for future, _ in worker.tasks])
+            self._client.cancel(
+                [future for worker in self._workers.values() for future, _ in worker.tasks]
+            )
             self._client.close(timeout=CLOSE_S)
 
 

@@ -13,7 +13,12 @@ from hilstar.basics.units import NS_PER_S
 from hilstar.display.quantise import primary_lights
 from hilstar.instruments.simulate.optics import DisplayColours, TwinOptics, seen_primaries
 from hilstar.instruments.simulate.shutter import rolled, rolling_light
-from hilstar.instruments.simulate.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
+from hilstar.instruments.simulate.simulator import (
+    Exposure,
+    TrackerBackground,
+    detector_canvas,
+    exposure_truth,
+)
 from hilstar.instruments.simulate.twin import true_geometry, true_panel
 from hilstar.optics.layers.layers import Sources, light_of, sky_layers
 from hilstar.optics.layers.truth import with_errors
@@ -72,12 +77,15 @@ class DisplayTracker:
         self.canvas = detector_canvas(self.file, self.camera)
         self._panel, self._primaries = true_panel(self._bench), seen_primaries(self._bench)
         self._colours = DisplayColours.of(self._bench)
-        self._background = TrackerBackground(self.config, self.file.folder, self.camera, moving=self._bench.moving)
+        self._background = TrackerBackground(
+            self.config, self.file.folder, self.camera, moving=self._bench.moving
+        )
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def _load_optics(self) -> None:
         self._optics = TwinOptics(
-            true_geometry(self._bench, self.camera), before_detector(self.config, self.file.folder, self._bench.camera)
+            true_geometry(self._bench, self.camera),
+            before_detector(self.config, self.file.folder, self._bench.camera),
         )
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
@@ -98,14 +106,24 @@ class DisplayTracker:
         else:
             dn = self._detector.expose(mean_e, exposure_s, rng)
         stars = self._bench.seen(self._bench.stars, view)
-        light = light_of(self.canvas, sky_layers(self.canvas, Sources(self._bench.moving), paths=False), stars, view)
+        light = light_of(
+            self.canvas,
+            sky_layers(self.canvas, Sources(self._bench.moving), paths=False),
+            stars,
+            view,
+        )
         truth = exposure_truth(self.canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
-        return Exposure(view, dn, mean_e, with_errors(truth, stars.catalog, self.config.sky.epoch_jyear))
+        return Exposure(
+            view, dn, mean_e, with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
+        )
 
     def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (primaries, H, W) of the display over the exposure."""
-        count, moving = max(1, round(view.exposure_s * self.config.monitor.refresh_hz)), self._bench.moving
+        count, moving = (
+            max(1, round(view.exposure_s * self.config.monitor.refresh_hz)),
+            self._bench.moving,
+        )
         streaks = moving is not None and moving.satellites is not None
         if not streaks and not view.turn.rate_cam_rad_s.any():
             count = len(self._bench.quantiser.exposure(0, count))
@@ -116,15 +134,22 @@ class DisplayTracker:
             t_ns = view.t_ns
             if streaks and t_ns is not None:
                 t_ns += round(seconds * NS_PER_S)
-            light = np.array(primary_lights(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel))
+            light = np.array(
+                primary_lights(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)
+            )
             total = light if total is None else total + light
         return np.zeros((0, 0, 0)) if total is None else total / count
 
-    def _rolling_e_per_s(self, view: View, rng: np.random.Generator | None) -> tuple[FloatArray, FloatArray]:
+    def _rolling_e_per_s(
+        self, view: View, rng: np.random.Generator | None
+    ) -> tuple[FloatArray, FloatArray]:
         """The mean light (primaries, H, W) of the display over each place's own exposure, and
         that of the glow (h, w).
         """
-        period_s, free = 1 / self.config.monitor.refresh_hz, self.config.tracker.trigger == "free" and rng is not None
+        period_s, free = (
+            1 / self.config.monitor.refresh_hz,
+            self.config.tracker.trigger == "free" and rng is not None,
+        )
         phase_s = rng.uniform(0, period_s) if free and rng is not None else -view.exposure_s / 2
         light, glow = rolling_light(self._bench, self._optics.geometry, self._panel, view, phase_s)
         return light, self._glow_e_per_s * glow
@@ -140,9 +165,26 @@ def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
     exposure.
     """
     tracker = config.tracker
-    gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.exposure_s
-    open_part, drawn = tracker.detector.fill_factor, None if config.render.psf == GAUSSIAN else _optics_keys(config)
-    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers, open_part, drawn
+    gathers = (
+        tracker.aperture_mm,
+        tracker.quantum_efficiencies,
+        tracker.transmission,
+        tracker.exposure_s,
+    )
+    open_part, drawn = (
+        tracker.detector.fill_factor,
+        None if config.render.psf == GAUSSIAN else _optics_keys(config),
+    )
+    return (
+        config.sky,
+        config.spacecraft,
+        config.monitor,
+        config.collimator,
+        config.render,
+        gathers,
+        open_part,
+        drawn,
+    )
 
 
 def _optics_keys(config: BenchConfig) -> tuple[object, ...]:

@@ -59,17 +59,32 @@ OWN_KEYS = (
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
     *("time_s", "noise_seed", "scenario"),
 )
-MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
+MAX_OWN = {
+    "rate_deg_s": 360.0,
+    "misalignment_arcsec": 36_000.0,
+    "time_s": 9e9,
+    "noise_seed": 2.0**63 - 1,
+}
 WHOLE = ("noise_seed",)
 # What [[require]] limits (ECSS-E-ST-60-20C), and its unit; those of an axis, arcsec, come first.
 Quantity = Literal[
-    "bias", "fov-error", "pixel-error", "noise", "nea", "availability", "wrong-rate", "time-to-first-attitude", "recovery"
+    "bias",
+    "fov-error",
+    "pixel-error",
+    "noise",
+    "nea",
+    "availability",
+    "wrong-rate",
+    "time-to-first-attitude",
+    "recovery",
 ]
 AXIS_QUANTITIES = ("bias", "fov-error", "pixel-error", "noise", "nea")
 TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
 QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_QUANTITIES, "s")
 QUANTITY_UNITS |= {"availability": "", "wrong-rate": ""}
-CONDITION = re.compile(r"\s*([A-Za-z0-9_.]+)\s*(<=|>=|==|!=|<|>)\s*(?:\"([^\"]*)\"|([-+0-9.eE]+))\s*")
+CONDITION = re.compile(
+    r"\s*([A-Za-z0-9_.]+)\s*(<=|>=|==|!=|<|>)\s*(?:\"([^\"]*)\"|([-+0-9.eE]+))\s*"
+)
 SCENARIO = "scenario"  # the path of a file of faults; empty for none
 ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
@@ -152,7 +167,9 @@ class Require(Table, frozen=True):
         where = f" where {self.condition}" if self.condition else ""
         side = "at most" if self.minimum is None else "at least"
         unit = QUANTITY_UNITS[self.quantity]
-        return f"{self.quantity}{axis} {side} {self.limit:g}{f' {unit}' if unit else ''}{share}{where}"
+        return (
+            f"{self.quantity}{axis} {side} {self.limit:g}{f' {unit}' if unit else ''}{share}{where}"
+        )
 
 
 class Plan(Table, frozen=True):
@@ -210,19 +227,27 @@ def parse_plan(path: Path, text: str) -> Plan:
     try:
         for key in TRACKER_KEYS if plan.through == "bench" else BENCH_KEYS:
             if key in tables:
-                other = 'through = "tracker" or "display"' if plan.through == "bench" else 'through = "bench"'
+                other = (
+                    'through = "tracker" or "display"'
+                    if plan.through == "bench"
+                    else 'through = "bench"'
+                )
                 raise InputError(f"{key}: is for {other}; write that, or leave {key} out")
         _check_attitudes(plan.attitudes)
         _check_told(plan.centroids)
         keys = [varied.key for varied in plan.vary]
         for varied in plan.vary:
             if keys.count(varied.key) > 1:
-                raise InputError(f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out')
+                raise InputError(
+                    f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out'
+                )
             _check_range(varied, plan.sampling)
         for number, require in enumerate(plan.require, start=1):
             _check_require(f"[[require]] number {number}", require)
         if plan.cases is None and plan.sampling != "grid":
-            raise InputError(f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000')
+            raise InputError(
+                f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000'
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return plan
@@ -246,7 +271,9 @@ def _check_attitudes(attitudes: Attitudes) -> None:
             f'[attitudes] radec_deg is for kind = "field", and kind is "{attitudes.kind}"; write that, or leave it out'
         )
     if attitudes.kind != "log" and attitudes.log is not None:
-        raise InputError(f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out')
+        raise InputError(
+            f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out'
+        )
 
 
 def _check_told(centroids: Centroiding) -> None:
@@ -256,7 +283,9 @@ def _check_told(centroids: Centroiding) -> None:
             '[centroids] psf, psf_focus_um and psf_spectrum are for centroider = "psf"; write that, or leave them out'
         )
     if centroids.psf_focus_um and centroids.psf in (TRACKER_PSF, GAUSSIAN):
-        raise InputError(f'[centroids] psf_focus_um is for the file of psf, and psf is "{centroids.psf}"; leave it out')
+        raise InputError(
+            f'[centroids] psf_focus_um is for the file of psf, and psf is "{centroids.psf}"; leave it out'
+        )
 
 
 def _check_range(varied: Varied, sampling: Sampling) -> None:
@@ -266,15 +295,21 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
         raise InputError(f"{where}: write either values = [...], or minimum and maximum")
     if varied.values is not None:
         if varied.steps is not None or varied.scale != "linear":
-            raise InputError(f"{where}: steps and scale are for minimum and maximum; leave them out beside values")
+            raise InputError(
+                f"{where}: steps and scale are for minimum and maximum; leave them out beside values"
+            )
         return
     low, high = ends
     if low is None or high is None or not low < high:
-        raise InputError(f"{where}: minimum = {low}, maximum = {high}; write two numbers, the smaller one first")
+        raise InputError(
+            f"{where}: minimum = {low}, maximum = {high}; write two numbers, the smaller one first"
+        )
     if varied.scale == "log" and low <= 0:
         raise InputError(f'{where}: minimum = {low:g} with scale = "log"; write a number above 0')
     if sampling == "grid" and varied.steps is None:
-        raise InputError(f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add steps = 5')
+        raise InputError(
+            f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add steps = 5'
+        )
     if sampling != "grid" and varied.steps is not None:
         raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
 
@@ -287,7 +322,9 @@ def _check_require(where: str, require: Require) -> None:
     if require.axis is not None and not require.of_axis:
         raise InputError(f"{where}: has no axis; leave axis out")
     if require.share is not None and quantity in ("bias", "availability", "wrong-rate"):
-        raise InputError(f"{where}: is one figure of all cases, without a share of them; leave share out")
+        raise InputError(
+            f"{where}: is one figure of all cases, without a share of them; leave share out"
+        )
     if quantity in ("availability", "wrong-rate") and not 0 <= require.limit <= 1:
         raise InputError(f"{where}: the limit {require.limit:g}; write a share from 0 to 1")
     try:
@@ -333,7 +370,12 @@ def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]
     for key, comparison, value in conditions_of(text):
         name = f"vary.{key}" if f"vary.{key}" in columns else key
         if name not in columns or isinstance(value, str) != (columns[name] == "text"):
-            varied = ", ".join(each.removeprefix("vary.") for each in columns if each.startswith("vary.")) or "none"
+            varied = (
+                ", ".join(
+                    each.removeprefix("vary.") for each in columns if each.startswith("vary.")
+                )
+                or "none"
+            )
             raise InputError(
                 f'[[require]] condition = "{shortened(text)}": {shortened(key)} is no key that the plan varies ({varied}),'
                 f" and no column of {'texts' if isinstance(value, str) else 'numbers'}; write one of those"
@@ -359,7 +401,11 @@ class Parameter:
         """The value at a place in [0, 1)."""
         if self.values:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
-        low, high = (math.log(end) for end in (self.minimum, self.maximum)) if self.log else (self.minimum, self.maximum)
+        low, high = (
+            (math.log(end) for end in (self.minimum, self.maximum))
+            if self.log
+            else (self.minimum, self.maximum)
+        )
         value = low + share * (high - low)
         value = min(max(math.exp(value), self.minimum), self.maximum) if self.log else value
         return round(value) if self.whole else value
@@ -412,7 +458,10 @@ def _parameter(varied: Varied, file: BenchFile) -> Parameter:
     ends = Parameter(varied.key, (), varied.minimum, varied.maximum, varied.scale == "log", whole)
     if varied.steps is None:
         return ends
-    return Parameter(varied.key, tuple(ends.value(step / max(1, varied.steps - 1)) for step in range(varied.steps)))
+    return Parameter(
+        varied.key,
+        tuple(ends.value(step / max(1, varied.steps - 1)) for step in range(varied.steps)),
+    )
 
 
 def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
@@ -421,12 +470,20 @@ def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict
         return
     if parameter.key == SCENARIO:
         if not isinstance(value, str):
-            raise InputError(f'the value {shortened(value)}; write paths of scenario files, and "" for none')
+            raise InputError(
+                f'the value {shortened(value)}; write paths of scenario files, and "" for none'
+            )
         return
     whole, largest = parameter.key in WHOLE, MAX_OWN[parameter.key.split(".")[0]]
     low = 0 if whole else -largest
-    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not low <= value <= largest:
-        raise InputError(f"the value {shortened(value)}; write a number from {low:g} to {largest:g}")
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int if whole else int | float)
+        or not low <= value <= largest
+    ):
+        raise InputError(
+            f"the value {shortened(value)}; write a number from {low:g} to {largest:g}"
+        )
 
 
 def _now(names: list[str], config: Any) -> Any:
@@ -459,7 +516,9 @@ def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> N
         value = [value] * len(present)
     if isinstance(table, list):
         if not last.isdigit() or int(last) >= len(table):
-            raise InputError(f"{'.'.join(names)}: write a number from 0 to {len(table) - 1} after the last dot")
+            raise InputError(
+                f"{'.'.join(names)}: write a number from 0 to {len(table) - 1} after the last dot"
+            )
         table[int(last)] = value
     else:
         table[last] = value
@@ -473,7 +532,14 @@ class Design:
     last combination. Raises InputError for a Latin hypercube that does not fit into memory.
     """
 
-    def __init__(self, sampling: Sampling, seed: int, cases: int, attitude_dimensions: int, levels: Sequence[int]) -> None:
+    def __init__(
+        self,
+        sampling: Sampling,
+        seed: int,
+        cases: int,
+        attitude_dimensions: int,
+        levels: Sequence[int],
+    ) -> None:
         self.sampling, self.seed, self.cases = sampling, seed, cases
         self.attitude_dimensions, self.levels = attitude_dimensions, tuple(levels)
         self.dimensions = attitude_dimensions + len(levels)
@@ -488,7 +554,9 @@ class Design:
                 )
             from scipy.stats import qmc
 
-            self._cube = qmc.LatinHypercube(self.dimensions, rng=np.random.default_rng(seed)).random(cases)
+            self._cube = qmc.LatinHypercube(
+                self.dimensions, rng=np.random.default_rng(seed)
+            ).random(cases)
 
     def points(self, begin: int, end: int) -> FloatArray:
         """The points of the cases from `begin` to before `end`."""
@@ -509,6 +577,8 @@ class Design:
         points, own = np.empty((end - begin, self.dimensions)), self.attitude_dimensions
         for row, case in zip(points, range(begin, end), strict=True):
             row[:own] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(own)
-            level = np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
+            level = (
+                np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
+            )
             row[own:] = (np.array(level) + 0.5) / self.levels
         return points

@@ -12,7 +12,14 @@ from hilstar.basics.errors import HilstarError, InputError, MachineError
 from hilstar.basics.process.pool import ProcessPool, WorkerProcess
 from hilstar.basics.reading import size_text
 from hilstar.instruments.campaign.plan import Design
-from hilstar.instruments.campaign.session import Answered, Identity, Job, Session, difference, peak_bytes
+from hilstar.instruments.campaign.session import (
+    Answered,
+    Identity,
+    Job,
+    Session,
+    difference,
+    peak_bytes,
+)
 from hilstar.instruments.campaign.store import Journal
 
 FIRST_CASES, MAX_TASK_CASES = 1, 1000  # cases in a task
@@ -81,7 +88,9 @@ class Backlog:
         """Note that a task came back after so many seconds of work."""
         self.to_run -= len(task)
         case_s = seconds / max(1, len(task))
-        self._case_s = case_s if self._case_s is None else (1 - SMOOTHING) * self._case_s + SMOOTHING * case_s
+        self._case_s = (
+            case_s if self._case_s is None else (1 - SMOOTHING) * self._case_s + SMOOTHING * case_s
+        )
 
     def give_back(self, task: Task) -> None:
         """Hand out a task again that nobody has begun."""
@@ -113,7 +122,9 @@ class Pool:
 
     task_s = TASK_S
 
-    def __init__(self, job: Job, identity: Identity, count: int, memory_bytes: int | None = None) -> None:
+    def __init__(
+        self, job: Job, identity: Identity, count: int, memory_bytes: int | None = None
+    ) -> None:
         self._identity, self._count, self._memory_bytes = identity, count, memory_bytes
         self._processes = ProcessPool(_start_session, (job,), (HilstarError,))
         self._starts_lost, self._peak_bytes = 0, 0
@@ -169,7 +180,9 @@ class Pool:
             )
         return max(1, min(self._count, room // self._peak_bytes))
 
-    def _take(self, worker: WorkerProcess, answered: Answered, backlog: Backlog, done: Done) -> None:
+    def _take(
+        self, worker: WorkerProcess, answered: Answered, backlog: Backlog, done: Done
+    ) -> None:
         task, worker.task = worker.task, None
         self._peak_bytes = max(self._peak_bytes, answered.peak_bytes)
         backlog.done(task, answered.seconds)
@@ -177,7 +190,9 @@ class Pool:
         if len(self._processes.workers) > self._allowed():
             self._processes.dismiss(worker)
 
-    def _replace(self, worker: WorkerProcess, exit_code: int | None, backlog: Backlog, lost: Lost) -> None:
+    def _replace(
+        self, worker: WorkerProcess, exit_code: int | None, backlog: Backlog, lost: Lost
+    ) -> None:
         if not worker.ready:
             self._starts_lost += 1
             if self._starts_lost >= MAX_STARTS_LOST:

@@ -40,7 +40,14 @@ from hilstar.instruments.campaign.results import MAX_FITTED_CASES, Columns, atti
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
-    **{"<=": operator.le, "<": operator.lt, ">=": operator.ge, ">": operator.gt, "==": operator.eq, "!=": operator.ne}
+    **{
+        "<=": operator.le,
+        "<": operator.lt,
+        ">=": operator.ge,
+        ">": operator.gt,
+        "==": operator.eq,
+        "!=": operator.ne,
+    }
 }
 MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown"
 TIME_SHARE = 0.95  # a time's share where `share` is not given
@@ -70,10 +77,16 @@ class RequirementVerdict:
         require = self.require
         said = f"{require.words}: {self.verdict}"
         if self.bound is not None and self.value is not None:
-            side = "not more" if (self.verdict == NOT_MET) == (require.minimum is not None) else "not less"
+            side = (
+                "not more"
+                if (self.verdict == NOT_MET) == (require.minimum is not None)
+                else "not less"
+            )
             said += f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at {100 * require.confidence:g} %"
         if self.verdict == NOT_SHOWN:
-            said += f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
+            said += (
+                f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
+            )
         return said
 
 
@@ -102,7 +115,11 @@ class _TooFew(Exception):
 
 
 def verdicts_of(
-    requires: list[Require], cases: Columns, scale: Scale, seed: int, bench_arcsec: tuple[float, float] | None = None
+    requires: list[Require],
+    cases: Columns,
+    scale: Scale,
+    seed: int,
+    bench_arcsec: tuple[float, float] | None = None,
 ) -> list[RequirementVerdict]:
     """The verdict of each requirement over the cases. Raises InputError for a condition on a column
     that is not there.
@@ -110,13 +127,19 @@ def verdicts_of(
     `bench_arcsec` is how far the bench's own attitude may be off, across and about: it is taken off
     an error's limit.
     """
-    cases = cases.some(np.arange(len(cases.numbers["frames"])) % -(-len(cases.numbers["frames"]) // MAX_FITTED_CASES) == 0)
+    cases = cases.some(
+        np.arange(len(cases.numbers["frames"]))
+        % -(-len(cases.numbers["frames"]) // MAX_FITTED_CASES)
+        == 0
+    )
     decomposed: dict[str, Decomposed | InputError] = {}
 
     def parts(condition: str, some: Columns) -> Decomposed:
         if condition not in decomposed:
             try:
-                decomposed[condition] = assess_cases(*attitudes_of(some), scale, np.random.default_rng(seed))
+                decomposed[condition] = assess_cases(
+                    *attitudes_of(some), scale, np.random.default_rng(seed)
+                )
             except InputError as error:
                 decomposed[condition] = error
         found = decomposed[condition]
@@ -130,9 +153,13 @@ def verdicts_of(
         chosen = chosen_cases(require.condition, cases)
         some = cases.some(chosen)
         try:
-            figure = _figure(require, some, partial(parts, require.condition, some), np.random.default_rng(seed))
+            figure = _figure(
+                require, some, partial(parts, require.condition, some), np.random.default_rng(seed)
+            )
         except _TooFew as few:
-            found.append(RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few)))
+            found.append(
+                RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few))
+            )
             continue
         found.append(_judged(require, figure, bench_arcsec))
     return found
@@ -145,12 +172,18 @@ def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
     kinds = dict.fromkeys(cases.numbers, "float64") | dict.fromkeys(cases.texts, "text")
     chosen = np.ones(len(cases.numbers["frames"]), dtype=np.bool_)
     for name, comparison, value in checked_conditions(condition, kinds):
-        column: Any = np.array(cases.texts[name], dtype=object) if name in cases.texts else cases.numbers[name]
+        column: Any = (
+            np.array(cases.texts[name], dtype=object)
+            if name in cases.texts
+            else cases.numbers[name]
+        )
         chosen &= np.asarray(COMPARISONS[comparison](column, value), dtype=np.bool_)
     return chosen
 
 
-def _judged(require: Require, figure: _Figure, bench_arcsec: tuple[float, float] | None) -> RequirementVerdict:
+def _judged(
+    require: Require, figure: _Figure, bench_arcsec: tuple[float, float] | None
+) -> RequirementVerdict:
     limit, maximum = require.limit, require.minimum is None
     own = 0.0  # what of the error the bench could have made, or hidden
     if bench_arcsec is not None and require.of_axis and maximum:
@@ -165,7 +198,13 @@ def _judged(require: Require, figure: _Figure, bench_arcsec: tuple[float, float]
     more = _more(require, figure) if verdict == NOT_SHOWN else None
     value = figure.value if math.isfinite(figure.value) else None
     return RequirementVerdict(
-        require, figure.cases, value, bound if math.isfinite(bound) else None, verdict, more, figure.method
+        require,
+        figure.cases,
+        value,
+        bound if math.isfinite(bound) else None,
+        verdict,
+        more,
+        figure.method,
     )
 
 
@@ -176,12 +215,19 @@ def _more(require: Require, figure: _Figure) -> int | None:
     limit, maximum, c = require.limit, require.minimum is None, require.confidence
     if figure.rate is not None:
         count, of = figure.rate
-        share, allowed = count / of, limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require)
+        share, allowed = (
+            count / of,
+            limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require),
+        )
 
         def decided(cases: int) -> bool:
             n = cases * of / figure.cases
             low, high = clopper_pearson(round(share * n), n, c)
-            return high <= allowed or low > allowed or (not maximum and (low >= allowed or high < allowed))
+            return (
+                high <= allowed
+                or low > allowed
+                or (not maximum and (low >= allowed or high < allowed))
+            )
 
         if share == allowed or not decided(MAX_MORE):
             return None
@@ -203,7 +249,9 @@ def _share(require: Require) -> float:
     return TIME_SHARE if require.share is None else require.share
 
 
-def _figure(require: Require, cases: Columns, parts: Callable[[], Decomposed], rng: np.random.Generator) -> _Figure:
+def _figure(
+    require: Require, cases: Columns, parts: Callable[[], Decomposed], rng: np.random.Generator
+) -> _Figure:
     quantity, c = require.quantity, require.confidence
     axes, count = AXIS_INDICES[require.axis or "cross"], len(cases.numbers["frames"])
     if not count:
@@ -211,17 +259,25 @@ def _figure(require: Require, cases: Columns, parts: Callable[[], Decomposed], r
     if quantity in ("availability", "wrong-rate"):
         solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
         asked = np.nan_to_num(cases.numbers["frames"])
-        return _rate(wrong, solved, c) if quantity == "wrong-rate" else _rate(solved - wrong, asked, c)
+        return (
+            _rate(wrong, solved, c) if quantity == "wrong-rate" else _rate(solved - wrong, asked, c)
+        )
     if quantity in ("time-to-first-attitude", "recovery"):
         return _time(require, cases)
     if quantity == "nea" and np.nansum(cases.numbers["frames"] > 1):
         return _within(cases, axes, require, rng)
     found = parts()
     figure = _of_parts(found, axes, require, rng)
-    return replace(figure, method=f"{figure.method}; {len(found.wrong)} wild answers left out") if len(found.wrong) else figure
+    return (
+        replace(figure, method=f"{figure.method}; {len(found.wrong)} wild answers left out")
+        if len(found.wrong)
+        else figure
+    )
 
 
-def _of_parts(found: Decomposed, axes: list[int], require: Require, rng: np.random.Generator) -> _Figure:
+def _of_parts(
+    found: Decomposed, axes: list[int], require: Require, rng: np.random.Generator
+) -> _Figure:
     """A figure of the error budget's parts."""
     quantity, c = require.quantity, require.confidence
     n, components = len(found.row), found.components
@@ -230,7 +286,9 @@ def _of_parts(found: Decomposed, axes: list[int], require: Require, rng: np.rand
         return _bias(components.mean[axes], total[:, axes].std(axis=0, ddof=1), n, c)
     if quantity in ("noise", "nea"):
         freedom = n - 1 - components.fov.freedom - components.pixel.freedom
-        return _noise(components.left[:, axes] * math.sqrt(n / max(freedom, 1.0)), freedom, require, rng)
+        return _noise(
+            components.left[:, axes] * math.sqrt(n / max(freedom, 1.0)), freedom, require, rng
+        )
     part = components.fov if quantity == "fov-error" else components.pixel
     if part.reason:
         raise _TooFew(part.reason, n)
@@ -259,7 +317,10 @@ def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
         if 0 < share < 1 and cases > 1:
             between = cases / (cases - 1) * float(((hits - share * asked) ** 2).sum()) / total**2
             effect = max(between / (share * (1 - share) / total), 1.0)
-            effective, method = max(total / effect, 1.0), f"Clopper-Pearson, design effect {effect:.3g}"
+            effective, method = (
+                max(total / effect, 1.0),
+                f"Clopper-Pearson, design effect {effect:.3g}",
+            )
     low, high = clopper_pearson(share * effective, effective, confidence)
     return _Figure(share, low, high, cases, method, (share * effective, effective))
 
@@ -273,7 +334,9 @@ def quantile_limits(values: FloatArray, share: float, confidence: float) -> tupl
     upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
     lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
-    return float(ordered[lower - 1]) if lower > 0 else -math.inf, float(ordered[upper]) if upper < n else math.inf
+    return float(ordered[lower - 1]) if lower > 0 else -math.inf, float(
+        ordered[upper]
+    ) if upper < n else math.inf
 
 
 def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> _Figure:
@@ -287,9 +350,17 @@ def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> 
 
 def _time(require: Require, cases: Columns) -> _Figure:
     numbers = cases.numbers
-    column, known = ("first_attitude_s", "frames") if require.quantity != "recovery" else ("recovery_s", "fault_end_s")
+    column, known = (
+        ("first_attitude_s", "frames")
+        if require.quantity != "recovery"
+        else ("recovery_s", "fault_end_s")
+    )
     if column not in numbers or known not in numbers:
-        why = "the table has no such column: a plan that varies scenario has" if column == "recovery_s" else "no such column"
+        why = (
+            "the table has no such column: a plan that varies scenario has"
+            if column == "recovery_s"
+            else "no such column"
+        )
         raise _TooFew(f"{column}: {why}", 0)
     seen = np.isfinite(numbers[known])
     if not seen.any():
@@ -308,7 +379,9 @@ def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> _Fi
 
 
 def _sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[float, float]:
-    low, high = (variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence))
+    low, high = (
+        variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence)
+    )
     return math.sqrt(low), math.sqrt(high)
 
 
@@ -334,7 +407,11 @@ def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Ge
     if not some.any():
         raise _TooFew("no case has two right answers", 0)
     square, freedom = (scatter[some] ** 2).mean(axis=1), answers[some] - 1
-    variance, n, method = float(square @ freedom / freedom.sum()), int(some.sum()), "chi-square, Gaussian"
+    variance, n, method = (
+        float(square @ freedom / freedom.sum()),
+        int(some.sum()),
+        "chi-square, Gaussian",
+    )
     factor = 1.0 if require.share is None else float(stats.norm.ppf((1 + require.share) / 2))
     excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
     # 14: the variance of that square, one degree of freedom a case
@@ -346,7 +423,9 @@ def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Ge
     return _Figure(factor * math.sqrt(variance), factor * low, factor * high, n, method)
 
 
-def _drawn(sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float) -> FloatArray:
+def _drawn(
+    sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
+) -> FloatArray:
     """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
     blocks = min(MAX_BLOCKS, len(sums))
     block = np.arange(len(sums)) * blocks // len(sums)
@@ -357,7 +436,11 @@ def _drawn(sums: FloatArray, weights: FloatArray, rng: np.random.Generator, conf
 
 
 def _repeating(
-    part: Component, noise_variance: FloatArray, axes: list[int], require: Require, rng: np.random.Generator
+    part: Component,
+    noise_variance: FloatArray,
+    axes: list[int],
+    require: Require,
+    rng: np.random.Generator,
 ) -> _Figure:
     n, c = len(part.fitted), require.confidence
     noise, variance = float(noise_variance[axes].mean()), float(part.variance[axes].mean())
@@ -379,4 +462,6 @@ def _repeating(
         factor = float(np.quantile(size, require.share)) / math.sqrt(float((size**2).mean()))
     elif require.share is not None:
         factor = float(stats.norm.ppf((1 + require.share) / 2))
-    return _Figure(factor * math.sqrt(variance), factor * math.sqrt(low), factor * math.sqrt(high), n, method)
+    return _Figure(
+        factor * math.sqrt(variance), factor * math.sqrt(low), factor * math.sqrt(high), n, method
+    )

@@ -8,13 +8,30 @@ from typing import Any
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, GREEN, INK, MUTED, ORANGE, RED, panels_of, png, svg, write_csv
+from hilstar.basics.charts import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    RED,
+    panels_of,
+    png,
+    svg,
+    write_csv,
+)
 from hilstar.basics.files import write_whole
 from hilstar.basics.html_pages import Markup, escaped, page_of, picture_of, table_of
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.plan import CONDITION, Plan
-from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN, RequirementVerdict, verdicts_of
+from hilstar.instruments.campaign.requirements import (
+    MET,
+    NOT_MET,
+    NOT_SHOWN,
+    RequirementVerdict,
+    verdicts_of,
+)
 from hilstar.instruments.campaign.results import VARY, Columns, read_cases
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.bench_file import BenchFile
@@ -31,7 +48,9 @@ SIGN = ("Name", "Role", "Date", "Signature")
 SIGN_STYLE = "display:inline-block;width:45%;border-bottom:1px solid;margin:2.2em 4% 0 0"
 
 
-def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> list[RequirementVerdict]:
+def write_requirements(
+    plan: Plan, path: Path, table: Path, file: BenchFile
+) -> list[RequirementVerdict]:
     """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises
     InputError.
     """
@@ -40,17 +59,27 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
     certificate = bench_certificate(file) if plan.through == "bench" else None
     own = None if certificate is None else certificate.attitude_arcsec
     found = verdicts_of(plan.require, cases, scale, plan.seed, own)
-    write_csv(table.with_name("requirements.csv"), COLUMNS, [[summary_of(each)[name] for name in COLUMNS] for each in found])
+    write_csv(
+        table.with_name("requirements.csv"),
+        COLUMNS,
+        [[summary_of(each)[name] for name in COLUMNS] for each in found],
+    )
     figure = _chart(cases, found)
     write_whole(table.with_name("requirements.png"), png(figure))
     about = [
         ("plan", str(path)),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
-        ("cases", f"{cases.cases} through {plan.through}, in {table.name}, sha256 {file_sha256(table)}"),
+        (
+            "cases",
+            f"{cases.cases} through {plan.through}, in {table.name}, sha256 {file_sha256(table)}",
+        ),
         ("program", f"hilstar {__version__}"),
         *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
-    counts = [(verdict, sum(each.verdict == verdict for each in found)) for verdict in (MET, NOT_MET, NOT_SHOWN)]
+    counts = [
+        (verdict, sum(each.verdict == verdict for each in found))
+        for verdict in (MET, NOT_MET, NOT_SHOWN)
+    ]
     each_count = ", ".join(f"{count} {verdict}" for verdict, count in counts if count)
     page = [
         f"<p>{_badge(verdict_of(found))} {escaped(f'Of {len(found)} requirements {each_count}.')}</p>",
@@ -59,9 +88,17 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
         table_of(
             [
                 (
-                    *(each.require.words, f"{100 * each.require.confidence:g} %", each.value, each.bound, each.cases),
+                    *(
+                        each.require.words,
+                        f"{100 * each.require.confidence:g} %",
+                        each.value,
+                        each.bound,
+                        each.cases,
+                    ),
                     Markup(_badge(each.verdict)),
-                    f"about {each.more} more cases" if each.verdict == NOT_SHOWN and each.more else "",
+                    f"about {each.more} more cases"
+                    if each.verdict == NOT_SHOWN and each.more
+                    else "",
                     each.method,
                 )
                 for each in found
@@ -72,7 +109,11 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
         " the bound on the limit's other side breaks it. Not shown: the cases decide neither. Quantities are those of"
         " ECSS-E-ST-60-20C; errors are one sigma an axis, arcsec, camera axes; times in seconds.</p>",
         "<h2>Error against rate</h2>",
-        picture_of(svg(figure).encode(), "svg+xml", "error across the boresight against rate, with the requirements"),
+        picture_of(
+            svg(figure).encode(),
+            "svg+xml",
+            "error across the boresight against rate, with the requirements",
+        ),
         "<h2>Signed</h2>",
         "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN),
     ]
@@ -116,7 +157,11 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
     rated = bool(np.isfinite(rate).any() and np.ptp(rate[np.isfinite(rate)]) > 0)
     at = rate if rated else cases.numbers["case"]
     known = np.flatnonzero(np.isfinite(error) & np.isfinite(at))
-    drawn = [each for each in found if each.require.quantity in DRAWN and (each.require.axis or "cross") in ("cross", "x", "y")]
+    drawn = [
+        each
+        for each in found
+        if each.require.quantity in DRAWN and (each.require.axis or "cross") in ("cross", "x", "y")
+    ]
     counts = f"{sum(each.verdict == MET for each in found)} of {len(found)} requirements are met"
     note = "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a requirement allows."
     with panels_of(counts, 1, note=note) as (axes,):
@@ -132,13 +177,26 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
             if rated and positive.all() and at[known].max() > 30 * at[known].min():
                 axes.set_xscale("log")
             low, high = float(at[known].min()), float(at[known].max())
-            top = 1.15 * max(float(np.quantile(error[known], 0.97)), *sigma, *(each.require.limit for each in drawn))
+            top = 1.15 * max(
+                float(np.quantile(error[known], 0.97)),
+                *sigma,
+                *(each.require.limit for each in drawn),
+            )
             axes.set_ylim(0, top)
             for each in drawn:
                 begin, end = _span(each.require.condition, low, high) if rated else (low, high)
-                axes.plot([begin, end], [each.require.limit] * 2, color=COLOURS[each.verdict], lw=2.2)
+                axes.plot(
+                    [begin, end], [each.require.limit] * 2, color=COLOURS[each.verdict], lw=2.2
+                )
                 words = f"{each.require.quantity} {each.verdict}"
-                axes.annotate(words, (begin, each.require.limit), (2, 3), textcoords="offset points", fontsize=9, color=INK)
+                axes.annotate(
+                    words,
+                    (begin, each.require.limit),
+                    (2, 3),
+                    textcoords="offset points",
+                    fontsize=9,
+                    color=INK,
+                )
         axes.set_xlabel("rate [deg/s]" if rated else "case")
         axes.set_ylabel("error across [arcsec]")
     return axes.figure

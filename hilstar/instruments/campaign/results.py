@@ -73,7 +73,8 @@ class Columns:
         """The chosen (n,) cases alone."""
         numbers = {name: column[chosen] for name, column in self.numbers.items()}
         texts = {
-            name: [text for text, is_one in zip(column, chosen, strict=True) if is_one] for name, column in self.texts.items()
+            name: [text for text, is_one in zip(column, chosen, strict=True) if is_one]
+            for name, column in self.texts.items()
         }
         return Columns(self.cases, numbers, texts)
 
@@ -100,20 +101,32 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
                 if pa.types.is_string(column.type):
                     texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
                 else:
-                    values = np.array([np.nan if v is None else float(v) for v in column.to_pylist()])
+                    values = np.array(
+                        [np.nan if v is None else float(v) for v in column.to_pylist()]
+                    )
                     numbers.setdefault(name, []).append(values)
-        return Columns(file.metadata.num_rows, {name: np.concatenate(parts) for name, parts in numbers.items()}, texts)
+        return Columns(
+            file.metadata.num_rows,
+            {name: np.concatenate(parts) for name, parts in numbers.items()},
+            texts,
+        )
     except (OSError, pa.ArrowException, ValueError) as error:
-        raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
+        raise InputError(
+            f"{path}: is no table of a campaign ({error}); delete it, and run the same command again"
+        ) from error
 
 
-def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tuple[dict[str, Any], Decomposed | None]:
+def case_budget(
+    cases: Columns, file: BenchFile, rng: np.random.Generator
+) -> tuple[dict[str, Any], Decomposed | None]:
     """The budget of a campaign's cases by the keys of --json, and its parts, as `hilstar assess`
     has them.
 
     A figure that too few answers determine is None, and a note says why.
     """
-    asked, solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong"))
+    asked, solved, wrong = (
+        float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong")
+    )
     tracker = file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
     commanded, reported = attitudes_of(cases)
@@ -129,7 +142,10 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
     scatter = scatter[np.isfinite(scatter).all(axis=1)]
     return {
         "bias_arcsec": None if parts is None else parts.bias_arcsec.tolist(),
-        **{f"{name}_arcsec": None if parts is None else getattr(parts, f"{name}_arcsec") for name in PARTS},
+        **{
+            f"{name}_arcsec": None if parts is None else getattr(parts, f"{name}_arcsec")
+            for name in PARTS
+        },
         "scatter_arcsec": axes_of_variance((scatter**2).mean(axis=0)) if len(scatter) else None,
         "availability": (solved - wrong) / asked if asked else 0.0,
         "wrong": int(wrong),
@@ -185,12 +201,20 @@ def _centroids(cases: Columns) -> dict[str, float] | None:
 
     off_px = {axis: numbers[f"centroid_d{axis}_px"] for axis in "xy"}
     bias_px = {axis: mean(off) for axis, off in off_px.items()}
-    square_px2 = {axis: mean(numbers[f"centroid_sigma_{axis}_px"] ** 2 + off**2) for axis, off in off_px.items()}
+    square_px2 = {
+        axis: mean(numbers[f"centroid_sigma_{axis}_px"] ** 2 + off**2)
+        for axis, off in off_px.items()
+    }
     return {
         **{f"bias_{axis}_px": bias for axis, bias in bias_px.items()},
-        **{f"sigma_{axis}_px": math.sqrt(max(0.0, square_px2[axis] - bias**2)) for axis, bias in bias_px.items()},
+        **{
+            f"sigma_{axis}_px": math.sqrt(max(0.0, square_px2[axis] - bias**2))
+            for axis, bias in bias_px.items()
+        },
         "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
-        "false_a_frame": float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
+        "false_a_frame": float(
+            np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)
+        ),
     }
 
 
@@ -239,9 +263,14 @@ def measures(cases: Columns) -> list[Measure]:
     numbers = cases.numbers
     errors = (numbers[f"error_{axis}_arcsec"] for axis in "xyz")
     x, y, z = (each - np.nanmedian(each) if np.isfinite(each).any() else each for each in errors)
-    found = [Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)), Measure("roll", "arcsec", np.abs(z))]
+    found = [
+        Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)),
+        Measure("roll", "arcsec", np.abs(z)),
+    ]
     if "centroid_sigma_x_px" in numbers:
-        dx, dy, sx, sy = (numbers[f"centroid_{name}_px"] for name in ("dx", "dy", "sigma_x", "sigma_y"))
+        dx, dy, sx, sy = (
+            numbers[f"centroid_{name}_px"] for name in ("dx", "dy", "sigma_x", "sigma_y")
+        )
         found.append(Measure("centroid", "px", np.sqrt((dx**2 + dy**2 + sx**2 + sy**2) / 2)))
     right = np.nan_to_num(numbers["solved"]) - np.nan_to_num(numbers["wrong"])
     frames = np.maximum(np.nan_to_num(numbers["frames"], nan=1.0), 1.0)
@@ -274,9 +303,12 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
         level=levels,
         error=errors,
         overall=_level(y, measure.mean)[0],
-        cost=float(levels.mean() - levels[best]) if measure.mean else math.sqrt(float((levels**2).mean() - levels[best] ** 2)),
+        cost=float(levels.mean() - levels[best])
+        if measure.mean
+        else math.sqrt(float((levels**2).mean() - levels[best] ** 2)),
         share=_share(y, index, len(places)),
-        sure=float(levels[worst] - levels[best]) > SURE * math.hypot(float(errors[best]), float(errors[worst])),
+        sure=float(levels[worst] - levels[best])
+        > SURE * math.hypot(float(errors[best]), float(errors[worst])),
     )
 
 
@@ -295,12 +327,16 @@ def _share(values: FloatArray, index: IntArray, bins: int) -> float:
     rank = rankdata(values)
     count = np.bincount(index, minlength=bins)
     mean = np.bincount(index, rank, minlength=bins) / count
-    within = np.bincount(index, (rank - mean[index]) ** 2, minlength=bins) / np.maximum(count - 1, 1)
+    within = np.bincount(index, (rank - mean[index]) ** 2, minlength=bins) / np.maximum(
+        count - 1, 1
+    )
     between = float((count * (mean - rank.mean()) ** 2).sum() - within.sum()) / len(rank)
     return max(0.0, between) / max(float(rank.var()), 1e-300)
 
 
-def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple[float | str, ...], IntArray]:
+def _bins(
+    name: str, cases: Columns, good: npt.NDArray[np.bool_]
+) -> tuple[tuple[float | str, ...], IntArray]:
     """The places of a parameter's bins, and the bin of each good case; none where one of them has
     too few cases.
 
@@ -348,7 +384,9 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
                 where = [float(place) for place in cost.places]
             else:
                 axis.set_xticks(where, [str(place) for place in cost.places])
-            axis.errorbar(where, cost.level, yerr=cost.error, fmt="o-", capsize=3, color=INK, ecolor=MUTED)
+            axis.errorbar(
+                where, cost.level, yerr=cost.error, fmt="o-", capsize=3, color=INK, ecolor=MUTED
+            )
             axis.axhline(cost.overall, linewidth=0.8, linestyle="--", color=MUTED)
             axis.set_ylim(0, top)
             if len(where) > 2 and min(where) > 0 and max(where) / min(where) > 30:
@@ -369,11 +407,36 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     budget, parts = case_budget(cases, file, np.random.default_rng(seed))
     write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_rows(budget, parts))
     found = costs(cases)
-    names = ("measure", "unit", "parameter", "overall", "cost", "share", "sure", "best", "at_best", "worst", "at_worst")
+    names = (
+        "measure",
+        "unit",
+        "parameter",
+        "overall",
+        "cost",
+        "share",
+        "sure",
+        "best",
+        "at_best",
+        "worst",
+        "at_worst",
+    )
     rows = [
         (
-            *(each.measure, each.unit, each.parameter, each.overall, each.cost, each.share, str(each.sure).lower()),
-            *(each.places[each.best], float(each.level[each.best]), each.places[each.worst], float(each.level[each.worst])),
+            *(
+                each.measure,
+                each.unit,
+                each.parameter,
+                each.overall,
+                each.cost,
+                each.share,
+                str(each.sure).lower(),
+            ),
+            *(
+                each.places[each.best],
+                float(each.level[each.best]),
+                each.places[each.worst],
+                float(each.level[each.worst]),
+            ),
         )
         for each in found
     ]
@@ -398,14 +461,24 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
 def lines_of(summary: dict[str, Any]) -> list[str]:
     """The summary's lines on the terminal."""
     lines = [f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}"]
-    lines += [f"{count} failed: {line}" for line, count in list(summary["failed_because"].items())[:MAX_REASONS]]
-    lines.append(f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong answers")
+    lines += [
+        f"{count} failed: {line}"
+        for line, count in list(summary["failed_because"].items())[:MAX_REASONS]
+    ]
+    lines.append(
+        f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong answers"
+    )
     if summary["bias_arcsec"] is not None:
-        lines.append(f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec about x, y, z")
+        lines.append(
+            f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec about x, y, z"
+        )
         for part, name in (*PARTS.items(), ("scatter", SCATTER)):
             axes: Axes | None = summary[f"{part}_arcsec"]
             if axes is not None:
-                values = ("-" if value is None else f"{value:.3g} arcsec {axis}" for axis, value in asdict(axes).items())
+                values = (
+                    "-" if value is None else f"{value:.3g} arcsec {axis}"
+                    for axis, value in asdict(axes).items()
+                )
                 lines.append(f"{name:20}{', '.join(values)}")
     found = summary["centroids"]
     if found is not None:

@@ -23,7 +23,14 @@ from hilstar.instruments.campaign.plan import (
 )
 from hilstar.instruments.campaign.pool import MAX_DEATHS, Backlog, Pool, Task
 from hilstar.instruments.campaign.session import Identity, Job, Session, files_sha256, identity_of
-from hilstar.instruments.campaign.store import About, Directory, Row, require_parquet, schema_of, write_table
+from hilstar.instruments.campaign.store import (
+    About,
+    Directory,
+    Row,
+    require_parquet,
+    schema_of,
+    write_table,
+)
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 
 if TYPE_CHECKING:
@@ -36,7 +43,9 @@ class Campaign:
     MachineError.
     """
 
-    def __init__(self, path: Path, directory: Path, solver: str, timeout_s: float, images: bool) -> None:
+    def __init__(
+        self, path: Path, directory: Path, solver: str, timeout_s: float, images: bool
+    ) -> None:
         require_parquet()
         text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
         self.path, self.directory = path, directory
@@ -60,7 +69,10 @@ class Campaign:
         self.maker: CaseMaker
         try:  # errors of plan, bench and solver are reported once, here
             if self.on_bench:
-                self.identity, self.maker = identity_of("the bench"), CaseMaker(self.plan, self.file, path.parent)
+                self.identity, self.maker = (
+                    identity_of("the bench"),
+                    CaseMaker(self.plan, self.file, path.parent),
+                )
                 self.columns = bench_columns(self.maker.parameters)
             else:
                 session = Session(self.job)
@@ -70,7 +82,9 @@ class Campaign:
                     session.close()
                 self.columns = columns(self.maker.parameters, "stars" in session.columns)
         except InputError as error:
-            raise InputError(f"{path}: {error}" if "[[vary]]" in str(error) else str(error)) from error
+            raise InputError(
+                f"{path}: {error}" if "[[vary]]" in str(error) else str(error)
+            ) from error
         if self.on_bench and self.file.config.answers is None:
             raise InputError(
                 f'{path}: through = "bench" needs the tracker\'s answers; write [answers] with source = "serial" or the like in'
@@ -81,8 +95,12 @@ class Campaign:
         levels = grid_levels(self.plan)
         self.cases = self.plan.cases or math.prod(levels)
         if self.on_bench and self.cases > MAX_BENCH_CASES:
-            raise InputError(f'{path}: cases = {self.cases}: through = "bench" takes at most {MAX_BENCH_CASES}')
-        self.design = Design(self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels)
+            raise InputError(
+                f'{path}: cases = {self.cases}: through = "bench" takes at most {MAX_BENCH_CASES}'
+            )
+        self.design = Design(
+            self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels
+        )
 
     def about(self) -> About:
         """Everything that the rows depend on."""
@@ -91,9 +109,18 @@ class Campaign:
             del plan[key]
         del plan["require"]  # judged afterwards: another limit is no other campaign
         identity = msgspec.to_builtins(self.identity)
-        return About(plan, self.file.sha256, self.job.files_sha256, self.job.solver, self.job.images, identity)
+        return About(
+            plan,
+            self.file.sha256,
+            self.job.files_sha256,
+            self.job.solver,
+            self.job.images,
+            identity,
+        )
 
-    def run(self, directory: Directory, workers: "Pool | Cluster", on_done: Callable[[int], None]) -> None:
+    def run(
+        self, directory: Directory, workers: "Pool | Cluster", on_done: Callable[[int], None]
+    ) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the
         number of finished cases.
 
@@ -116,19 +143,34 @@ class Campaign:
                     keep([failed(row, f"its worker died {MAX_DEATHS} times over it")])
 
             if done < self.cases:
-                workers.run(Backlog(self.design, journal, workers.task_s), lambda task, answered: keep(answered.rows), lost)
+                workers.run(
+                    Backlog(self.design, journal, workers.task_s),
+                    lambda task, answered: keep(answered.rows),
+                    lost,
+                )
             self._write(directory, (journal.rows(block) for block in range(journal.blocks)))
             journal.remove()
         finally:
             journal.close()
 
-    def show(self, directory: Directory, display: "Display", notices: Notices, on_done: Callable[[int], None]) -> bool:
+    def show(
+        self,
+        directory: Directory,
+        display: "Display",
+        notices: Notices,
+        on_done: Callable[[int], None],
+    ) -> bool:
         """Show the missing cases on the bench, and write the tables once none is missing; False
         where a signal ended the run.
 
         Raises as `run` does. The same call goes on from there.
         """
-        from hilstar.instruments.campaign.bench_run import CHECKS, BenchOrder, BenchRun, write_checks
+        from hilstar.instruments.campaign.bench_run import (
+            CHECKS,
+            BenchOrder,
+            BenchRun,
+            write_checks,
+        )
         from hilstar.server.answers.judge import AnswerRules
         from hilstar.server.answers.reader import open_answers
 
@@ -137,7 +179,15 @@ class Campaign:
         order = BenchOrder(self.plan, self.cases, self.maker, self.design)
         with open_answers(config, self.file.folder, notices) as source:
             source.await_ready()
-            run = BenchRun(order, self.columns, directory, source=source, rules=rules, notices=notices, on_done=on_done)
+            run = BenchRun(
+                order,
+                self.columns,
+                directory,
+                source=source,
+                rules=rules,
+                notices=notices,
+                on_done=on_done,
+            )
             try:
                 if not run.run(display):
                     return False
@@ -159,7 +209,9 @@ class Campaign:
 
     def _write(self, directory: Directory, blocks: Iterator[list[Row]]) -> None:
         about = {
-            f"hilstar.{name}": value if isinstance(value, str) else msgspec.json.encode(value).decode()
+            f"hilstar.{name}": value
+            if isinstance(value, str)
+            else msgspec.json.encode(value).decode()
             for name, value in msgspec.to_builtins(self.about()).items()
         }
         write_table(directory.table, schema_of(self.columns, about), blocks)

@@ -22,7 +22,15 @@ from hilstar.basics.errors import HilstarError, InputError, MachineError, one_li
 from hilstar.basics.files import make_directory
 from hilstar.basics.reading import CHUNK_BYTES, open_regular
 from hilstar.basics.resources import resource_path
-from hilstar.instruments.campaign.cases import Case, CaseMaker, CaseTally, Kind, columns, failed, first_row
+from hilstar.instruments.campaign.cases import (
+    Case,
+    CaseMaker,
+    CaseTally,
+    Kind,
+    columns,
+    failed,
+    first_row,
+)
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.campaign.plan import SCENARIO, TRACKER_PSF, Plan, parse_plan
 from hilstar.instruments.campaign.solvers import CENTROIDS, SolverFault, choose_solver
@@ -64,7 +72,9 @@ def code_sha256() -> str:
     for root, pattern in ((package, "*.py"), (shaders, "*")):
         for path in sorted(root.rglob(pattern)):
             if path.is_file():
-                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+                digest.update(
+                    path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes()
+                )
     return digest.hexdigest()
 
 
@@ -78,7 +88,9 @@ def difference(found: Identity, wanted: Identity) -> str | None:
 
 def identity_of(gl_renderer: str) -> Identity:
     """The identity of this process with a renderer."""
-    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
+    return Identity(
+        hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer
+    )
 
 
 class Job(msgspec.Struct, frozen=True):
@@ -133,7 +145,11 @@ class Session:
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
         self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
         self._solver = choose_solver(
-            job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s, Path(job.plan_path).parent
+            job.solver,
+            self.plan.centroids,
+            Path(job.solver_folder),
+            job.timeout_s,
+            Path(job.plan_path).parent,
         )
         self._tracker: Imaging | None = None
         self._at(self.maker.file)
@@ -160,7 +176,13 @@ class Session:
             raise
         except HilstarError as error:
             return failed(row, one_line(str(error)))
-        except (ArithmeticError, ValueError, LookupError, MemoryError, np.linalg.LinAlgError) as error:
+        except (
+            ArithmeticError,
+            ValueError,
+            LookupError,
+            MemoryError,
+            np.linalg.LinAlgError,
+        ) as error:
             self._tracker = None
             return failed(row, one_line(f"{type(error).__name__}: {error}"))
 
@@ -188,7 +210,11 @@ class Session:
                 write_exposure_fits(path, tracker, exposure, noise)
             tally.see(exposure)
             try:
-                tally.hear(exposure, self._solver.solve(exposure, tracker), frame * self.plan.step_s + exposure_s)
+                tally.hear(
+                    exposure,
+                    self._solver.solve(exposure, tracker),
+                    frame * self.plan.step_s + exposure_s,
+                )
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)
@@ -219,7 +245,13 @@ def files_sha256(plan: Plan, folder: Path) -> str:
     Raises InputError.
     """
     digest = hashlib.sha256()
-    varied = [str(name) for each in plan.vary if each.key == SCENARIO for name in each.values or () if name]
+    varied = [
+        str(name)
+        for each in plan.vary
+        if each.key == SCENARIO
+        for name in each.values or ()
+        if name
+    ]
     told = [] if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN) else [plan.centroids.psf]
     for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied, *told]:
         with open_regular(folder / name, "give the path of a file") as file:

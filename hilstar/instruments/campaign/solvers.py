@@ -106,7 +106,9 @@ def checked_attitude(numbers: object, who: str) -> FloatArray:
     except (TypeError, ValueError):
         q = np.zeros(0)
     if q.shape != (4,) or not np.isfinite(q).all():
-        raise SolverFault(f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted")
+        raise SolverFault(
+            f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted"
+        )
     norm = float(np.linalg.norm(q))
     if abs(norm - 1) > MAX_NORM_ERROR:
         raise SolverFault(f"{who}: answered a quaternion of norm {norm:.6g}; a unit one is wanted")
@@ -128,7 +130,9 @@ class CentroidSolver:
         """Centroid errors, and the attitude by the matched stars."""
         wanted, psf, detector = self._wanted, tracker.canvas.psf, tracker.config.tracker.detector
         if wanted.centroider == "psf" and detector.bayer is not None:
-            raise InputError('[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out, or bayer')
+            raise InputError(
+                '[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out, or bayer'
+            )
         width_px = software_psf_px(psf.width_px, detector)
         settings = CentroidSettings(
             threshold_sigma=wanted.threshold_sigma,
@@ -137,10 +141,17 @@ class CentroidSolver:
             window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
             psf_sigma_px=width_px if wanted.remove_s_curve else None,
         )
-        image, truth, (height, width) = software_image(exposure.dn, detector), exposure.truth, exposure.dn.shape
+        image, truth, (height, width) = (
+            software_image(exposure.dn, detector),
+            exposure.truth,
+            exposure.dn.shape,
+        )
         found = find_stars(image, settings)
         with np.errstate(invalid="ignore"):
-            off_x, off_y = (np.abs(truth[name] - (side - 1) / 2) for name, side in (("x_px", width), ("y_px", height)))
+            off_x, off_y = (
+                np.abs(truth[name] - (side - 1) / 2)
+                for name, side in (("x_px", width), ("y_px", height))
+            )
             truth = truth[(off_x <= width / 2) & (off_y <= height / 2) & truth["drawn"]]
         # The truth is in order of light: of stars with one find, the brightest has it.
         index = nearest(found, truth["x_px"], truth["y_px"])
@@ -153,19 +164,27 @@ class CentroidSolver:
         x_px, y_px, matched = truth["x_px"][good], truth["y_px"][good], int(is_matched.sum())
         dx_px, dy_px = found.x_px[index[good]] - x_px, found.y_px[index[good]] - y_px
         if wanted.centroider == "psf":
-            places = self._fitted(exposure, tracker, truth[good], (found.x_px[index[good]], found.y_px[index[good]]))
+            places = self._fitted(
+                exposure, tracker, truth[good], (found.x_px[index[good]], found.y_px[index[good]])
+            )
             dx_px, dy_px = places[0] - x_px, places[1] - y_px
         counts = len(truth), len(found), matched, len(found) - matched
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good], truth[good])
         if len(x_px) < MIN_STARS:
-            return SolverAnswer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
+            return SolverAnswer(
+                None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors
+            )
         true = normalise(tracker.camera.rays(x_px, y_px))
         known = flight_camera(tracker.config.tracker, tracker.file.folder, tracker.camera)
         seen = normalise(known.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
-        return SolverAnswer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
+        return SolverAnswer(
+            multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors
+        )
 
-    def _fitted(self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places) -> Places:
+    def _fitted(
+        self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places
+    ) -> Places:
         """Places (n,) of stars by the PSF that is told, from where a window found them; their
         spectra are known.
         """
@@ -174,7 +193,9 @@ class CentroidSolver:
         reach = psf.footprint_px // 2 + 1
         padded = np.pad(exposure.dn - estimate_background(exposure.dn).level, 2 * reach)
         near = np.arange(reach, 3 * reach + 1)
-        stamps = padded[(pixels[0][:, None] + near)[:, :, None], (pixels[1][:, None] + near)[:, None, :]]
+        stamps = padded[
+            (pixels[0][:, None] + near)[:, :, None], (pixels[1][:, None] + near)[:, None, :]
+        ]
         shares = None
         if glass is not None and self._wanted.psf_spectrum == "star":
             shares = glass.shares_of(tracker.stars, truth["hip"])
@@ -190,8 +211,14 @@ class CentroidSolver:
             return GaussianPsf(psf.width_px), None
         if self._told is None or self._told[0] != tracker.file.sha256:
             optics = TrackerOptics(psf=str(self._folder / wanted.psf), focus_um=wanted.psf_focus_um)
-            told = tracker_psf(msgspec.structs.replace(tracker.config.tracker, optics=optics), tracker.file.folder)
-            glass = StarGlass(tracker.file, told) if isinstance(told, GlassPsf) and isinstance(tracker, Simulator) else None
+            told = tracker_psf(
+                msgspec.structs.replace(tracker.config.tracker, optics=optics), tracker.file.folder
+            )
+            glass = (
+                StarGlass(tracker.file, told)
+                if isinstance(told, GlassPsf) and isinstance(tracker, Simulator)
+                else None
+            )
             self._told = tracker.file.sha256, told, glass
         return self._told[1:]
 
@@ -222,7 +249,9 @@ class FunctionSolver:
         except TimeoutError as error:
             raise SolverFault(f"the solver took longer than {self._timeout_s:g} s") from error
         except Exception as error:
-            raise SolverFault(one_line(f"the solver raised {type(error).__name__}: {error}")) from error
+            raise SolverFault(
+                one_line(f"the solver raised {type(error).__name__}: {error}")
+            ) from error
         if answer is None:
             return SolverAnswer(None, "the solver found no attitude")
         return SolverAnswer(checked_attitude(answer, "the solver"))
@@ -232,7 +261,9 @@ def given_image(exposure: Exposure, tracker: SolvedTracker) -> npt.NDArray[np.ui
     """The DN (height, width) that a solver gets, its own: of a mosaic as `[tracker.detector]
     solver_image` says.
     """
-    return np.asarray(np.rint(software_image(exposure.dn, tracker.config.tracker.detector)), dtype=np.uint16)
+    return np.asarray(
+        np.rint(software_image(exposure.dn, tracker.config.tracker.detector)), dtype=np.uint16
+    )
 
 
 def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
@@ -286,7 +317,9 @@ class CommandSolver:
         try:
             self._words = shlex.split(template)
         except ValueError as error:
-            raise InputError(f"--solver {template}: {error}; write a command with {IMAGE}, or {PICTURE}, in it") from error
+            raise InputError(
+                f"--solver {template}: {error}; write a command with {IMAGE}, or {PICTURE}, in it"
+            ) from error
         if not any(IMAGE in word or PICTURE in word for word in self._words):
             raise InputError(
                 f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids,"
@@ -321,21 +354,32 @@ class CommandSolver:
             try:
                 child = Child(words, self._folder)
             except OSError as error:
-                raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
+                raise SolverFault(
+                    f"the solver cannot be started: {words[0]} ({error.strerror})"
+                ) from error
             with child:
                 code = child.wait(self._timeout_s)
                 if child.too_much:
                     most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
-                    raise SolverFault(f"the solver printed more than {most} and was ended; let it print the quaternion alone")
+                    raise SolverFault(
+                        f"the solver printed more than {most} and was ended; let it print the quaternion alone"
+                    )
                 if code is None:
                     raise SolverFault(f"the solver took longer than {self._timeout_s:g} s")
         if code:
             said = child.err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
-            line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(str(folder), "")
+            line = (
+                said[0]
+                .replace(str(image), IMAGE)
+                .replace(str(picture), PICTURE)
+                .replace(str(folder), "")
+            )
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
         q = printed_attitude(child.out)
         return (
-            SolverAnswer(None, "the solver found no attitude") if q is None else SolverAnswer(checked_attitude(q, "the solver"))
+            SolverAnswer(None, "the solver found no attitude")
+            if q is None
+            else SolverAnswer(checked_attitude(q, "the solver"))
         )
 
 
@@ -358,7 +402,9 @@ def printed_attitude(text: str) -> object | None:
     return None
 
 
-def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float, plan_folder: Path = Path()) -> Solver:
+def choose_solver(
+    text: str, settings: Centroiding, folder: Path, timeout_s: float, plan_folder: Path = Path()
+) -> Solver:
     """The solver that `text` names, with relative names in `folder`, those of the plan in
     `plan_folder`.
 

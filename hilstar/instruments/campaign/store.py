@@ -56,7 +56,9 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> "pa.Schem
     import pyarrow as pa
 
     kinds = {"int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()}
-    return pa.schema([pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about))
+    return pa.schema(
+        [pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about)
+    )
 
 
 def write_table(path: Path, schema: "pa.Schema", blocks: Iterator[list[Row]]) -> None:
@@ -67,14 +69,22 @@ def write_table(path: Path, schema: "pa.Schema", blocks: Iterator[list[Row]]) ->
     import pyarrow.parquet as pq
 
     with whole_file(path) as file:
-        settings: Any = {"compression": COMPRESSION, "compression_level": COMPRESSION_LEVEL, "version": "2.6"}
+        settings: Any = {
+            "compression": COMPRESSION,
+            "compression_level": COMPRESSION_LEVEL,
+            "version": "2.6",
+        }
         with pq.ParquetWriter(file, schema, **settings) as writer:
             for rows in blocks:
                 columns = {field.name: [row[field.name] for row in rows] for field in schema}
                 for field in schema:
                     if field.type == pa.float64():  # JSON writes a whole number without its point
-                        columns[field.name] = [None if value is None else float(value) for value in columns[field.name]]
-                writer.write_table(pa.Table.from_pydict(columns, schema=schema), row_group_size=max(1, len(rows)))
+                        columns[field.name] = [
+                            None if value is None else float(value) for value in columns[field.name]
+                        ]
+                writer.write_table(
+                    pa.Table.from_pydict(columns, schema=schema), row_group_size=max(1, len(rows))
+                )
 
 
 def failures(path: Path) -> dict[str, int]:
@@ -91,7 +101,9 @@ def failures(path: Path) -> dict[str, int]:
                 if row["status"] == "failed":
                     because[row["why"]] = because.get(row["why"], 0) + 1
     except (OSError, pa.ArrowException, KeyError) as error:
-        raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
+        raise InputError(
+            f"{path}: is no table of a campaign ({error}); delete it, and run the same command again"
+        ) from error
     return because
 
 
@@ -125,7 +137,9 @@ class Journal:
     @property
     def done(self) -> int:
         """How many cases have their row."""
-        return sum(len(self._block(block)) for block in self._full) + sum(len(done) for done in self._done.values())
+        return sum(len(self._block(block)) for block in self._full) + sum(
+            len(done) for done in self._done.values()
+        )
 
     def missing(self, block: int) -> list[int]:
         """The cases of a block that have no row yet, in order."""
@@ -184,12 +198,18 @@ class Journal:
         path = self._path(block, OPEN)
         try:
             if block not in self._files:
-                self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+                self._files[block] = os.open(
+                    path,
+                    os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC,
+                    0o666,
+                )
             # a full disk may take a part: that is a cut line, dropped at the next start
             while line:
                 line = line[os.write(self._files[block], line) :]
         except OSError as error:
-            raise cannot_write(path, error, "make room, and run the same command again: it goes on") from error
+            raise cannot_write(
+                path, error, "make room, and run the same command again: it goes on"
+            ) from error
 
     def _close_block(self, block: int) -> None:
         os.fsync(self._files[block])
@@ -205,7 +225,9 @@ class Journal:
         if not whole:
             write_whole(path, b"".join(_line(row) for row in found.values()))
         if len(found) == len(self._block(block)):  # killed between the last row and the new name
-            self._files[block] = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
+            self._files[block] = os.open(
+                path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+            )
             self._done[block] = set(found)
             self._close_block(block)
             return []
@@ -216,13 +238,19 @@ class Journal:
         try:
             data = path.read_bytes()
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); run the same command again") from error
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror}); run the same command again"
+            ) from error
         found: dict[int, Row] = {}
         lines = data.split(b"\n")
         whole = lines.pop() == b""
         for line in lines:
             row = _row(line)
-            if row is None or row["case"] in found or row["case"] not in self._block(int(path.name[:6])):
+            if (
+                row is None
+                or row["case"] in found
+                or row["case"] not in self._block(int(path.name[:6]))
+            ):
                 whole = False
             else:
                 found[row["case"]] = row
@@ -278,7 +306,9 @@ class Directory:
         if not place.exists():
             for name in (TABLE, JOURNAL):
                 if (self.path / name).exists():
-                    raise InputError(f"{self.path / name}: is there already, and no {ABOUT} says whose it is; {ANOTHER}")
+                    raise InputError(
+                        f"{self.path / name}: is there already, and no {ABOUT} says whose it is; {ANOTHER}"
+                    )
             write_whole(place, msgspec.json.format(msgspec.json.encode(about), indent=1))
             return
         try:
@@ -289,7 +319,9 @@ class Directory:
         if self.table.exists():  # its rows are not run again, so this machine may differ
             now = msgspec.structs.replace(now, identity=before.identity)
         if before != now:
-            raise InputError(f"{self.path}: holds another campaign: {_changed(before, about)}; {ANOTHER}")
+            raise InputError(
+                f"{self.path}: holds another campaign: {_changed(before, about)}; {ANOTHER}"
+            )
 
     def journal(self, cases: int) -> Journal:
         """The journal of rows that have come so far."""
@@ -309,7 +341,11 @@ def _changed(before: About, now: About) -> str:
             if old != new:
                 old, new = (shortened(msgspec.json.encode(value).decode()) for value in (old, new))
                 return f"{words}{key} was {old} and is {new}"
-    for key, words in (("bench_sha256", "its bench file"), ("files_sha256", "its log or scenario"), ("solver", "--solver")):
+    for key, words in (
+        ("bench_sha256", "its bench file"),
+        ("files_sha256", "its log or scenario"),
+        ("solver", "--solver"),
+    ):
         if said[0][key] != said[1][key]:
             return f"{words} was {shortened(said[0][key])} and is {shortened(said[1][key])}"
     return "--images was another"

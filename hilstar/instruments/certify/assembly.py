@@ -17,13 +17,25 @@ from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 from hilstar.display.calibration import BUILT_IN, read_toml, weights_of_grid
 from hilstar.display.geometry import load_notes
 from hilstar.instruments.certify.budget import Distribution, Input, Model
-from hilstar.instruments.certify.estimates import Evenness, LightDeviation, evenness, light_deviation, place_errors
+from hilstar.instruments.certify.estimates import (
+    Evenness,
+    LightDeviation,
+    evenness,
+    light_deviation,
+    place_errors,
+)
 from hilstar.instruments.certify.lens import LensFit, lens_fit
 from hilstar.instruments.certify.model import Deviations, Figures, reference_stars
 from hilstar.instruments.certify.readings import Reader, dot_places, geometry_of
 from hilstar.instruments.certify.structure import in_time, lasting_root
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_calibration, catalogue_choice, star_flux, star_kinds, star_rates
+from hilstar.server.bench.build import (
+    bench_calibration,
+    catalogue_choice,
+    star_flux,
+    star_kinds,
+    star_rates,
+)
 from hilstar.server.bench.catalogue import sigma_instrument_mag
 from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import choose_catalog, table_facts
@@ -80,9 +92,16 @@ def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generato
     white before every eight.
     """
     count = min(levels, white)
-    wanted = next(found for n in itertools.count(count) if len(found := np.unique(np.rint(np.geomspace(1, white, n)))) >= count)
+    wanted = next(
+        found
+        for n in itertools.count(count)
+        if len(found := np.unique(np.rint(np.geomspace(1, white, n)))) >= count
+    )
     order = rng.permutation(np.repeat(wanted.astype(np.intp), repeats))
-    rounds = [np.concatenate([[0, white], order[k : k + READINGS_A_ROUND]]) for k in range(0, len(order), READINGS_A_ROUND)]
+    rounds = [
+        np.concatenate([[0, white], order[k : k + READINGS_A_ROUND]])
+        for k in range(0, len(order), READINGS_A_ROUND)
+    ]
     return np.asarray(np.concatenate([*rounds, [0, white]]), dtype=np.intp)
 
 
@@ -100,7 +119,10 @@ class Assembled:
 
 
 def assemble(
-    file: BenchFile, read: Read | None, warm_up: float | None = None, checked: dict[str, float] | None = None
+    file: BenchFile,
+    read: Read | None,
+    warm_up: float | None = None,
+    checked: dict[str, float] | None = None,
 ) -> Assembled:
     """The budget of a bench. Raises InputError.
 
@@ -124,16 +146,27 @@ def assemble(
         *_of_drift(figures, checked, missing),
         *_of_sky(file, figures, missing),
     ]
-    names = [*figures.names, *((quantity, star, unit) for quantity, unit in SKY for star in range(count))]
+    names = [
+        *figures.names,
+        *((quantity, star, unit) for quantity, unit in SKY for star in range(count)),
+    ]
     quantised = np.array([star.quantised_mag for star in figures.stars])
 
     def model(variables: list[FloatArray]) -> FloatArray:
         def total(name: str) -> FloatArray | float:
             parts = [(z, getattr(each, name)) for z, each in zip(variables, effects, strict=True)]
-            return sum((np.tensordot(z, slopes, axes=1) for z, slopes in parts if slopes is not None), start=0.0)
+            return sum(
+                (np.tensordot(z, slopes, axes=1) for z, slopes in parts if slopes is not None),
+                start=0.0,
+            )
 
         trials = len(variables[0])
-        off = Deviations(*(np.zeros((trials, *getattr(value, n).shape[1:])) + getattr(value, n) + total(m) for n, m in KINDS))
+        off = Deviations(
+            *(
+                np.zeros((trials, *getattr(value, n).shape[1:])) + getattr(value, n) + total(m)
+                for n, m in KINDS
+            )
+        )
         found = figures.of(off)
         sky = np.zeros((trials, len(SKY), count)) + total("sky")
         sky += found[:, : 3 * count].reshape(trials, 3, count)
@@ -143,10 +176,18 @@ def assemble(
     return Assembled([each.input for each in effects], model, names, figures, missing)
 
 
-KINDS = (("levels", "levels"), ("even", "even"), ("place_arcsec", "place"), ("delay_ms", "delay"), ("late_ms", "late"))
+KINDS = (
+    ("levels", "levels"),
+    ("even", "even"),
+    ("place_arcsec", "place"),
+    ("delay_ms", "delay"),
+    ("late_ms", "late"),
+)
 
 
-def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[str]) -> tuple[Deviations, list[Effect]]:
+def _of_readings(
+    file: BenchFile, figures: Figures, read: Read, missing: list[str]
+) -> tuple[Deviations, list[Effect]]:
     light = read.light
     join = light.weights(figures.log_light)
     dark, lasting = (join @ light.dark_factors).T, (join @ light.lasting_factors).T
@@ -161,7 +202,11 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
     late_ms = read.delays_ms
     delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
     value = Deviations(
-        (join @ light.value)[None], (even @ fit.value[:, 0] - form / 2)[None], place.value[None], np.array([delay]), np.zeros(1)
+        (join @ light.value)[None],
+        (even @ fit.value[:, 0] - form / 2)[None],
+        place.value[None],
+        np.array([delay]),
+        np.zeros(1),
     )
     white = math.sqrt(read.even.found.noise_variance) / fit.noise if read.even.found.total else 1.0
     found = [
@@ -208,100 +253,183 @@ def _of_delays(late_ms: FloatArray) -> Iterator[Effect]:
     from one to the next.
     """
     count, order = len(late_ms), np.arange(len(late_ms), dtype=np.float64)
-    lasts, source = in_time(order, late_ms - late_ms.mean(), np.ones((count, 1))), f"{count} edges of a photodiode"
+    lasts, source = (
+        in_time(order, late_ms - late_ms.mean(), np.ones((count, 1))),
+        f"{count} edges of a photodiode",
+    )
     error = math.sqrt(lasts.noise_variance / count)
-    yield Effect(Input("delay", "Student t", source, 1, error, "ms", count - 1.0), delay=np.array([error]))
+    yield Effect(
+        Input("delay", "Student t", source, 1, error, "ms", count - 1.0), delay=np.array([error])
+    )
     if lasts.total:
         error = float(np.linalg.norm(lasting_root(order, lasts).mean(axis=0)))
-        several = Input("delay that lasts", "Student t", f"{source}, which correlate", 1, error, "ms", lasts.dof)
+        several = Input(
+            "delay that lasts", "Student t", f"{source}, which correlate", 1, error, "ms", lasts.dof
+        )
         yield Effect(several, delay=np.array([error]))
 
 
 def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Places (n,) all over a square of the screen, left, top and side, px."""
     left, top, side = square_px
-    along = (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5 if side > 1 else np.zeros(1)
+    along = (
+        (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5
+        if side > 1
+        else np.zeros(1)
+    )
     x, y = np.meshgrid(left + along, top + along)
     return x.ravel(), y.ravel()
 
 
-def _of_structure(figures: Figures, read: Read, lasting: FloatArray, rough: FloatArray) -> Iterator[Effect]:
+def _of_structure(
+    figures: Figures, read: Read, lasting: FloatArray, rough: FloatArray
+) -> Iterator[Effect]:
     """The effects of what the residuals have left of structure, where they have it: in time, of
     codes, of light, of places.
     """
     light, even, place = read.light, read.even, read.place.at(figures.x_px, figures.y_px)
     if light.lasting.total:
-        error, source = light.noise * math.sqrt(light.lasting.total), "readings that correlate from one to the next"
+        error, source = (
+            light.noise * math.sqrt(light.lasting.total),
+            "readings that correlate from one to the next",
+        )
         yield Effect(
-            Input("noise that lasts", "Student t", source, len(lasting), error, "relative", light.lasting.dof), levels=lasting
+            Input(
+                "noise that lasts",
+                "Student t",
+                source,
+                len(lasting),
+                error,
+                "relative",
+                light.lasting.dof,
+            ),
+            levels=lasting,
         )
     if light.common_factors.size:
         common = (light.weights(figures.log_light) @ light.common_factors).T
         error = float(np.abs(light.common_factors).max())
-        source = "ratios of lattices by pairs of images, the ADC's rounding and its lowest code, black"
+        source = (
+            "ratios of lattices by pairs of images, the ADC's rounding and its lowest code, black"
+        )
         shared = Input("what readings share", "normal", source, len(common), error, "relative")
         yield Effect(shared, levels=common)
     if rough.any():
         source = "codes read, each foretold by the others: those not read"
         yield Effect(
-            Input("roughness of the response", "normal", source, len(rough), _rms(rough[rough > 0]), "relative"),
+            Input(
+                "roughness of the response",
+                "normal",
+                source,
+                len(rough),
+                _rms(rough[rough > 0]),
+                "relative",
+            ),
             levels=np.diag(rough),
         )
     if even.found.total:
         count, read_px = len(figures.stars), _places_in(light.square_px)
-        shares = np.concatenate([np.eye(count), np.full((count, len(read_px[0])), -1 / len(read_px[0]))], axis=1)
+        shares = np.concatenate(
+            [np.eye(count), np.full((count, len(read_px[0])), -1 / len(read_px[0]))], axis=1
+        )
         x, y = np.append(figures.x_px, read_px[0]), np.append(figures.y_px, read_px[1])
         scatter = even.scatter(x, y, shares)
         error, length = math.sqrt(even.found.total), even.found.mean_length
-        source = f"light of dots about its map, over {length:.0f} px: the screen's, at each star's place"
-        yield Effect(Input("uneven light", "Student t", source, len(scatter), error, "relative", even.found.dof), even=scatter)
+        source = (
+            f"light of dots about its map, over {length:.0f} px: the screen's, at each star's place"
+        )
+        yield Effect(
+            Input(
+                "uneven light", "Student t", source, len(scatter), error, "relative", even.found.dof
+            ),
+            even=scatter,
+        )
     if place.found.total:
         error, length = math.sqrt(place.found.total), place.found.mean_length
         source = f"places of dots about the lens, which correlate over {length:.0f} px"
         yield Effect(
-            Input("dots that correlate", "Student t", source, len(place.structure), error, "arcsec", place.found.dof),
+            Input(
+                "dots that correlate",
+                "Student t",
+                source,
+                len(place.structure),
+                error,
+                "arcsec",
+                place.found.dof,
+            ),
             place=place.structure,
         )
 
 
-def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: list[str]) -> Iterator[Effect]:
+def _of_files(
+    file: BenchFile, figures: Figures, value: Deviations, missing: list[str]
+) -> Iterator[Effect]:
     """The effects of a bench's calibration files and stated errors, and in `value` what the
     response has wrong.
     """
     monitor, certify, count = file.config.monitor, file.config.certify, len(figures.stars)
     name = monitor.calibration
     known = None if name in BUILT_IN else read_toml(file.folder / name)
-    errors, light_map = None if known is None else known.errors, bench_calibration(file.config, file.folder)
+    errors, light_map = (
+        None if known is None else known.errors,
+        bench_calibration(file.config, file.folder),
+    )
     if errors is None:
         missing.append(f"flux: [monitor] calibration = {name!r} does not say how well it is known")
     else:
         light, relative = np.log(np.array(errors.light)), np.array(errors.relative)
-        join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(np.clip(figures.log_light, light[0], light[-1]))
+        join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(
+            np.clip(figures.log_light, light[0], light[-1])
+        )
         join = join - np.eye(len(light))[-1]  # relative to white, whose light is full scale
         value.levels[0] += join @ np.array(errors.off)
         common = errors.black if errors.common is None else errors.common
         black = common / np.array(errors.light)  # common to all levels
         own, source = np.sqrt(np.maximum(relative**2 - black**2, 0.0)), f"levels of {name}"
         yield Effect(
-            Input("response", "Student t", source, len(light) + 1, float(np.median(relative)), "relative", errors.dof),
+            Input(
+                "response",
+                "Student t",
+                source,
+                len(light) + 1,
+                float(np.median(relative)),
+                "relative",
+                errors.dof,
+            ),
             levels=np.concatenate([(join * own).T, (join @ black)[None]]),
         )
     if (white := certify.flux_at_white_relative) is not None:
         dof = certify.flux_at_white_dof or math.inf
         source, kind = "[certify] flux_at_white_relative", _by_freedom(dof)
-        yield Effect(Input("full scale", kind, source, 1, white, "relative", dof), even=np.full((1, count), white))
+        yield Effect(
+            Input("full scale", kind, source, 1, white, "relative", dof),
+            even=np.full((1, count), white),
+        )
     else:
-        missing.append("full scale: nothing was read, and [certify] flux_at_white_relative is not written")
+        missing.append(
+            "full scale: nothing was read, and [certify] flux_at_white_relative is not written"
+        )
     if light_map.uniformity is None or light_map.uniformity_relative is None:
-        missing.append(f"evenness: nothing was read, and {name} has no [uniformity] with its standard error")
+        missing.append(
+            f"evenness: nothing was read, and {name} has no [uniformity] with its standard error"
+        )
     else:
         field = light_map.uniformity_relative
-        sides = zip((figures.y_px, figures.x_px), monitor.resolution_px[::-1], light_map.uniformity.shape, strict=True)
-        rows, columns = (weights_of_grid(side, n)[np.rint(at).astype(np.intp)] for at, side, n in sides)
+        sides = zip(
+            (figures.y_px, figures.x_px),
+            monitor.resolution_px[::-1],
+            light_map.uniformity.shape,
+            strict=True,
+        )
+        rows, columns = (
+            weights_of_grid(side, n)[np.rint(at).astype(np.intp)] for at, side, n in sides
+        )
         weights = (rows[:, :, None] * columns[:, None]).reshape(count, -1)
         # each field is known by itself, and stars share them
         slopes = field * np.linalg.qr(weights.T)[1]
-        yield Effect(Input("evenness", "normal", f"fields of {name}", len(slopes), field, "relative"), even=slopes)
+        yield Effect(
+            Input("evenness", "normal", f"fields of {name}", len(slopes), field, "relative"),
+            even=slopes,
+        )
     yield from _of_geometry(file, figures, missing)
     yield from _stated_delay(file, missing)
 
@@ -317,67 +445,114 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
     name = file.config.collimator.geometry
     error = None if name is None else load_notes(file.folder / name).error
     if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
-        missing.append("place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)")
+        missing.append(
+            "place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)"
+        )
         return
     wide, high = file.config.monitor.resolution_px
     if error.map_arcsec is not None:
         rows = np.where(np.array(error.map_arcsec) < 0, np.nan, np.array(error.map_arcsec))
-        at = ((figures.y_px + 0.5) / high * (rows.shape[0] - 1), (figures.x_px + 0.5) / wide * (rows.shape[1] - 1))
+        at = (
+            (figures.y_px + 0.5) / high * (rows.shape[0] - 1),
+            (figures.x_px + 0.5) / wide * (rows.shape[1] - 1),
+        )
 
         def seen(values: FloatArray) -> FloatArray:
             return np.asarray(map_coordinates(values, at, order=1, mode="nearest"))
 
         known = seen(np.where(np.isnan(rows), np.nanmax(rows), rows)) / math.sqrt(2)
         if error.modes_arcsec is None:
-            place, source = np.eye(2)[:, None] * known[:, None], f"map of errors of {name}, all stars together"
+            place, source = (
+                np.eye(2)[:, None] * known[:, None],
+                f"map of errors of {name}, all stars together",
+            )
         else:
             modes = np.array(error.modes_arcsec).reshape(-1, 2, *rows.shape)
             place = np.stack([[seen(axis) for axis in mode] for mode in modes]).transpose(0, 2, 1)
             source = f"covariance of {name}"
-        yield Effect(Input("geometry", "normal", source, len(place), _rms(known), "arcsec"), place=place)
+        yield Effect(
+            Input("geometry", "normal", source, len(place), _rms(known), "arcsec"), place=place
+        )
     else:
-        missing.append(f"lens: {name} has no errors of the lens, and those of its alignment alone count")
+        missing.append(
+            f"lens: {name} has no errors of the lens, and those of its alignment alone count"
+        )
     if error.alignment_covariance_arcsec2 is not None:
-        covariance, dof = np.array(error.alignment_covariance_arcsec2), error.alignment_dof or math.inf
+        covariance, dof = (
+            np.array(error.alignment_covariance_arcsec2),
+            error.alignment_dof or math.inf,
+        )
         size, axes = np.linalg.eigh(covariance)
         turns = (axes * np.sqrt(np.maximum(size, 0.0))).T
-        source, rms = f"covariance of the rotation of {name}", math.sqrt(max(float(size.mean()), 0.0))
-        yield Effect(Input("alignment", _by_freedom(dof), source, 3, rms, "arcsec", dof), place=figures.turned(turns))
+        source, rms = (
+            f"covariance of the rotation of {name}",
+            math.sqrt(max(float(size.mean()), 0.0)),
+        )
+        yield Effect(
+            Input("alignment", _by_freedom(dof), source, 3, rms, "arcsec", dof),
+            place=figures.turned(turns),
+        )
 
 
 def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
     known = file.config.certify.panel_delay_u_ms
     if known is None:
-        missing.append("latency: no photodiode read it, and [certify] panel_delay_u_ms is not written")
+        missing.append(
+            "latency: no photodiode read it, and [certify] panel_delay_u_ms is not written"
+        )
     else:
-        yield Effect(Input("delay", "normal", "[certify] panel_delay_u_ms", 1, known, "ms"), delay=np.array([known]))
+        yield Effect(
+            Input("delay", "normal", "[certify] panel_delay_u_ms", 1, known, "ms"),
+            delay=np.array([known]),
+        )
 
 
-def _of_warm_up(file: BenchFile, count: int, seen: float | None, missing: list[str]) -> Iterator[Effect]:
+def _of_warm_up(
+    file: BenchFile, count: int, seen: float | None, missing: list[str]
+) -> Iterator[Effect]:
     source, known = "white in the next ten minutes (--warm-up)", file.config.certify.warm_up_percent
     if seen is None and known is not None:
         seen, source = known / 100, "[certify] warm_up_percent"
     if seen is None:
-        missing.append("warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is not written")
+        missing.append(
+            "warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is not written"
+        )
     else:
         u = seen / math.sqrt(3)
-        yield Effect(Input("warm-up", "rectangular", source, 1, u, "relative"), even=np.full((1, count), u))
+        yield Effect(
+            Input("warm-up", "rectangular", source, 1, u, "relative"), even=np.full((1, count), u)
+        )
 
 
-def _of_drift(figures: Figures, checked: dict[str, float] | None, missing: list[str]) -> Iterator[Effect]:
+def _of_drift(
+    figures: Figures, checked: dict[str, float] | None, missing: list[str]
+) -> Iterator[Effect]:
     """Drift since the last check: anywhere within the largest change that was seen, of each
     quantity by itself.
     """
     if checked is None:
-        missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
+        missing.append(
+            "drift since the certificate: no check has been made (hilstar certify --check)"
+        )
         return
-    names, count = ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency"), len(figures.stars)
+    names, count = (
+        ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency"),
+        len(figures.stars),
+    )
     light, x, y, turn, scale, late = (checked.get(name, 0.0) / math.sqrt(3) for name in names)
     even, place, delay = np.zeros((6, count)), np.zeros((6, count, 2)), np.zeros(6)
     even[0], place[1, :, 0], place[2, :, 1], delay[5] = light / 100, x, y, late
-    place[3], place[4] = figures.turned(np.array([[0.0, 0.0, turn]]))[0], 1e-6 * scale * ARCSEC_PER_RAD * figures.tangent
+    place[3], place[4] = (
+        figures.turned(np.array([[0.0, 0.0, turn]]))[0],
+        1e-6 * scale * ARCSEC_PER_RAD * figures.tangent,
+    )
     source = f"largest changes over all checks: {', '.join(names)}"
-    yield Effect(Input("drift", "rectangular", source, 6, light / 100, "relative"), even=even, place=place, delay=delay)
+    yield Effect(
+        Input("drift", "rectangular", source, 6, light / 100, "relative"),
+        even=even,
+        place=place,
+        delay=delay,
+    )
 
 
 def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
@@ -389,16 +564,23 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
         source = f"certificate of {instrument.name}{f', {instrument.date}' if instrument.date else ''}, k = {instrument.k:g}"
         yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * one)
     else:
-        missing.append("absolute scale of the light: no [certify.instrument]; light is in the tracker's own electrons")
+        missing.append(
+            "absolute scale of the light: no [certify.instrument]; light is in the tracker's own electrons"
+        )
     yield from _of_tracker(file, figures, missing)
     if certify.temperature_k and (certify.flux_mag_per_k or certify.place_arcsec_per_k):
         kelvin = certify.temperature_k / math.sqrt(3)
-        flux, place = certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE, certify.place_arcsec_per_k * kelvin
+        flux, place = (
+            certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE,
+            certify.place_arcsec_per_k * kelvin,
+        )
         moved = np.zeros((3, stars, 2))
         moved[1, :, 0], moved[2, :, 1] = place, place
         source = f"[certify] temperature_k = {certify.temperature_k:g}, half of a range"
         light = np.stack([flux * one[0], 0 * one[0], 0 * one[0]])
-        yield Effect(Input("temperature", "rectangular", source, 3, kelvin, "K"), even=light, place=moved)
+        yield Effect(
+            Input("temperature", "rectangular", source, 3, kelvin, "K"), even=light, place=moved
+        )
     else:
         missing.append("temperature: no range or no coefficient in [certify]")
     if certify.rate_deg_s:
@@ -435,7 +617,9 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
     elif direction:
         place = np.zeros((2, len(at), count, 2))
         place[0, :, :, 0] = place[1, :, :, 1] = direction / stated.k * smooth[:, :count]
-        lens = Input("tracker's lens", "normal", source, 2 * len(at), direction / stated.k, "arcsec")
+        lens = Input(
+            "tracker's lens", "normal", source, 2 * len(at), direction / stated.k, "arcsec"
+        )
         yield Effect(lens, place=place.reshape(-1, count, 2))
     if (even := stated.evenness_expanded_relative) is None:
         missing.append(
@@ -446,7 +630,9 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
         # Relative to the middle two places are off by a half each, in variance, where they are far
         # apart.
         from_middle = even / stated.k * (smooth[:, :count] - smooth[:, count:])
-        vignetting = Input("tracker's evenness", "normal", source, len(at), even / stated.k, "relative")
+        vignetting = Input(
+            "tracker's evenness", "normal", source, len(at), even / stated.k, "relative"
+        )
         yield Effect(vignetting, even=from_middle)
     if (linear := stated.linearity_expanded_relative) is None:
         missing.append(
@@ -484,7 +670,10 @@ def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[E
     lost = np.array([star.quantised_mag for star in stars])
     light = float(lost.std(ddof=1)) if count > 2 else 0.0
     source = "scatter of what the codes of the reference stars lose"
-    yield Effect(Input("quantisation", "normal", source, count, light, "mag"), sky=each(np.full(count, light), 0))
+    yield Effect(
+        Input("quantisation", "normal", source, count, light, "mag"),
+        sky=each(np.full(count, light), 0),
+    )
 
 
 def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -497,7 +686,9 @@ def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatA
     facts = table_facts(choice, stars, errors_of(stars))
     covariance = motion_at(stars, facts, sky.epoch_jyear).covariance
     place_mas = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    mag = sigma_instrument_mag(stars, facts, star_rates(file.config, file.folder), star_kinds(file.config, stars))
+    mag = sigma_instrument_mag(
+        stars, facts, star_rates(file.config, file.folder), star_kinds(file.config, stars)
+    )
     return np.nan_to_num(mag), np.nan_to_num(place_mas) / 1000
 
 
@@ -510,11 +701,19 @@ def spectrum_mag(file: BenchFile, b_v_mag: FloatArray) -> tuple[FloatArray, str]
     its source.
     """
     if file.config.sky.spectrum != "blackbody" or file.config.sky.brightness != "dgs":
-        return np.full(len(b_v_mag), LIBRARY_MAG), "real stars of one colour (study tradeoff: 0.026 mag at 95 %)"
+        return np.full(
+            len(b_v_mag), LIBRARY_MAG
+        ), "real stars of one colour (study tradeoff: 0.026 mag at 95 %)"
     rates = []
     known = np.nan_to_num(b_v_mag, nan=0.65)
     for spectrum in ("pickles", "blackbody"):
         sky = msgspec.structs.replace(file.config.sky, spectrum=spectrum)
         flux = star_flux(msgspec.structs.replace(file.config, sky=sky), file.folder)
-        rates.append(np.asarray(flux(np.zeros(len(known)), known, np.full(len(known), np.nan), None)).sum(axis=1))
-    return np.abs(magnitude(rates[0] / rates[1])), "black bodies against library spectra of the same B-V"
+        rates.append(
+            np.asarray(flux(np.zeros(len(known)), known, np.full(len(known), np.nan), None)).sum(
+                axis=1
+            )
+        )
+    return np.abs(
+        magnitude(rates[0] / rates[1])
+    ), "black bodies against library spectra of the same B-V"

@@ -107,12 +107,17 @@ def first_order(model: Model, inputs: list[Input]) -> Combined:
     standard = np.sqrt((contribution**2).sum(axis=1))
     finite = np.array([1 / each.dof for each in inputs])
     with np.errstate(divide="ignore", invalid="ignore"):
-        dof = np.minimum(np.nan_to_num(standard**4 / (contribution**4 @ finite), nan=MAX_DOF, posinf=MAX_DOF), MAX_DOF)
+        dof = np.minimum(
+            np.nan_to_num(standard**4 / (contribution**4 @ finite), nan=MAX_DOF, posinf=MAX_DOF),
+            MAX_DOF,
+        )
     k = stdtrit(dof, (1 + COVERAGE) / 2)
     return Combined(value, standard, dof, value - k * standard, value + k * standard, contribution)
 
 
-def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_trials: int) -> BudgetTrials:
+def by_trials(
+    model: Model, inputs: list[Input], rng: np.random.Generator, max_trials: int
+) -> BudgetTrials:
     """Draw trials until two digits of every standard uncertainty and interval stand, or
     `max_trials` are drawn.
     """
@@ -133,22 +138,35 @@ def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_t
     return BudgetTrials(mean, standard, low, high, len(batches) * BATCH, settled)
 
 
-def why_they_differ(combined: Combined, drawn: BudgetTrials, inputs: list[Input], number: int) -> str:
+def why_they_differ(
+    combined: Combined, drawn: BudgetTrials, inputs: list[Input], number: int
+) -> str:
     """Why the intervals of a figure by both ways differ; "" where they agree within DIFFER of
     their half width.
     """
     half = (combined.upper[number] - combined.lower[number]) / 2
-    off = max(abs(combined.lower[number] - drawn.lower[number]), abs(combined.upper[number] - drawn.upper[number]))
+    off = max(
+        abs(combined.lower[number] - drawn.lower[number]),
+        abs(combined.upper[number] - drawn.upper[number]),
+    )
     if half <= SMALLEST or off <= DIFFER * half:
         return ""
-    share = combined.contribution[number] ** 2 / max(float((combined.contribution[number] ** 2).sum()), 1e-300)
+    share = combined.contribution[number] ** 2 / max(
+        float((combined.contribution[number] ** 2).sum()), 1e-300
+    )
     largest = inputs[int(np.argmax(share))]
     middle = (drawn.upper[number] + drawn.lower[number]) / 2 - combined.value[number]
     if abs(middle) > DIFFER * half:
         return "the model is not linear over the inputs' range: its interval is not even about the value"
     if largest.distribution in ("rectangular", "triangular") and share.max() > 0.5:
-        return f"the largest input ({largest.name}) is {largest.distribution}, whose tails are short"
-    few = [each.name for each, part in zip(inputs, share, strict=True) if each.dof < FEW_DOF and part > FEW_SHARE]
+        return (
+            f"the largest input ({largest.name}) is {largest.distribution}, whose tails are short"
+        )
+    few = [
+        each.name
+        for each, part in zip(inputs, share, strict=True)
+        if each.dof < FEW_DOF and part > FEW_SHARE
+    ]
     if few:
         return f"few readings ({', '.join(few)}): Welch-Satterthwaite's freedom is an approximation"
     return "the model is not linear over the inputs' range"

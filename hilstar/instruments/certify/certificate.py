@@ -15,12 +15,26 @@ from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_
 from hilstar.display.calibration import BUILT_IN
 from hilstar.display.identity import MonitorIdentity, sha256_of
 from hilstar.instruments.certify.assembly import Assembled, assemble, read_bench
-from hilstar.instruments.certify.budget import MAX_DOF, BudgetTrials, Combined, by_trials, first_order, why_they_differ
+from hilstar.instruments.certify.budget import (
+    MAX_DOF,
+    BudgetTrials,
+    Combined,
+    by_trials,
+    first_order,
+    why_they_differ,
+)
 from hilstar.instruments.certify.check import take_check
 from hilstar.instruments.certify.model import THIRDS, true_deviations
 from hilstar.instruments.certify.readings import Reader
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigure, Contribution, InputRow
+from hilstar.server.bench.certificate import (
+    KIND,
+    ByTrials,
+    Certificate,
+    CertifiedFigure,
+    Contribution,
+    InputRow,
+)
 from hilstar.server.bench.config import CertifySettings
 from hilstar.server.bench.measured_on import measured_on
 
@@ -43,7 +57,9 @@ MEASURANDS = {
 UNKNOWN = {
     "latency": ("latency",),
     "flux": ("flux", "star_flux"),
-    "place and attitude": tuple(name for name in MEASURANDS if "place" in name or "attitude" in name),
+    "place and attitude": tuple(
+        name for name in MEASURANDS if "place" in name or "attitude" in name
+    ),
 }
 LIMITS = {
     "flux": "max_flux_mag",
@@ -75,7 +91,12 @@ def certify(
     reference = None if reader is None else msgspec.json.encode(take_check(file, reader))
     budget = assemble(file, read, warm_up, checked)
     combined = first_order(budget.model, budget.inputs)
-    drawn = by_trials(budget.model, budget.inputs, np.random.default_rng(SEED), QUICK_TRIALS if quick else MAX_TRIALS)
+    drawn = by_trials(
+        budget.model,
+        budget.inputs,
+        np.random.default_rng(SEED),
+        QUICK_TRIALS if quick else MAX_TRIALS,
+    )
     truth = None
     if reader is not None and reader.truth is not None:
         truth = budget.figures.of(true_deviations(budget.figures, reader.truth))[0]
@@ -90,7 +111,9 @@ def certify(
         kind=KIND,
         number=f"H{made[:10].replace('-', '')}-{sha256_of(core)[:8]}",
         made=made,
-        valid_until=(now.astimezone(datetime.UTC).date() + datetime.timedelta(days=settings.valid_days)).isoformat(),
+        valid_until=(
+            now.astimezone(datetime.UTC).date() + datetime.timedelta(days=settings.valid_days)
+        ).isoformat(),
         hilstar=hilstar.__version__,
         bench=file.path.name,
         bench_sha256=file.sha256,
@@ -138,7 +161,11 @@ def _never_assessed(settings: CertifySettings) -> list[str]:
 
 
 def _figures(
-    file: BenchFile, budget: Assembled, combined: Combined, drawn: BudgetTrials, truth: np.ndarray[Any, Any] | None
+    file: BenchFile,
+    budget: Assembled,
+    combined: Combined,
+    drawn: BudgetTrials,
+    truth: np.ndarray[Any, Any] | None,
 ) -> list[CertifiedFigure]:
     found, settings = [], file.config.certify
     unknown = {each.partition(":")[0] for each in budget.not_assessed}
@@ -147,10 +174,20 @@ def _figures(
         if quantity in missing:
             continue
         star = (
-            budget.figures.stars[which] if quantity.removeprefix("star_") in ("flux", "place_along", "place_across") else None
+            budget.figures.stars[which]
+            if quantity.removeprefix("star_") in ("flux", "place_along", "place_across")
+            else None
         )
-        field = -1 - which if quantity.startswith("attitude") else None if star is None else star.field
-        region = "screen" if quantity == "latency" else f"field {field}" if star is None else THIRDS[star.third]
+        field = (
+            -1 - which if quantity.startswith("attitude") else None if star is None else star.field
+        )
+        region = (
+            "screen"
+            if quantity == "latency"
+            else f"field {field}"
+            if star is None
+            else THIRDS[star.third]
+        )
         standard = float(combined.standard[number])
         shares = combined.contribution[number]
         ranked = [k for k in np.argsort(-shares, kind="stable") if shares[k] > 0]
@@ -176,8 +213,12 @@ def _figures(
                 unit=unit,
                 dof=round(dof, 1) if dof < MAX_DOF else None,
                 limit=limit,
-                conforms=None if limit is None else all(abs(end - nominal) <= limit for end in ends),
-                truth=_rounded(float(truth[number])) if truth is not None and number < len(truth) else None,
+                conforms=None
+                if limit is None
+                else all(abs(end - nominal) <= limit for end in ends),
+                truth=_rounded(float(truth[number]))
+                if truth is not None and number < len(truth)
+                else None,
                 by_trials=ByTrials(
                     standard_uncertainty=_rounded(float(drawn.standard[number])),
                     lower=_rounded(float(drawn.lower[number])),
@@ -211,7 +252,11 @@ def files_of(file: BenchFile) -> dict[str, str]:
         config.tracker.distortion,
         config.tracker.optics.psf,
     ]
-    named += [*config.tracker.quantum_efficiencies.values(), config.tracker.transmission, config.sky.catalogue]
+    named += [
+        *config.tracker.quantum_efficiencies.values(),
+        config.tracker.transmission,
+        config.sky.catalogue,
+    ]
     for name in named:
         if not isinstance(name, str) or name in BUILT_IN or not (file.folder / name).is_file():
             continue
@@ -219,9 +264,14 @@ def files_of(file: BenchFile) -> dict[str, str]:
         found[name] = sha256_of(read_bytes(path, "", MAX_FILE_BYTES))
         if path.suffix == ".toml":
             table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES))
-            for inner in (table.get("calibration", {}).get("response"), table.get("uniformity", {}).get("file")):
+            for inner in (
+                table.get("calibration", {}).get("response"),
+                table.get("uniformity", {}).get("file"),
+            ):
                 if isinstance(inner, str) and (path.parent / inner).is_file():
-                    found[str(Path(name).parent / inner)] = sha256_of(read_bytes(path.parent / inner, "", MAX_FILE_BYTES))
+                    found[str(Path(name).parent / inner)] = sha256_of(
+                        read_bytes(path.parent / inner, "", MAX_FILE_BYTES)
+                    )
     return found
 
 
@@ -230,7 +280,11 @@ def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
     the calibration files.
     """
     monitor = file.config.monitor
-    named = [now] if now is not None else [each.identity for each in measured_on(file) if each.identity is not None]
+    named = (
+        [now]
+        if now is not None
+        else [each.identity for each in measured_on(file) if each.identity is not None]
+    )
     return {
         "resolution_px": list(monitor.resolution_px),
         "refresh_hz": monitor.refresh_hz,

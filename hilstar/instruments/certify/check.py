@@ -23,7 +23,13 @@ from hilstar.basics.reading import NOT_JSON, exists, read_bytes, read_text
 from hilstar.instruments.calibrate.warm_up import WarmUp, fitted_white, judge_warm_up, watch_white
 from hilstar.instruments.certify.budget import COVERAGE
 from hilstar.instruments.certify.estimates import place_errors, surface
-from hilstar.instruments.certify.readings import DotReadings, Reader, VirtualReader, dot_places, geometry_of
+from hilstar.instruments.certify.readings import (
+    DotReadings,
+    Reader,
+    VirtualReader,
+    dot_places,
+    geometry_of,
+)
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.config.certify import VirtualSettings
 
@@ -131,7 +137,9 @@ def read_reference(path: Path) -> CheckReadings | None:
     try:
         return msgspec.json.decode(read_bytes(path, "", MAX_BYTES), type=CheckReadings)
     except NOT_JSON as error:
-        raise InputError(f"{path}: has no readings of a certificate ({shortened(error)}); certify the bench --again") from error
+        raise InputError(
+            f"{path}: has no readings of a certificate ({shortened(error)}); certify the bench --again"
+        ) from error
 
 
 def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[CheckFigure]:
@@ -143,12 +151,22 @@ def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Che
     found.append(("psf", 100 * (now.psf_px / was.psf_px - 1), psf_u, ALARMED_DOF, 0.0))
     if was.delay_ms is not None and now.delay_ms is not None:
         both = math.hypot(was.delay_u_ms, now.delay_u_ms)
-        found.append(("latency", now.delay_ms - was.delay_ms, both, float(max(min(was.delay_dof, now.delay_dof), 1)), 0.0))
+        found.append(
+            (
+                "latency",
+                now.delay_ms - was.delay_ms,
+                both,
+                float(max(min(was.delay_dof, now.delay_dof), 1)),
+                0.0,
+            )
+        )
     probability = FALSE_ALARM / len(found)
     return [_judged(*each, probability) for each in found]
 
 
-def _judged(quantity: str, value: float, u: float, dof: float, free: float, probability: float) -> CheckFigure:
+def _judged(
+    quantity: str, value: float, u: float, dof: float, free: float, probability: float
+) -> CheckFigure:
     """A figure with its threshold; with `free` numbers of freedom it is a root mean square,
     tested by F.
     """
@@ -163,7 +181,16 @@ def _judged(quantity: str, value: float, u: float, dof: float, free: float, prob
         lower, upper = value - wide, value + wide
     threshold = math.hypot(tolerance, k * u) if free else tolerance + k * u
     return CheckFigure(
-        quantity, value, u, lower, upper, unit, min(dof, ALARMED_DOF), tolerance, threshold, abs(value) <= threshold
+        quantity,
+        value,
+        u,
+        lower,
+        upper,
+        unit,
+        min(dof, ALARMED_DOF),
+        tolerance,
+        threshold,
+        abs(value) <= threshold,
     )
 
 
@@ -180,15 +207,29 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
         raise InputError("the check's codes are not the certificate's; certify the bench --again")
     mean = np.array([[light[code == c].mean() for c in codes] for code, light in sets])
     count = np.array([[(code == c).sum() for c in codes] for code, _ in sets])
-    squares = np.array([[((light[code == c] - light[code == c].mean()) ** 2).sum() for c in codes] for code, light in sets])
+    squares = np.array(
+        [
+            [((light[code == c] - light[code == c].mean()) ** 2).sum() for c in codes]
+            for code, light in sets
+        ]
+    )
     used = squares.sum(axis=1) > 0  # a bench file's own figures have no noise
     freedom = (count - 1)[used]
     bright = codes > codes[len(codes) // 3]
     dof = float(freedom[:, bright].sum())
-    relative = math.sqrt(float((squares[used][:, bright] / mean[used][:, bright] ** 2).sum()) / dof) if dof else 0.0
+    relative = (
+        math.sqrt(float((squares[used][:, bright] / mean[used][:, bright] ** 2).sum()) / dof)
+        if dof
+        else 0.0
+    )
     faint = np.arange(len(codes)) < FAINT
-    floor = float((squares[used] - freedom * (relative * mean[used]) ** 2)[:, faint].sum() / max(freedom[:, faint].sum(), 1))
-    variance = sum(((relative * mean[k]) ** 2 + max(floor, 0.0)) / count[k] for k in (0, 1) if used[k])
+    floor = float(
+        (squares[used] - freedom * (relative * mean[used]) ** 2)[:, faint].sum()
+        / max(freedom[:, faint].sum(), 1)
+    )
+    variance = sum(
+        ((relative * mean[k]) ** 2 + max(floor, 0.0)) / count[k] for k in (0, 1) if used[k]
+    )
     sigma = np.sqrt(variance)
     lit, white = codes > 0, mean[0, -1]
     change, error = mean[1, lit] / mean[0, lit] - 1, sigma[lit] / mean[0, lit]
@@ -203,10 +244,22 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
     rest = math.sqrt(float((left**2).mean()))
     typical = 100 * math.sqrt(float(np.mean(error**2)))
     return [
-        ("brightness", 100 * float(at @ slope), 100 * math.sqrt(float(at @ covariance @ at)), dof, 0.0),
+        (
+            "brightness",
+            100 * float(at @ slope),
+            100 * math.sqrt(float(at @ covariance @ at)),
+            dof,
+            0.0,
+        ),
         ("gamma", float(slope[1]), math.sqrt(float(covariance[1, 1])), dof, 0.0),
         ("response_rest", rest * typical, typical * math.sqrt(free / len(left)), dof, float(free)),
-        ("black", 100 * float(mean[1, 0] - mean[0, 0]) / white, 100 * float(sigma[0]) / white, dof, 0.0),
+        (
+            "black",
+            100 * float(mean[1, 0] - mean[0, 0]) / white,
+            100 * float(sigma[0]) / white,
+            dof,
+            0.0,
+        ),
     ]
 
 
@@ -214,7 +267,10 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
     """Evenness, scale, rotation, shift, and what is left of the geometry, by the dots that both
     have.
     """
-    places = [{(x, y): k for k, (x, y) in enumerate(zip(each.x_px, each.y_px, strict=True))} for each in (was, now)]
+    places = [
+        {(x, y): k for k, (x, y) in enumerate(zip(each.x_px, each.y_px, strict=True))}
+        for each in (was, now)
+    ]
     both = sorted(places[0].keys() & places[1].keys())
     dots = []
     for each, place in zip((was, now), places, strict=True):
@@ -222,21 +278,33 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
         x, y, seen_x, seen_y, light_of = np.array(columns)[:, [place[at] for at in both]]
         dots.append(DotReadings(x, y, seen_x, seen_y, light_of))
     if len(both) < 4 * len(TOLERANCES):
-        raise InputError(f"{len(both)} dots are seen now and were then; look at focus, exposure and what covers the screen")
+        raise InputError(
+            f"{len(both)} dots are seen now and were then; look at focus, exposure and what covers the screen"
+        )
     size = file.config.monitor.resolution_px
     moved = place_errors(file, dots[1]) - place_errors(file, dots[0])
     rays = geometry_of(file).monitor.rays(dots[0].x_px, dots[0].y_px)
     u, v = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     one, none = np.ones_like(u), np.zeros_like(u)
-    design = np.concatenate([np.stack([one, none, u, -v], axis=1), np.stack([none, one, v, u], axis=1)])
+    design = np.concatenate(
+        [np.stack([one, none, u, -v], axis=1), np.stack([none, one, v, u], axis=1)]
+    )
     values = moved.T.ravel()
     kept = np.isfinite(values)
     for _ in range(3):
         inverse = np.linalg.pinv(design[kept])
         found = inverse @ values[kept]
         left = values - design @ found
-        kept = np.isfinite(values) & (np.abs(left) < 6 * 1.4826 * max(float(np.median(np.abs(left[kept]))), 1e-9))
-    rest = surface(dots[0].x_px, dots[0].y_px, np.where(kept, left, np.nan).reshape(2, -1).T, REST_DEGREES, size)
+        kept = np.isfinite(values) & (
+            np.abs(left) < 6 * 1.4826 * max(float(np.median(np.abs(left[kept]))), 1e-9)
+        )
+    rest = surface(
+        dots[0].x_px,
+        dots[0].y_px,
+        np.where(kept, left, np.nan).reshape(2, -1).T,
+        REST_DEGREES,
+        size,
+    )
     error = rest.noise * np.linalg.norm(inverse, axis=1)
     ppm = 1e6 / 206264.806
     terms = rest.terms(dots[0].x_px, dots[0].y_px)
@@ -248,16 +316,30 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
     even = light.terms(dots[0].x_px, dots[0].y_px) @ light.value[:, 0]
     n, count = float(len(both)), float(terms.shape[1])
     return [
-        ("evenness", 100 * float(even.std()), 100 * light.noise * math.sqrt((count - 1) / n), light.dof, count - 1),
+        (
+            "evenness",
+            100 * float(even.std()),
+            100 * light.noise * math.sqrt((count - 1) / n),
+            light.dof,
+            count - 1,
+        ),
         ("scale", ppm * float(found[2]), ppm * float(error[2]), rest.dof, 0.0),
         ("rotation", float(found[3]), float(error[3]), rest.dof, 0.0),
         ("shift_x", float(found[0]), float(error[0]), rest.dof, 0.0),
         ("shift_y", float(found[1]), float(error[1]), rest.dof, 0.0),
-        ("geometry_rest", float(np.sqrt((fitted**2).mean())), rest.noise * math.sqrt(free / (2 * n)), rest.dof, free),
+        (
+            "geometry_rest",
+            float(np.sqrt((fitted**2).mean())),
+            rest.noise * math.sqrt(free / (2 * n)),
+            rest.dof,
+            free,
+        ),
     ]
 
 
-def record(folder: Path, made: datetime.datetime, since: str, figures: list[CheckFigure]) -> list[dict[str, str]]:
+def record(
+    folder: Path, made: datetime.datetime, since: str, figures: list[CheckFigure]
+) -> list[dict[str, str]]:
     """Add a check to checks.csv and draw all of them; its rows. Raises InputError where they
     cannot be read or written.
     """
@@ -269,13 +351,20 @@ def record(folder: Path, made: datetime.datetime, since: str, figures: list[Chec
         if any(set(row) != set(columns) for row in rows):
             raise InputError(f"{path}: its columns are not {', '.join(columns)}; move it away")
     stamp = made.isoformat(timespec="milliseconds")  # two checks of one second are two
-    rows += [{"made": stamp, "certificate": since, **{k: str(v) for k, v in asdict(each).items()}} for each in figures]
+    rows += [
+        {"made": stamp, "certificate": since, **{k: str(v) for k, v in asdict(each).items()}}
+        for each in figures
+    ]
     write_csv(path, columns, ([row[name] for name in columns] for row in rows))
     draw_checks(folder / CHART, rows)
     return rows
 
 
-DRAWN = (("brightness", "brightness [%]"), ("shift_x", "shift along x [arcsec]"), ("psf", "PSF sigma [%]"))
+DRAWN = (
+    ("brightness", "brightness [%]"),
+    ("shift_x", "shift along x [arcsec]"),
+    ("psf", "PSF sigma [%]"),
+)
 
 
 def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:
@@ -288,9 +377,13 @@ def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:
     with chart(path, finding, panels=len(DRAWN)) as panels:
         for axes, (quantity, label) in zip(panels, DRAWN, strict=True):
             mine = [row for row in rows if row["quantity"] == quantity]
-            days = [(datetime.datetime.fromisoformat(row["made"]) - first).total_seconds() / 86400 for row in mine]
+            days = [
+                (datetime.datetime.fromisoformat(row["made"]) - first).total_seconds() / 86400
+                for row in mine
+            ]
             value, u, limit = (
-                np.array([float(row[key]) for row in mine]) for key in ("value", "standard_uncertainty", "threshold")
+                np.array([float(row[key]) for row in mine])
+                for key in ("value", "standard_uncertainty", "threshold")
             )
             axes.errorbar(days, value, 2 * u, fmt="o-", color=BLUE)
             for sign in (-1, 1):
@@ -318,7 +411,9 @@ def largest_changes(folder: Path) -> dict[str, float] | None:
         for row in csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))):
             found[row["quantity"]] = max(abs(float(row["value"])), found.get(row["quantity"], 0.0))
     except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: is no table of checks ({shortened(error)}); move it away") from error
+        raise InputError(
+            f"{path}: is no table of checks ({shortened(error)}); move it away"
+        ) from error
     return found or None
 
 

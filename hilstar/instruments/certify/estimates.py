@@ -27,7 +27,13 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.display.calibration import weights_of_grid
-from hilstar.instruments.certify.readings import DotReadings, LightReadings, geometry_of, grey_response, white_of
+from hilstar.instruments.certify.readings import (
+    DotReadings,
+    LightReadings,
+    geometry_of,
+    grey_response,
+    white_of,
+)
 from hilstar.instruments.certify.structure import Cells, Structure, in_place, in_time, lasting_root
 from hilstar.optics.camera import field_terms
 from hilstar.server.bench.bench_file import BenchFile
@@ -83,7 +89,9 @@ class LightDeviation:
 
     def bent(self, log_light: FloatArray) -> FloatArray:
         """By how much the spline is above straight lines from code to code, at lights (n,)."""
-        return np.asarray(self.weights(log_light) @ self.value - np.interp(log_light, self.log_light, self.value))
+        return np.asarray(
+            self.weights(log_light) @ self.value - np.interp(log_light, self.log_light, self.value)
+        )
 
     def rough(self, log_light: FloatArray) -> FloatArray:
         """How far single codes may be from the spline through those read, at lights (n,), one
@@ -110,7 +118,9 @@ class LightDeviation:
             return np.zeros(len(log_light))
         excess = (off - noise) / (gaps[inner] ** 2).sum(axis=1)
         window = np.ones(ROUGH_CODES)
-        around = np.convolve(excess, window, mode="same") / np.convolve(np.ones(len(excess)), window, mode="same")
+        around = np.convolve(excess, window, mode="same") / np.convolve(
+            np.ones(len(excess)), window, mode="same"
+        )
         local = np.interp(log_light, self.log_light[inner], np.maximum(around, 0.0))
         between = 1 + (self.weights(log_light) ** 2).sum(axis=1)
         read = (np.abs(log_light[:, None] - self.log_light) < SAME_LIGHT).any(axis=1)
@@ -154,12 +164,17 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         left = read.light - design @ (found := inverse @ (read.light / sigma))
         own = 1 - np.einsum("ij,ji->i", design / sigma[:, None], inverse)
         noise = math.sqrt(
-            float(((left / np.maximum(by_shape, 1e-300))[bright] ** 2).sum()) / max(float(own[bright].sum()), 1e-9)
+            float(((left / np.maximum(by_shape, 1e-300))[bright] ** 2).sum())
+            / max(float(own[bright].sum()), 1e-9)
         )
         floor = math.sqrt(float((left[dark] ** 2).sum()) / max(float(own[dark].sum()), 1e-9))
     if own[bright].sum() < MIN_DOF / 2 or own[dark].sum() < MIN_DOF / 2:
-        raise InputError("white and black are read too seldom to know their scatter; read both three times or more")
-    by_light, by_dark = (inverse * part / sigma for part in (noise * by_shape, np.full(len(lit), floor)))
+        raise InputError(
+            "white and black are read too seldom to know their scatter; read both three times or more"
+        )
+    by_light, by_dark = (
+        inverse * part / sigma for part in (noise * by_shape, np.full(len(lit), floor))
+    )
     when = np.asarray(hours if timed else np.arange(len(read.code)), dtype=np.float64)
     lasting = in_time(when, left / sigma, design / sigma[:, None])
     # What is correlated is no noise of a reading by itself.
@@ -167,14 +182,22 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     by_light, by_dark = alone * by_light, alone * by_dark
     lasts = inverse @ lasting_root(when, lasting)
     light, size = found[1 : len(codes)] - found[0], len(codes)
-    lost = math.hypot(*(float(np.linalg.norm(each[size - 1] - each[0])) for each in (by_light, by_dark)))
+    lost = math.hypot(
+        *(float(np.linalg.norm(each[size - 1] - each[0])) for each in (by_light, by_dark))
+    )
     if not light[-1] > FAINT_SIGMAS * lost:
-        raise InputError("white reads no light above black; look at what the screen shows, and expose longer")
+        raise InputError(
+            "white reads no light above black; look at what the screen shows, and expose longer"
+        )
     grey, (width, height) = grey_response(file), file.config.monitor.resolution_px
     even = bench_calibration(file.config, file.folder).uniformity_map((width, height))
     square = read.square_px or (width // 2, height // 2, 1)
     left_px, top_px, side = square
-    here = 1.0 if even is None else float(even[top_px : top_px + side, left_px : left_px + side].mean())
+    here = (
+        1.0
+        if even is None
+        else float(even[top_px : top_px + side, left_px : left_px + side].mean())
+    )
     common = np.zeros((len(codes), 0))
     if read.common is not None:
         common = np.stack([np.bincount(place, each) / count for each in read.common.T], axis=1)
@@ -217,17 +240,29 @@ class Surface:
         are apart at pixels (n,).
         """
         wide, high = self.resolution_px
-        x, y = ((np.arange(n) + 0.5) * side / n - 0.5 for n, side in zip(MAP, self.resolution_px, strict=True))
-        grid = (self.terms(*(part.ravel() for part in np.meshgrid(x, y))) @ self.value[:, 0]).reshape(MAP[::-1])
-        rows, columns = (weights_of_grid(side, n) for side, n in zip((high, wide), MAP[::-1], strict=True))
+        x, y = (
+            (np.arange(n) + 0.5) * side / n - 0.5
+            for n, side in zip(MAP, self.resolution_px, strict=True)
+        )
+        grid = (
+            self.terms(*(part.ravel() for part in np.meshgrid(x, y))) @ self.value[:, 0]
+        ).reshape(MAP[::-1])
+        rows, columns = (
+            weights_of_grid(side, n) for side, n in zip((high, wide), MAP[::-1], strict=True)
+        )
         at = np.rint(y_px).astype(np.intp), np.rint(x_px).astype(np.intp)
         return np.asarray(
-            self.terms(x_px, y_px) @ self.value[:, 0] - np.einsum("nr,rc,nc->n", rows[at[0]], grid, columns[at[1]])
+            self.terms(x_px, y_px) @ self.value[:, 0]
+            - np.einsum("nr,rc,nc->n", rows[at[0]], grid, columns[at[1]])
         )
 
 
 def surface(
-    x_px: FloatArray, y_px: FloatArray, values: FloatArray, degrees: tuple[int, ...], resolution_px: tuple[int, int]
+    x_px: FloatArray,
+    y_px: FloatArray,
+    values: FloatArray,
+    degrees: tuple[int, ...],
+    resolution_px: tuple[int, int],
 ) -> Surface:
     """Fit a surface to values (n, columns) at pixels; wild ones do not count. Raises InputError
     for too few dots.
@@ -253,14 +288,25 @@ def surface(
         squares = float((left[kept] ** 2).sum())
         if best is not None:
             more = best.dof - dof
-            if more <= 0 or fdtrc(more, dof, max(best_squares - squares, 0.0) / more / max(squares / dof, 1e-30)) > BETTER_P:
+            if (
+                more <= 0
+                or fdtrc(
+                    more, dof, max(best_squares - squares, 0.0) / more / max(squares / dof, 1e-30)
+                )
+                > BETTER_P
+            ):
                 break
         noise = math.sqrt(squares / dof)
         # r'r is the normal matrix, so its inverse's root is that of r.
-        best, best_squares = Surface(degree, resolution_px, found, noise * np.linalg.inv(r), float(dof), noise), squares
+        best, best_squares = (
+            Surface(degree, resolution_px, found, noise * np.linalg.inv(r), float(dof), noise),
+            squares,
+        )
     if best is None:
         needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
-        raise InputError(f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and [collimator]")
+        raise InputError(
+            f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and [collimator]"
+        )
     return best
 
 
@@ -287,7 +333,9 @@ def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
     fit = surface(read.x_px, read.y_px, off[:, None], EVEN_DEGREES, size)
     left = off - (fit.terms(read.x_px, read.y_px) @ fit.value)[:, 0]
     kept = np.isfinite(left)
-    kept &= np.abs(left) <= WILD_SIGMAS * max(MAD_TO_SIGMA * float(np.median(np.abs(left[kept]))), 1e-12)
+    kept &= np.abs(left) <= WILD_SIGMAS * max(
+        MAD_TO_SIGMA * float(np.median(np.abs(left[kept]))), 1e-12
+    )
     x, y = read.x_px[kept], read.y_px[kept]
     terms = fit.terms(x, y)
     found = in_place(x, y, left[None, kept], terms[None])

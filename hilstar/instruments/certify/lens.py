@@ -106,7 +106,9 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     geometry = geometry_of(file)
     kept: BoolArray = np.asarray(np.isfinite(seen_off).all(axis=1))
     monitor = geometry.monitor
-    flat = Camera(monitor.resolution_px, monitor.focal_length_px, monitor.principal_point_px, np.eye(3), None)
+    flat = Camera(
+        monitor.resolution_px, monitor.focal_length_px, monitor.principal_point_px, np.eye(3), None
+    )
     rays = monitor.rays(read.x_px, read.y_px)
     wanted = rays[:, :2] / rays[:, 2:]
     found = _fitted(geometry, flat, wanted, read, kept)
@@ -130,7 +132,9 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     for degree in (0, *DEGREES):
         terms = np.concatenate([_terms(found, flat, wanted[kept], (x, y), degree), phases], axis=2)
         scale = np.maximum(np.linalg.norm(terms.reshape(2 * len(x), -1), axis=0), TINY)
-        vectors, size, across = np.linalg.svd(terms.reshape(2 * len(x), -1) / scale, full_matrices=False)
+        vectors, size, across = np.linalg.svd(
+            terms.reshape(2 * len(x), -1) / scale, full_matrices=False
+        )
         told = size > SAME * size[0]
         own = vectors[:, told]
         coefficients = own.T @ left[kept].T.ravel()
@@ -139,7 +143,9 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
         structure = in_place(x, y, rest, basis)
         mix = across[told].T / size[told] / scale[:, None]
         dof = float(2 * len(x) - told.sum())
-        fit = LensFit(geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof)
+        fit = LensFit(
+            geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof
+        )
         # By what the residuals show: the variance of a structure as long as the field is hardly
         # known.
         if float((rest**2).sum()) / dof <= (1 + DOT_VARIANCE) * structure.noise_variance:
@@ -152,12 +158,16 @@ def _phases(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """What the pattern of the tracker's pixels does to centroids (2, n, 4): waves of one pixel,
     along each axis by itself.
     """
-    waves = [np.stack([np.sin(2 * np.pi * at), np.cos(2 * np.pi * at)], axis=1) for at in (x_px, y_px)]
+    waves = [
+        np.stack([np.sin(2 * np.pi * at), np.cos(2 * np.pi * at)], axis=1) for at in (x_px, y_px)
+    ]
     nothing = np.zeros_like(waves[0])
     return np.stack([np.hstack([waves[0], nothing]), np.hstack([nothing, waves[1]])])
 
 
-def _fitted(geometry: BenchGeometry, flat: Camera, wanted: FloatArray, read: DotReadings, kept: BoolArray) -> fits.Fit:
+def _fitted(
+    geometry: BenchGeometry, flat: Camera, wanted: FloatArray, read: DotReadings, kept: BoolArray
+) -> fits.Fit:
     """The lens that turns directions of the bench file into those seen."""
     x, y = flat.places_px(*wanted[kept].T)
     count = len(x)
@@ -165,8 +175,12 @@ def _fitted(geometry: BenchGeometry, flat: Camera, wanted: FloatArray, read: Dot
     plan = DotPlan(x, y, np.ones((count, 1), dtype=bool))
     seen = Observed(none, none, read.seen_x_px[kept], read.seen_y_px[kept], np.ones(count))
     still = np.array([[1.0, 0.0, 0.0, 0.0]])
-    problem = fits.Problem(plan, fits.Nominal(flat, still[0], geometry.tracker), still, EXPECTED_NOISE_PX)
-    return fits.fit(problem, fits.Model(fits.BROWN_CONRADY), 0, fits.MatchedDots(seen, np.arange(count)))
+    problem = fits.Problem(
+        plan, fits.Nominal(flat, still[0], geometry.tracker), still, EXPECTED_NOISE_PX
+    )
+    return fits.fit(
+        problem, fits.Model(fits.BROWN_CONRADY), 0, fits.MatchedDots(seen, np.arange(count))
+    )
 
 
 def _tangents(fitted: Camera, flat: Camera, wanted: FloatArray) -> FloatArray:
@@ -175,7 +189,13 @@ def _tangents(fitted: Camera, flat: Camera, wanted: FloatArray) -> FloatArray:
     return np.asarray(rays[:, :2] / rays[:, 2:])
 
 
-def _terms(fit: fits.Fit, flat: Camera, wanted: FloatArray, at_px: tuple[FloatArray, FloatArray], degree: int) -> FloatArray:
+def _terms(
+    fit: fits.Fit,
+    flat: Camera,
+    wanted: FloatArray,
+    at_px: tuple[FloatArray, FloatArray],
+    degree: int,
+) -> FloatArray:
     """Slopes (2, n, terms) of places, arcsec, by the lens's numbers, or polynomials in their
     place where there is a degree.
     """
@@ -186,7 +206,9 @@ def _terms(fit: fits.Fit, flat: Camera, wanted: FloatArray, at_px: tuple[FloatAr
         return polynomials
     still = np.array([[1.0, 0.0, 0.0, 0.0]])
     nominal = fits.Nominal(flat, still[0], flat)
-    shown = np.append(_tangents(fit.geometry.monitor, flat, wanted), np.ones((len(wanted), 1)), axis=1)
+    shown = np.append(
+        _tangents(fit.geometry.monitor, flat, wanted), np.ones((len(wanted), 1)), axis=1
+    )
     columns = []
     for number in range(fit.model.size):
         step = np.zeros(fit.model.size)
@@ -196,7 +218,9 @@ def _terms(fit: fits.Fit, flat: Camera, wanted: FloatArray, at_px: tuple[FloatAr
             camera = fits.geometry_of(fit.model, nominal, still, fit.numbers + sign * step).monitor
             places.append(np.stack(camera.project(shown @ camera.cam_to_image.T)))
         # A pixel that moves by the lens shows its direction elsewhere by the opposite.
-        columns.append((places[1] - places[0]) / (2 * DERIVATIVE_STEP) / flat.focal_length_px * ARCSEC_PER_RAD)
+        columns.append(
+            (places[1] - places[0]) / (2 * DERIVATIVE_STEP) / flat.focal_length_px * ARCSEC_PER_RAD
+        )
     return np.concatenate([np.stack(columns, axis=2), polynomials, _decentring(wanted)], axis=2)
 
 

@@ -74,11 +74,15 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
             if len({star.field for star in stars}) == file.config.certify.fields:
                 break
     if not stars:
-        raise InputError(f"{file.path}: no {MIN_STARS} stars stand alone in a reference field; write a fainter [sky]")
+        raise InputError(
+            f"{file.path}: no {MIN_STARS} stars stand alone in a reference field; write a fainter [sky]"
+        )
     return stars
 
 
-def _of_field(bench: Bench, frame: Frame, number: int, geometry: BenchGeometry) -> list[ReferenceStar]:
+def _of_field(
+    bench: Bench, frame: Frame, number: int, geometry: BenchGeometry
+) -> list[ReferenceStar]:
     truth, sigma = frame.rows, max(bench.psf.width_px)
     vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
     x, y = truth["x_px"].astype(np.float64), truth["y_px"].astype(np.float64)
@@ -91,7 +95,11 @@ def _of_field(bench: Bench, frame: Frame, number: int, geometry: BenchGeometry) 
     third, shown, found = thirds(geometry, x), shown_light(frame.levels, bench.panel), []
     for each in range(len(THIRDS)):
         here = np.flatnonzero(kept & (third == each))  # the brightest first
-        for k in here[np.unique(np.linspace(0, len(here) - 1, STARS_A_THIRD).astype(int))] if len(here) else []:
+        for k in (
+            here[np.unique(np.linspace(0, len(here) - 1, STARS_A_THIRD).astype(int))]
+            if len(here)
+            else []
+        ):
             rows, columns = (slice(round(at) - reach, round(at) + reach + 1) for at in (y[k], x[k]))
             light, level = shown[rows, columns].ravel(), frame.levels[rows, columns].ravel()
             wanted, lit = float(frame.linear[rows, columns].sum(dtype=np.float64)), light > 0
@@ -126,7 +134,11 @@ def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
     """The third (n,) of what the tracker sees of the screen, 0 at the left, by columns."""
     along, down = geometry.monitor.grid_px((181, 61))
     seen = along[_seen(geometry, along, down)]
-    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, float(geometry.monitor.resolution_px[0]))
+    low, high = (
+        (float(seen.min()), float(seen.max()))
+        if len(seen)
+        else (0.0, float(geometry.monitor.resolution_px[0]))
+    )
     return np.asarray(np.clip((x_px - low) / max(high - low, 1.0) * 3, 0, 2).astype(np.intp))
 
 
@@ -154,21 +166,33 @@ class Figures:
 
     def __init__(self, file: BenchFile, stars: list[ReferenceStar]) -> None:
         self.stars, self.file = stars, file
-        self.log_light, place = np.unique(np.concatenate([star.log_light for star in stars]), return_inverse=True)
+        self.log_light, place = np.unique(
+            np.concatenate([star.log_light for star in stars]), return_inverse=True
+        )
         self._shares = np.zeros((len(stars), len(self.log_light)))
         start = 0
         for number, star in enumerate(stars):
             np.add.at(self._shares[number], place[start : start + len(star.share)], star.share)
             start += len(star.share)
-        self.x_px, self.y_px = (np.array([getattr(star, name) for star in stars]) for name in ("x_px", "y_px"))
+        self.x_px, self.y_px = (
+            np.array([getattr(star, name) for star in stars]) for name in ("x_px", "y_px")
+        )
         self._direction = np.stack([star.direction for star in stars])
         self.tangent = self._direction[:, :2] / self._direction[:, 2:]
         fields = np.array([star.field for star in stars])
-        self._of_field = [np.flatnonzero(fields == number) for number in range(int(fields.max()) + 1)]
+        self._of_field = [
+            np.flatnonzero(fields == number) for number in range(int(fields.max()) + 1)
+        ]
         each = [("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec")]
-        self.names = [(quantity, star, unit) for quantity, unit in each for star in range(len(stars))]
+        self.names = [
+            (quantity, star, unit) for quantity, unit in each for star in range(len(stars))
+        ]
         axes = [("attitude_x", "arcsec"), ("attitude_y", "arcsec"), ("attitude_z", "arcsec")]
-        self.names += [(quantity, -1 - field, unit) for field in range(len(self._of_field)) for quantity, unit in axes]
+        self.names += [
+            (quantity, -1 - field, unit)
+            for field in range(len(self._of_field))
+            for quantity, unit in axes
+        ]
         self.names.append(("latency", 0, "ms"))
 
     def turned(self, turns_arcsec: FloatArray) -> FloatArray:
@@ -184,13 +208,18 @@ class Figures:
         arcsec, latency ms.
         """
         certify, monitor = self.file.config.certify, self.file.config.monitor
-        flux = magnitude(np.maximum(off.levels @ self._shares.T, NO_LIGHT)) - MAG_PER_RELATIVE * off.even
+        flux = (
+            magnitude(np.maximum(off.levels @ self._shares.T, NO_LIGHT))
+            - MAG_PER_RELATIVE * off.even
+        )
         late_ms = off.delay_ms - monitor.panel_delay_ms + off.late_ms
         place = off.place_arcsec.copy()
         # deg/s to arcsec/ms; what is late lags behind
         place[..., 0] -= certify.rate_deg_s * 3.6 * late_ms[:, None]
         turned = [self._attitude(place[:, stars], stars) for stars in self._of_field]
-        return np.concatenate([flux, place[..., 0], place[..., 1], *turned, off.delay_ms[:, None]], axis=1)
+        return np.concatenate(
+            [flux, place[..., 0], place[..., 1], *turned, off.delay_ms[:, None]], axis=1
+        )
 
     def _attitude(self, place_arcsec: FloatArray, stars: IntArray) -> FloatArray:
         """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported
@@ -203,15 +232,32 @@ class Figures:
         left[..., 2] *= np.linalg.det(left @ right)[:, None]
         turn = left @ right
         # The axial vector of a rotation by an angle a is 2 sin(a) times its axis.
-        axial = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+        axial = np.stack(
+            [
+                turn[:, 2, 1] - turn[:, 1, 2],
+                turn[:, 0, 2] - turn[:, 2, 0],
+                turn[:, 1, 0] - turn[:, 0, 1],
+            ],
+            axis=1,
+        )
         sine = np.linalg.norm(axial, axis=1, keepdims=True) / 2
-        return np.asarray(axial / 2 * ARCSEC_PER_RAD * np.arcsin(np.clip(sine, 1e-300, 1.0)) / np.maximum(sine, 1e-300))
+        return np.asarray(
+            axial
+            / 2
+            * ARCSEC_PER_RAD
+            * np.arcsin(np.clip(sine, 1e-300, 1.0))
+            / np.maximum(sine, 1e-300)
+        )
 
 
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     """The deviations of a bench whose truth is known (b = 1), at its reference stars."""
     file = figures.file
-    mine, its, (width, height) = grey_response(file), grey_response(truth), file.config.monitor.resolution_px
+    mine, its, (width, height) = (
+        grey_response(file),
+        grey_response(truth),
+        file.config.monitor.resolution_px,
+    )
     levels = np.interp(figures.log_light, np.log(mine.light[1:]), its.light[1:] / mine.light[1:])
     levels *= white_of(truth) / white_of(file)
     rows, columns = np.rint(figures.y_px).astype(np.intp), np.rint(figures.x_px).astype(np.intp)
@@ -220,7 +266,9 @@ def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
         known = bench_calibration(bench.config, bench.folder).uniformity_map((width, height))
         if known is not None:
             even += sign * np.log(known[rows, columns].astype(np.float64))
-    shown, wanted = (geometry_of(each).monitor.rays(figures.x_px, figures.y_px) for each in (truth, file))
+    shown, wanted = (
+        geometry_of(each).monitor.rays(figures.x_px, figures.y_px) for each in (truth, file)
+    )
     place = (shown[:, :2] / shown[:, 2:] - wanted[:, :2] / wanted[:, 2:]) * ARCSEC_PER_RAD
     delay = np.array([truth.config.monitor.panel_delay_ms])
     return Deviations(levels[None], even[None], place[None], delay, np.zeros(1))

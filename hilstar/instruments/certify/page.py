@@ -18,7 +18,11 @@ from hilstar.server.bench.certificate import Certificate, CertifiedFigure
 PRINTED = """<style>@page { size: A4; margin: 16mm } @media print { body { margin: 0; max-width: none; font-size: 11px }
 details { display: block } details > * { display: block } h2 { break-after: avoid } tr, img, p { break-inside: avoid } }
 .banner { border-left: .5rem solid; padding: .5rem 1rem; margin: 1rem 0; font-size: 1.1em }</style>"""
-VERDICTS = {True: ("#2e7d32", "Conforms"), False: ("#c62828", "Does not conform"), None: ("#0b62a4", "Stated, no limits")}
+VERDICTS = {
+    True: ("#2e7d32", "Conforms"),
+    False: ("#c62828", "Does not conform"),
+    None: ("#0b62a4", "Stated, no limits"),
+}
 SHOWN = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")
 BARS = ("flux", "place_along", "attitude_x", "star_flux")
 MAX_BARS = 6
@@ -34,18 +38,32 @@ def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
     """
     colour, verdict = VERDICTS[found.conforms]
     missed = [each for each in found.figures if each.conforms is False]
-    why = f": {len(missed)} of {sum(each.conforms is not None for each in found.figures)} figures" if missed else ""
+    why = (
+        f": {len(missed)} of {sum(each.conforms is not None for each in found.figures)} figures"
+        if missed
+        else ""
+    )
     body = [
         PRINTED,
         f'<p class="banner" style="border-color:{colour}"><b>{verdict}{why}</b>. {escaped(statement(found))}</p>',
         table_of(_heads(found, digest)),
         "<h2>Figures</h2><p>Worst of each kind and region: value and 95 % interval (coverage factor k by Student's t).</p>",
-        table_of(list(_worst(found)), ("quantity", "region", "value", "from", "to", "unit", "k", "dof", "limit", "verdict")),
+        table_of(
+            list(_worst(found)),
+            ("quantity", "region", "value", "from", "to", "unit", "k", "dof", "limit", "verdict"),
+        ),
         table_of([(name, text) for name, text in found.measurands.items()]),
         "<h2>Budget</h2>",
-        *(_bars(found, quantity) for quantity in BARS if any(each.quantity == quantity for each in found.figures)),
+        *(
+            _bars(found, quantity)
+            for quantity in BARS
+            if any(each.quantity == quantity for each in found.figures)
+        ),
         table_of(
-            [(e.name, e.distribution, e.standard_uncertainty, e.unit, e.dof, e.source) for e in found.inputs],
+            [
+                (e.name, e.distribution, e.standard_uncertainty, e.unit, e.dof, e.source)
+                for e in found.inputs
+            ],
             ("input", "distribution", "standard uncertainty", "unit", "dof", "source"),
         ),
         "<h2>First order against trials</h2>",
@@ -56,10 +74,25 @@ def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
         table_of([(f"monitor {key}", str(value)) for key, value in found.monitor.items()]),
         table_of([(f"collimator {key}", str(value)) for key, value in found.collimator.items()]),
         "<h2>Files</h2>",
-        table_of([(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()], ("file", "SHA-256")),
+        table_of(
+            [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()],
+            ("file", "SHA-256"),
+        ),
         f"<details><summary>All {len(found.figures)} figures</summary>",
         table_of(
-            [(e.quantity, e.region, e.star, e.value, e.standard_uncertainty, e.lower, e.upper, e.unit) for e in found.figures],
+            [
+                (
+                    e.quantity,
+                    e.region,
+                    e.star,
+                    e.value,
+                    e.standard_uncertainty,
+                    e.lower,
+                    e.upper,
+                    e.unit,
+                )
+                for e in found.figures
+            ],
             ("quantity", "region", "HIP", "value", "standard uncertainty", "from", "to", "unit"),
         ),
         "</details>",
@@ -70,8 +103,14 @@ def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
 def statement(found: Certificate) -> str:
     """The statement of uncertainty, in a sentence or two."""
     parts = []
-    for quantity, words in (("flux", "a star's flux"), ("place_along", "its place"), ("attitude_x", "attitude across")):
-        half = [(each.upper - each.lower) / 2 for each in found.figures if each.quantity == quantity]
+    for quantity, words in (
+        ("flux", "a star's flux"),
+        ("place_along", "its place"),
+        ("attitude_x", "attitude across"),
+    ):
+        half = [
+            (each.upper - each.lower) / 2 for each in found.figures if each.quantity == quantity
+        ]
         unit = next((each.unit for each in found.figures if each.quantity == quantity), "")
         if half:
             parts.append(f"{words} {np.sqrt(np.mean(np.square(half))):.2g} {unit}")
@@ -89,7 +128,10 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
         yield name, getattr(found, name) or "not stated"
     if found.instrument:
         of = found.instrument
-        yield "instrument", f"{of['name']}, {of['date']}: U = {of['relative_expanded']:.3g} relative, k = {of['k']:g}"
+        yield (
+            "instrument",
+            f"{of['name']}, {of['date']}: U = {of['relative_expanded']:.3g} relative, k = {of['k']:g}",
+        )
     yield "decision rule", RULES[found.decision]
     if found.replaces:
         yield "replaces", found.replaces
@@ -105,9 +147,26 @@ def _worst(found: Certificate) -> Iterator[tuple[object, ...]]:
     for (quantity, region), members in groups.items():
         worst = max(members, key=lambda each: max(abs(each.lower), abs(each.upper)))
         judged = [each.conforms for each in members if each.conforms is not None]
-        verdict = None if not judged else "conforms" if all(judged) else f"{judged.count(False)} of {len(judged)} do not"
+        verdict = (
+            None
+            if not judged
+            else "conforms"
+            if all(judged)
+            else f"{judged.count(False)} of {len(judged)} do not"
+        )
         dof = "unlimited" if worst.dof is None else f"{worst.dof:.0f}"
-        yield quantity, region, worst.value, worst.lower, worst.upper, worst.unit, worst.k, dof, worst.limit, verdict
+        yield (
+            quantity,
+            region,
+            worst.value,
+            worst.lower,
+            worst.upper,
+            worst.unit,
+            worst.k,
+            dof,
+            worst.limit,
+            verdict,
+        )
 
 
 def _bars(found: Certificate, quantity: str) -> str:
@@ -124,16 +183,35 @@ def _bars(found: Certificate, quantity: str) -> str:
     finding = f"{quantity}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]} {np.sqrt(ranked[0][1]):.2g}"
     with panels_of(finding, height_inch=1.1 + 0.3 * len(ranked)) as (axes,):
         colours = [BLUE if k == 0 else TEAL for k in range(len(ranked))]
-        value_bars(axes, [f"{name} [{unit}]" for name, _ in ranked], [float(np.sqrt(value)) for _, value in ranked], colours)
+        value_bars(
+            axes,
+            [f"{name} [{unit}]" for name, _ in ranked],
+            [float(np.sqrt(value)) for _, value in ranked],
+            colours,
+        )
     return drawing_of(axes.figure, f"budget of {quantity}")
 
 
 def _both_ways(found: Certificate) -> Iterator[str]:
-    both = [each for each in found.figures if each.by_trials is not None and each.standard_uncertainty > 0]
+    both = [
+        each
+        for each in found.figures
+        if each.by_trials is not None and each.standard_uncertainty > 0
+    ]
     if not both:
         return
-    ratio = np.array([each.by_trials.standard_uncertainty / each.standard_uncertainty for each in both if each.by_trials])
-    stand = "two digits of every figure stand" if found.two_digits_stand else "the largest number of trials was reached"
+    ratio = np.array(
+        [
+            each.by_trials.standard_uncertainty / each.standard_uncertainty
+            for each in both
+            if each.by_trials
+        ]
+    )
+    stand = (
+        "two digits of every figure stand"
+        if found.two_digits_stand
+        else "the largest number of trials was reached"
+    )
     yield (
         f"<p>{found.trials} trials of the whole model ({stand}): their standard uncertainty is {ratio.min():.3f} to"
         f" {ratio.max():.3f} of first order's.</p>"
@@ -146,18 +224,28 @@ def _both_ways(found: Certificate) -> Iterator[str]:
     ]  # fmt: skip
     if rows:
         yield f"<p>{len(apart)} figures differ by more than 5 % of the interval; the certificate states the trials'.</p>"
-        yield table_of(rows, ("quantity", "of", "first order from", "to", "trials from", "to", "why"))
+        yield table_of(
+            rows, ("quantity", "of", "first order from", "to", "trials from", "to", "why")
+        )
     else:
         yield "<p>No interval differs by more than 5 %.</p>"
 
 
 def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str, str]]:
     """The certificate as lines of a terminal: name and text."""
-    lines = [("number", found.number), ("verdict", VERDICTS[found.conforms][1]), ("uncertainty", statement(found))]
+    lines = [
+        ("number", found.number),
+        ("verdict", VERDICTS[found.conforms][1]),
+        ("uncertainty", statement(found)),
+    ]
     for quantity in SHOWN:
         for region in (*THIRDS, None):
-            members = [e for e in found.figures if e.quantity == quantity and region in (None, e.region)]
-            if not members or (region is None) == (quantity in ("flux", "place_along", "place_across")):
+            members = [
+                e for e in found.figures if e.quantity == quantity and region in (None, e.region)
+            ]
+            if not members or (region is None) == (
+                quantity in ("flux", "place_along", "place_across")
+            ):
                 continue
             each = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
             half = (each.upper - each.lower) / 2
@@ -167,4 +255,9 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
             text = f"{value} +- {half:.{places}f} {each.unit} (the worst of {len(members)})"
             lines.append((f"{quantity} {region or ''}".strip(), text))
     lines += [("not assessed", each) for each in found.not_assessed]
-    return [*lines, ("valid until", found.valid_until), ("sha256", digest), ("page", str(folder / "index.html"))]
+    return [
+        *lines,
+        ("valid until", found.valid_until),
+        ("sha256", digest),
+        ("page", str(folder / "index.html")),
+    ]

@@ -29,7 +29,12 @@ from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_calibration, calibration_source, open_bench, orientation_of
+from hilstar.server.bench.build import (
+    bench_calibration,
+    calibration_source,
+    open_bench,
+    orientation_of,
+)
 from hilstar.server.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
@@ -82,7 +87,9 @@ class DotReadings:
 
 def geometry_of(file: BenchFile) -> BenchGeometry:
     """Monitor and tracker as a bench file has them."""
-    return BenchGeometry(bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder))
+    return BenchGeometry(
+        bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder)
+    )
 
 
 def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
@@ -91,11 +98,16 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
     """
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     width, height = geometry.monitor.resolution_px
-    seen = math.prod(min(ratio * s, t) for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True))
+    seen = math.prod(
+        min(ratio * s, t)
+        for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True)
+    )
     step = max(math.ceil(max(APART_TRACKER_PX, math.sqrt(seen / MAX_DOTS)) / ratio), 2 * DOT_PX)
     x, y = (
         part.ravel()
-        for part in np.meshgrid(np.arange(step // 2, width - DOT_PX, step), np.arange(step // 2, height - DOT_PX, step))
+        for part in np.meshgrid(
+            np.arange(step // 2, width - DOT_PX, step), np.arange(step // 2, height - DOT_PX, step)
+        )
     )
     at_x, at_y = geometry.to_tracker(x.astype(np.float64), y.astype(np.float64))
     wide, high = geometry.tracker.resolution_px
@@ -132,13 +144,17 @@ class VirtualReader:
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         image_sources.refuse_other_bench(file, truth)
         if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
-            raise InputError(f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)")
+            raise InputError(
+                f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)"
+            )
         self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
         self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
         self._noise, self._t_s = truth.config.certify.virtual, 0.0
         monitor = truth.config.monitor
         self._response = grey_response(truth)
-        self._uniformity = bench_calibration(truth.config, truth.folder).uniformity_map(monitor.resolution_px)
+        self._uniformity = bench_calibration(truth.config, truth.folder).uniformity_map(
+            monitor.resolution_px
+        )
         self._white_e_per_s = white_of(truth)
 
     def now_ns(self) -> int:
@@ -168,20 +184,34 @@ class VirtualReader:
         x, y = x_px.astype(np.float64), y_px.astype(np.float64)
         less = 1 / math.sqrt(images)
         seen = geometry_of(self.truth).to_tracker(x, y)
-        light = np.ones(len(x)) if self._uniformity is None else self._uniformity[y_px, x_px].astype(np.float64)
+        light = (
+            np.ones(len(x))
+            if self._uniformity is None
+            else self._uniformity[y_px, x_px].astype(np.float64)
+        )
         light *= 1 + less * self._noise.reading_noise * self._rng.standard_normal(len(x))
-        seen_x, seen_y = (part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x)) for part in seen)
+        seen_x, seen_y = (
+            part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x))
+            for part in seen
+        )
         kept = np.isfinite(seen_x) & np.isfinite(seen_y)
         psf_u = less * self._noise.reading_noise
-        psf = float(np.hypot(*tracker_psf(self.truth.config.tracker, self.truth.folder).width_px) / math.sqrt(2))
+        psf = float(
+            np.hypot(*tracker_psf(self.truth.config.tracker, self.truth.folder).width_px)
+            / math.sqrt(2)
+        )
         noisy = psf * (1 + psf_u * float(self._rng.standard_normal()))
-        return DotReadings(x[kept], y[kept], seen_x[kept], seen_y[kept], light[kept], noisy, psf * psf_u)
+        return DotReadings(
+            x[kept], y[kept], seen_x[kept], seen_y[kept], light[kept], noisy, psf * psf_u
+        )
 
     def delays_ms(self) -> FloatArray:
         """A simulated photodiode."""
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
-        return delays_of(image_sources.virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file)
+        return delays_of(
+            image_sources.virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file
+        )
 
 
 def white_of(file: BenchFile) -> float:
@@ -255,7 +285,10 @@ class ImageReader:
             for down in range(-half, half + 1):
                 for right in range(-half, half + 1):
                     codes[y_px + down, x_px + right] = code
-            looked = [context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark) for number in range(images)]
+            looked = [
+                context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark)
+                for number in range(images)
+            ]
             if not context.is_too_bright(looked[0]):
                 break
             code = context.darker(code)
@@ -269,11 +302,21 @@ class ImageReader:
             raise InputError(
                 f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus and the exposure"
             )
-        far, near = (np.asarray(part) for part in cKDTree(np.stack([found.x_px, found.y_px], axis=1)).query(expected))
+        far, near = (
+            np.asarray(part)
+            for part in cKDTree(np.stack([found.x_px, found.y_px], axis=1)).query(expected)
+        )
         kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
         if kept.sum() < MIN_DOTS:
-            raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
-        seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(self._context.file))
+            raise InputError(
+                f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)"
+            )
+        seen = SeenScreen(
+            geometry.monitor,
+            geometry.tracker,
+            is_sure=True,
+            psf_sigma_px=psf_sigma_of(self._context.file),
+        )
         sharp = seen_sharpness(image, seen, self.file.config.tracker.detector, len(looked))
         at = near[kept]
         places = x[kept], y[kept], found.x_px[at], found.y_px[at]

@@ -85,7 +85,13 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
             weight = 1 / (1 + ratio * eigen)
             normal = spread.terms.T @ (weight[:, None] * spread.terms)
             towards = spread.terms.T @ (weight * spread.value)
-            left = float(spread.value @ (weight * spread.value) - towards @ np.linalg.solve(normal, towards)) + spread.square
+            left = (
+                float(
+                    spread.value @ (weight * spread.value)
+                    - towards @ np.linalg.solve(normal, towards)
+                )
+                + spread.square
+            )
             sizes = float(np.linalg.slogdet(normal)[1] - np.log(weight).sum())
             likelihood[row, column] = -0.5 * (sizes + dof * math.log(max(left, TINY)))
             noise[row, column] = left / dof
@@ -106,7 +112,12 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
     middle = float((share * np.log(each)).sum())
     dof = max(2 / max(float((share * (np.log(each) - middle) ** 2).sum()), TINY), MIN_DOF)
     variance = (share * each).sum(axis=1)
-    return Structure(finer[0], variance * math.exp(middle) / variance.sum(), float((share * noise_of_some).sum()), dof)
+    return Structure(
+        finer[0],
+        variance * math.exp(middle) / variance.sum(),
+        float((share * noise_of_some).sum()),
+        dof,
+    )
 
 
 def _finer(values: FloatArray, step: float) -> FloatArray:
@@ -115,9 +126,13 @@ def _finer(values: FloatArray, step: float) -> FloatArray:
     return np.asarray(np.geomspace(values[0], values[-1], count))
 
 
-def _between(lengths: FloatArray, values: FloatArray, finer: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _between(
+    lengths: FloatArray, values: FloatArray, finer: tuple[FloatArray, FloatArray]
+) -> FloatArray:
     """Values (lengths, ratios), smooth in the logarithms of both, on a finer grid."""
-    spline = RectBivariateSpline(np.log(lengths), np.log(RATIOS), values, kx=min(3, len(lengths) - 1), ky=3, s=0)
+    spline = RectBivariateSpline(
+        np.log(lengths), np.log(RATIOS), values, kx=min(3, len(lengths) - 1), ky=3, s=0
+    )
     return np.asarray(spline(np.log(finer[0]), np.log(finer[1])))
 
 
@@ -173,7 +188,9 @@ class Cells:
     def lengths(self) -> FloatArray:
         """Lengths that the lattice can tell, px: from half of a cell to half of its extent."""
         low, high = min(self.side) / 2, max(float(np.ptp(each)) for each in self.middle) / 2
-        return np.asarray(np.geomspace(low, high, max(round(math.log(high / low) / math.log(LENGTH_STEP)) + 1, 2)))
+        return np.asarray(
+            np.geomspace(low, high, max(round(math.log(high / low) / math.log(LENGTH_STEP)) + 1, 2))
+        )
 
     def means(self, values: FloatArray) -> FloatArray:
         """The means (cells, ...) of values (n, ...); 0 in empty cells."""
@@ -189,7 +206,9 @@ class Cells:
         for middle, side in zip(self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 6  # a mean over a cell: its own variance twice
             between = (middle[:, None] - middle) ** 2
-            eigen, vectors = np.linalg.eigh(length_px / math.sqrt(wide) * np.exp(-between / (2 * wide)))
+            eigen, vectors = np.linalg.eigh(
+                length_px / math.sqrt(wide) * np.exp(-between / (2 * wide))
+            )
             parts.append((np.maximum(eigen, 0.0), vectors))
         (down, rows), (along, columns) = parts
         return np.outer(down, along).ravel(), rows, columns
@@ -205,11 +224,15 @@ class Cells:
         parts = []
         for at, middle, side in zip((y_px, x_px), self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 12
-            parts.append(length_px / math.sqrt(wide) * np.exp(-((at[:, None] - middle) ** 2) / (2 * wide)))
+            parts.append(
+                length_px / math.sqrt(wide) * np.exp(-((at[:, None] - middle) ** 2) / (2 * wide))
+            )
         return np.asarray((parts[0][:, :, None] * parts[1][:, None]).reshape(len(x_px), -1))
 
 
-def in_place(x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: FloatArray) -> Structure:
+def in_place(
+    x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: FloatArray
+) -> Structure:
     """The structure in place of residuals (axes, n) at places (n,), whose fit has `terms` (axes,
     n, p) common to all axes.
     """
@@ -218,7 +241,12 @@ def in_place(x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: Floa
     means = [cells.means(each) for each in values]
     of_terms = [cells.means(each) for each in terms]
     scale = math.sqrt(cells.typical)
-    within = float(sum(((each - mean[cells.index]) ** 2).sum() for each, mean in zip(values, means, strict=True)))
+    within = float(
+        sum(
+            ((each - mean[cells.index]) ** 2).sum()
+            for each, mean in zip(values, means, strict=True)
+        )
+    )
     free = float(len(values) * (len(cells.index) - (cells.count > 0).sum()))
     empty = np.flatnonzero(~cells.filled)
     hidden = np.zeros((cells.size, len(empty)))
@@ -247,8 +275,15 @@ def _rectangle(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
     cells = Cells(x_px, y_px)
     filled = cells.filled.reshape(len(cells.middle[0]), len(cells.middle[1]))
     low, high = [0, 0], list(filled.shape)
-    while not (part := filled[low[0] : high[0], low[1] : high[1]]).mean() > ENOUGH and part.size > MIN_CELLS:
-        edges = [(float(np.take(part, end, axis=axis).mean()), axis, end) for axis in (0, 1) for end in (0, -1)]
+    while (
+        not (part := filled[low[0] : high[0], low[1] : high[1]]).mean() > ENOUGH
+        and part.size > MIN_CELLS
+    ):
+        edges = [
+            (float(np.take(part, end, axis=axis).mean()), axis, end)
+            for axis in (0, 1)
+            for end in (0, -1)
+        ]
         _, axis, end = min(edges)
         low[axis] += end == 0
         high[axis] += end

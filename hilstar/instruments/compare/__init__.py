@@ -12,8 +12,20 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.instruments.compare.compare_skies import check_skies, compare_skies, read_frame_fits, read_truth_csv
-from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, finding, star_lines
+from hilstar.instruments.compare.compare_skies import (
+    check_skies,
+    compare_skies,
+    read_frame_fits,
+    read_truth_csv,
+)
+from hilstar.instruments.compare.sky_comparison import (
+    CENTROID_PX,
+    FLUX_MAG,
+    Limits,
+    SkyComparison,
+    finding,
+    star_lines,
+)
 from hilstar.instruments.compare.star_fit import Truth, describes
 from hilstar.server.bench.frame import Frame
 
@@ -40,7 +52,9 @@ def assert_same_sky(
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:
-        raise AssertionError("\n".join([finding(comparison), *star_lines(comparison, MAX_LINES, "")]))
+        raise AssertionError(
+            "\n".join([finding(comparison), *star_lines(comparison, MAX_LINES, "")])
+        )
     return comparison
 
 
@@ -83,7 +97,13 @@ def _together(image: FloatArray) -> FloatArray:
 def _image(sky: Sky) -> FloatArray:
     if isinstance(sky, str | Path):
         return read_frame_fits(Path(sky))
-    image = (sky.light if len(sky.light) > 1 else sky.linear) if isinstance(sky, Frame) else np.asarray(sky)
+    image = (
+        (sky.light if len(sky.light) > 1 else sky.linear)
+        if isinstance(sky, Frame)
+        else np.asarray(sky)
+    )
     if image.dtype.kind != "f":
-        raise InputError(f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes")
+        raise InputError(
+            f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes"
+        )
     return np.asarray(image, dtype=np.float64)

@@ -19,7 +19,12 @@ from hilstar.basics.reading import read_bytes
 from hilstar.basics.text_tables import finite_numbers, read_rows
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.instruments.compare import star_fit
-from hilstar.instruments.compare.sky_comparison import Limits, SkyComparison, StarDifference, common_change
+from hilstar.instruments.compare.sky_comparison import (
+    Limits,
+    SkyComparison,
+    StarDifference,
+    common_change,
+)
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import Psf
 
@@ -60,33 +65,49 @@ def compare_skies(
         tables = truth, frame_truth
         pairs = zip(CHANNELS, frame, golden, strict=True)
         each = {name: compare_skies(one, other, limits, *tables) for name, one, other in pairs}
-        return replace(compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each)
+        return replace(
+            compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each
+        )
     psf = star_fit.star_psf(golden)
     seeds, unmeasured = _measurable(golden, star_fit.find_seeds(golden, truth, psf), psf)
     if not seeds.hip:
-        raise InputError("compare: no star of the golden image has enough light in view; give one that has")
+        raise InputError(
+            "compare: no star of the golden image has enough light in view; give one that has"
+        )
     fit = _SkyFit(golden, seeds.places_px, psf)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
     more, less = moved.residual - fit.residual, fit.residual - moved.residual
-    for light, table, error in ((less, truth, math.inf), (more, truth if frame_truth is None else frame_truth, -math.inf)):
+    for light, table, error in (
+        (less, truth, math.inf),
+        (more, truth if frame_truth is None else frame_truth, -math.inf),
+    ):
         places, flux = _unexplained(light, fit, moved)
         stars += [
             StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
             for hip, (x, y), f in zip(
-                star_fit.names_at(places, table, star_fit.blend_distance_px(psf)), places, flux, strict=True
+                star_fit.names_at(places, table, star_fit.blend_distance_px(psf)),
+                places,
+                flux,
+                strict=True,
             )
         ]
-    return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
+    return SkyComparison(
+        stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0]))
+    )
 
 
 def check_skies(frame: FloatArray, golden: FloatArray) -> None:
     """Raise InputError where two images cannot be compared, as `compare_skies` does."""
     for name, image in (("frame", frame), ("golden", golden)):
         if not (image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)) or min(image.shape) < 2:
-            raise InputError(f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)")
+            raise InputError(
+                f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)"
+            )
         if not np.isfinite(image).all():
-            raise InputError(f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers")
+            raise InputError(
+                f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers"
+            )
     if frame.shape != golden.shape:
         (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
         raise InputError(
@@ -140,14 +161,25 @@ class _SkyFit:
         return fit
 
 
-def _differences(seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> list[StarDifference]:
+def _differences(
+    seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits
+) -> list[StarDifference]:
     flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
     shift = moved.places_px - fit.places_px
-    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px))
+    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (
+        np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px)
+    )
     error_mag = np.where(gone, np.inf, magnitude(np.where(gone, 1.0, moved.flux / fit.flux)))
-    columns = (*fit.places_px.T, fit.flux, error_mag, *np.where(gone, 0.0, shift.T), limit_mag, limit_px)
+    columns = (
+        *fit.places_px.T,
+        fit.flux,
+        error_mag,
+        *np.where(gone, 0.0, shift.T),
+        limit_mag,
+        limit_px,
+    )
     return [
         StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, Limits(own_mag, own_px))
         for hip, (x_px, y_px, flux, mag, dx_px, dy_px, own_mag, own_px) in zip(
@@ -169,7 +201,9 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
         star_fit.bright_pixels(light, star_fit.around(floor, fit.psf) + rounding), fit.psf
     ).places_px
     places = star_fit.refined(light, seeds, fit.psf)
-    flux = star_fit.StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    flux = star_fit.StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[
+        :, 0
+    ]
     column, row = seeds.astype(np.intp).T
     # Two stars at one place: the fit may give one too much and the other less than 0.
     return places, np.maximum(flux, light[row, column])
@@ -191,7 +225,9 @@ def read_frame_fits(path: Path) -> FloatArray:
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error
     if header.get("BUNIT") != UNIT or image.ndim not in (2, 3) or image.dtype.kind != "f":
-        raise InputError(f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
+        raise InputError(
+            f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}"
+        )
     light = np.asarray(image, dtype=np.float64)
     if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
         raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
@@ -211,6 +247,8 @@ def read_truth_csv(path: Path) -> star_fit.Truth:
         names.append(name)
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
     truth["name"] = names
-    for name, column in zip(TRUTH_COLUMNS, np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T, strict=True):
+    for name, column in zip(
+        TRUTH_COLUMNS, np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T, strict=True
+    ):
         truth[name] = column
     return truth

@@ -6,7 +6,18 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilstar.basics.charts import GREEN, INK, MUTED, ORANGE, PURPLE, RED, SMALL_PT, chart, title_lines, write_csv
+from hilstar.basics.charts import (
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    RED,
+    SMALL_PT,
+    chart,
+    title_lines,
+    write_csv,
+)
 from hilstar.basics.units import magnitude
 from hilstar.instruments.compare.sky_comparison import SkyComparison, StarDifference, finding
 
@@ -19,9 +30,24 @@ MAX_NAMES = 6  # stars named in each panel; the table has all
 MAX_TRIED = 60  # names that are tried for room
 ROOM_PX = 3.0  # between two names
 MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
-STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
+STYLES = (
+    ("same", ".", MUTED),
+    ("changed", "o", RED),
+    ("missing", "v", PURPLE),
+    ("extra", "^", ORANGE),
+)
 COLUMNS = (
-    *("kind", "hip", "x_px", "y_px", "flux_e_per_s", "flux_error_mag", "dx_px", "dy_px", "centroid_error_px"),
+    *(
+        "kind",
+        "hip",
+        "x_px",
+        "y_px",
+        "flux_e_per_s",
+        "flux_error_mag",
+        "dx_px",
+        "dy_px",
+        "centroid_error_px",
+    ),
     # 1 where the star differs from what is common to all
     *("flux_limit_mag", "centroid_limit_px", "differs"),
 )
@@ -68,7 +94,13 @@ class ChartPanel:
         self.common = 0.0
         if common is not None:
             self.common = abs(common.flux_mag) if unit == "mag" else math.hypot(*common.shift_px)
-        self.row = 4 * max([self.limit, self.common, *(max(self.point(star)[1:]) for star in self.of("same", "changed"))])
+        self.row = 4 * max(
+            [
+                self.limit,
+                self.common,
+                *(max(self.point(star)[1:]) for star in self.of("same", "changed")),
+            ]
+        )
         self.rows = {"missing": self.row, "extra": 8 * self.row}
 
     def of(self, *kinds: str) -> list[StarDifference]:
@@ -95,11 +127,26 @@ class ChartPanel:
         for kind, marker, colour in STYLES:
             mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
             heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
-            axis.plot(mags, heights, marker, color=colour, ms=5 if kind == "same" else 7, label=self.label(kind, len(mags)))
-        axis.axhline(self.limit, color=INK, ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
+            axis.plot(
+                mags,
+                heights,
+                marker,
+                color=colour,
+                ms=5 if kind == "same" else 7,
+                label=self.label(kind, len(mags)),
+            )
+        axis.axhline(
+            self.limit, color=INK, ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}"
+        )
         if self.common:
-            axis.axhline(self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
-        wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
+            axis.axhline(
+                self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}"
+            )
+        wider = [
+            point
+            for star in self.of("same", "changed")
+            if (point := self.point(star))[2] > self.limit
+        ]
         if wider:
             at, _, limits = zip(*wider, strict=True)
             axis.plot(at, limits, "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}")
@@ -114,7 +161,11 @@ class ChartPanel:
             if self.unit == "mag" if star.kind in self.rows else error > own:
                 name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
                 place = mag, self.rows.get(star.kind, error)
-                names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT))
+                names.append(
+                    axis.annotate(
+                        name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT
+                    )
+                )
         return names[:MAX_TRIED]
 
 
@@ -129,7 +180,11 @@ def write_report(directory: Path, comparison: SkyComparison) -> None:
         (
             *(star.kind, " ".join(map(str, star.hip)), star.x_px, star.y_px, star.flux_e_per_s),
             *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
-            *(star.limits.flux_mag, star.limits.centroid_px, int((star.hip, star.x_px, star.y_px) in odd)),
+            *(
+                star.limits.flux_mag,
+                star.limits.centroid_px,
+                int((star.hip, star.x_px, star.y_px) in odd),
+            ),
         )
         for star in comparison.stars
     ]

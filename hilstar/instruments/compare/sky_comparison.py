@@ -95,7 +95,10 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
         else:
             a, b, d, e, g, h = more
             wide = 1 + g * x + h * y
-            moved = np.stack([(a * x + b * y + right + x) / wide - x, (d * x + e * y + down + y) / wide - y], axis=-1)
+            moved = np.stack(
+                [(a * x + b * y + right + x) / wide - x, (d * x + e * y + down + y) / wide - y],
+                axis=-1,
+            )
         return np.asarray(moved * scale)
 
     return motion
@@ -107,7 +110,9 @@ def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> Fl
     for _ in range(ROUNDS):
         root = np.sqrt(weight)[:, None]
         weighted = (design * root[..., None]).reshape(-1, design.shape[2])
-        found = np.asarray(np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64)
+        found = np.asarray(
+            np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64
+        )
         weight = 1 / np.maximum(np.hypot(*(wanted - design @ found).T), finest)
     return np.asarray(found)
 
@@ -124,7 +129,9 @@ class Limits:
     def __post_init__(self) -> None:
         for name in ("flux_mag", "centroid_px"):
             if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"compare: {name} = {getattr(self, name):g}; write a number above 0")
+                raise InputError(
+                    f"compare: {name} = {getattr(self, name):g}; write a number above 0"
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,14 +167,24 @@ class StarDifference:
     @property
     def error_over_limit(self) -> float:
         """The larger of its two errors, each divided by its limit."""
-        return max(abs(self.flux_error_mag) / self.limits.flux_mag, self.centroid_error_px / self.limits.centroid_px)
+        return max(
+            abs(self.flux_error_mag) / self.limits.flux_mag,
+            self.centroid_error_px / self.limits.centroid_px,
+        )
 
     @property
     def name(self) -> str:
         """Its HIP number, those of its blend, or its place."""
         if self.hip:
-            hips, bodies = ([one for one in self.hip if isinstance(one, kind)] for kind in (int, str))
-            return " + ".join([*(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)), *map(str, bodies)])
+            hips, bodies = (
+                [one for one in self.hip if isinstance(one, kind)] for kind in (int, str)
+            )
+            return " + ".join(
+                [
+                    *(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)),
+                    *map(str, bodies),
+                ]
+            )
         return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
 
     def line(self) -> str:
@@ -207,13 +224,26 @@ class CommonChange:
         """What is common, for a person."""
         right, down = self.shift_px
         digits = 2 if math.hypot(right, down) >= 0.1 else 4
-        found = [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"] if any(self.shift_px) else []
+        found = (
+            [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"]
+            if any(self.shift_px)
+            else []
+        )
         found += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
         found += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
-        dimmer, digits = "dimmer" if self.flux_mag > 0 else "brighter", 2 if abs(self.flux_mag) >= 0.1 else 4
+        dimmer, digits = (
+            "dimmer" if self.flux_mag > 0 else "brighter",
+            2 if abs(self.flux_mag) >= 0.1 else 4,
+        )
         found += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
         odd = len(self.differing)
-        rest = "" if not odd else "; 1 star differs from that" if odd == 1 else f"; {odd} stars differ from that"
+        rest = (
+            ""
+            if not odd
+            else "; 1 star differs from that"
+            if odd == 1
+            else f"; {odd} stars differ from that"
+        )
         return f"all {', '.join(found) or 'moved alike'}{rest}"
 
     def summary(self) -> dict[str, Any]:
@@ -233,12 +263,18 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     nothing.
     """
     both = [star for star in stars if star.kind in ("same", "changed")]
-    missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
+    missing, extra = (
+        [star for star in stars if star.kind == kind] for kind in ("missing", "extra")
+    )
     pairs = dict(_pairs(missing, extra))
     for here, there in pairs.items():  # stars that moved far are in both images
         old, new = missing[here], extra[there]
         error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
-        both.append(replace(old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px))
+        both.append(
+            replace(
+                old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px
+            )
+        )
     if len(both) < max(MIN_STARS, MIN_STAR_SHARE * (len(both) + len(missing) - len(pairs))):
         return None
     middle = (np.array(size_px) - 1) / 2
@@ -251,7 +287,9 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     errors_mag = np.array([star.flux_error_mag for star in both])
     flux_mag = float(np.median(errors_mag))
     limit_mag = np.median([star.limits.flux_mag for star in both])
-    if abs(flux_mag) <= limit_mag or np.median(np.abs(errors_mag - flux_mag)) > MIN_SHARE * abs(flux_mag):
+    if abs(flux_mag) <= limit_mag or np.median(np.abs(errors_mag - flux_mag)) > MIN_SHARE * abs(
+        flux_mag
+    ):
         flux_mag = 0.0
     if motion is None and not flux_mag:
         return None
@@ -291,7 +329,10 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
     voters = min(MAX_VOTERS, len(old), len(new))
     if voters < MIN_STARS:
         return []
-    brightest = [np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS] for kind in (missing, extra)]
+    brightest = [
+        np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS]
+        for kind in (missing, extra)
+    ]
     votes = (new[brightest[1]][None, :] - old[brightest[0]][:, None]).reshape(-1, 2)
     near = cKDTree(votes).query_ball_point(votes, VOTE_PX)
     winner = max(near, key=len)
@@ -303,7 +344,9 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
         # Those that are each other's nearest, within PAIR_PX.
         distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
         back = np.asarray(cKDTree(predicted).query(new)[1])
-        pairs = [(k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k]
+        pairs = [
+            (k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k
+        ]
         here, there = (np.array([pair[k] for pair in pairs], dtype=np.intp) for k in (0, 1))
         middle = old.mean(axis=0)
         motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
@@ -372,12 +415,16 @@ class SkyComparison:
     @property
     def flux_error_mag(self) -> ErrorSpread:
         """Of the stars that both images have."""
-        return error_spread(np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")]))
+        return error_spread(
+            np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")])
+        )
 
     @property
     def centroid_error_px(self) -> ErrorSpread:
         """Of the stars that both images have."""
-        return error_spread(np.array([star.centroid_error_px for star in self.of("same", "changed")]))
+        return error_spread(
+            np.array([star.centroid_error_px for star in self.of("same", "changed")])
+        )
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `hilstar compare`; infinite errors are null there."""
@@ -393,7 +440,13 @@ class SkyComparison:
             "unmeasured": self.unmeasured,
             "common": None if self.common is None else self.common.summary(),
             "bad": [
-                {"kind": star.kind, "hip": star.hip, "x_px": star.x_px, "y_px": star.y_px, "flux_e_per_s": star.flux_e_per_s}
+                {
+                    "kind": star.kind,
+                    "hip": star.hip,
+                    "x_px": star.x_px,
+                    "y_px": star.y_px,
+                    "flux_e_per_s": star.flux_e_per_s,
+                }
                 | {"flux_error_mag": star.flux_error_mag, "dx_px": star.dx_px, "dy_px": star.dy_px}
                 for star in self.bad
             ],
@@ -430,7 +483,9 @@ def finding(comparison: SkyComparison) -> str:
         return f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and {largest[1]:.2g} px off"
     if comparison.common is not None:
         odd = comparison.differing[:1]
-        return f"Not the same sky: {comparison.common.line()}" + "".join(f"; the worst is {star.line()}" for star in odd)
+        return f"Not the same sky: {comparison.common.line()}" + "".join(
+            f"; the worst is {star.line()}" for star in odd
+        )
     counts = {name: len(comparison.of(name)) for name in ("changed", "missing", "extra")}
     rest = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
     return f"Not the same sky: of {comparison.star_count} stars {rest}; the worst is {comparison.bad[0].line()}"

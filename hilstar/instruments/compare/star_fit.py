@@ -61,7 +61,9 @@ class StarTemplates:
         self.places_px = places_px
         self.shape = shape
         reach_px = psf.footprint_px // 2 + 1
-        self._x, self._y = (_Profiles(places_px[:, k], psf.width_px[k], reach_px, shape[1 - k]) for k in (0, 1))
+        self._x, self._y = (
+            _Profiles(places_px[:, k], psf.width_px[k], reach_px, shape[1 - k]) for k in (0, 1)
+        )
         self.in_view = self._x.share.sum(axis=1) * self._y.share.sum(axis=1)
 
     @cached_property
@@ -82,11 +84,18 @@ class StarTemplates:
         """
         size, width = len(self.places_px), self._x.share.shape[1]
         middles = np.column_stack([self._x.middle, self._y.middle])
-        near = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
-        star, other = (np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1))
+        near = (
+            cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
+        )
+        star, other = (
+            np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1)
+        )
         along_x, along_y = (profiles.overlaps(star, other) for profiles in (self._x, self._y))
         entry = [(("share", "slope").index(y), ("share", "slope").index(x)) for y, x in COLUMNS]
-        blocks = np.stack([along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry], axis=1)
+        blocks = np.stack(
+            [along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry],
+            axis=1,
+        )
         row, col = (3 * star[:, None] + np.arange(9) // 3, 3 * other[:, None] + np.arange(9) % 3)
         return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))
 
@@ -125,10 +134,14 @@ class StarTemplates:
         blocks[row // 3, row % 3, col % 3] = entries.data[own]
         variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
         fluxes = entries.row % 3 + entries.col % 3 == 0
-        near = np.bincount(entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size)
+        near = np.bincount(
+            entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size
+        )
         around = pixel_error * near
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
+            return np.sqrt(variance[:, 0]) * around, np.sqrt(
+                variance[:, 1:].sum(axis=1)
+            ) * around / np.abs(flux)
 
 
 class _Profiles:
@@ -184,8 +197,14 @@ def star_psf(image: FloatArray) -> GaussianPsf:
     # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own
     # 1/12 px^2 is subtracted.
     power = np.vdot(image, image)
-    correlations = (np.vdot(image[:, 1:], image[:, :-1]) / power, np.vdot(image[1:], image[:-1]) / power)
-    x, y = (math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04)) for part in correlations)
+    correlations = (
+        np.vdot(image[:, 1:], image[:, :-1]) / power,
+        np.vdot(image[1:], image[:-1]) / power,
+    )
+    x, y = (
+        math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04))
+        for part in correlations
+    )
     sigma, first = np.array([x, y]), GaussianPsf((x, y))
     found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
     places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
@@ -197,7 +216,9 @@ def star_psf(image: FloatArray) -> GaussianPsf:
         if not good.any():
             break
         places[good] += np.clip(steps[good, :2], -0.5, 0.5)
-        sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma)
+        sigma = sigma + np.clip(
+            np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma
+        )
     return GaussianPsf((float(sigma[0]), float(sigma[1])))
 
 
@@ -212,20 +233,30 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
     return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
 
 
-def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int) -> FloatArray:
+def _sigma_steps(
+    padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int
+) -> FloatArray:
     """Newton's steps (n, 4) of each star by itself: x, y, sigma x, sigma y."""
     parts, pixels = [], []
     for axis in (0, 1):
-        pixel = np.rint(places_px[:, axis]).astype(np.intp)[:, None] + np.arange(-reach_px, reach_px + 1)
-        near, far = ((pixel - places_px[:, axis, None] + side) / sigma_px[axis] for side in (-0.5, 0.5))
+        pixel = np.rint(places_px[:, axis]).astype(np.intp)[:, None] + np.arange(
+            -reach_px, reach_px + 1
+        )
+        near, far = (
+            (pixel - places_px[:, axis, None] + side) / sigma_px[axis] for side in (-0.5, 0.5)
+        )
         widen = (near * _bell(near) - far * _bell(far)) / sigma_px[axis]
         parts.append((ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px[axis], widen))
         pixels.append(np.clip(pixel + 2 * reach_px, 0, padded.shape[1 - axis] - 1))
     (x, slope_x, widen_x), (y, slope_y, widen_y) = parts
     pairs = ((y, x), (y, slope_x), (slope_y, x), (y, widen_x), (widen_y, x))
-    columns = np.stack([v[:, :, None] * u[:, None, :] for v, u in pairs], axis=1).reshape(len(places_px), 5, -1)
+    columns = np.stack([v[:, :, None] * u[:, None, :] for v, u in pairs], axis=1).reshape(
+        len(places_px), 5, -1
+    )
     light = padded[pixels[1][:, :, None], pixels[0][:, None, :]].reshape(len(places_px), -1, 1)
-    fitted = np.linalg.pinv(columns @ columns.transpose(0, 2, 1), hermitian=True) @ (columns @ light)
+    fitted = np.linalg.pinv(columns @ columns.transpose(0, 2, 1), hermitian=True) @ (
+        columns @ light
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(fitted[:, 1:, 0] / fitted[:, :1, 0])
 
@@ -240,7 +271,9 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
     low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
     high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
     for _ in range(MAX_PLACE_STEPS):
-        step = np.clip(shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX)
+        step = np.clip(
+            shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX
+        )
         before, places_px = places_px, np.clip(places_px + step, low, high)
         if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
             break
@@ -269,7 +302,9 @@ class Seeds:
 
     def only(self, kept: npt.NDArray[np.bool_]) -> "Seeds":
         """The seeds (n,) that are `kept`."""
-        return Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
+        return Seeds(
+            self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep]
+        )
 
 
 def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
@@ -309,15 +344,21 @@ def describes(truth: Truth, image: FloatArray) -> bool:
     (height, width).
     """
     psf = star_psf(image)
-    return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf))
+    return _has(
+        truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf)
+    )
 
 
-def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int | str, ...]]:
+def names_at(
+    places_px: FloatArray, truth: Truth | None, blend_px: float
+) -> list[tuple[int | str, ...]]:
     """The HIP number of the table's star at each place (n, 2), px, where it has one."""
     if truth is None or not len(truth) or not len(places_px):
         return [()] * len(places_px)
     distance, nearest = _nearest(_places_px(truth), places_px)
-    return [_name_of(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
+    return [
+        _name_of(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)
+    ]
 
 
 def _name_of(row: np.void) -> tuple[int | str, ...]:
@@ -344,7 +385,11 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     size = len(seeds.places_px)
     pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
-    group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp) if size else np.zeros(0, dtype=np.intp)
+    group = (
+        np.asarray(connected_components(links, directed=False)[1], dtype=np.intp)
+        if size
+        else np.zeros(0, dtype=np.intp)
+    )
     _, first = np.unique(group, return_index=True)
     hips: dict[int, tuple[int | str, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):

@@ -37,7 +37,10 @@ class FixedPattern:
     @property
     def rms(self) -> tuple[float, ...]:
         """Response, pixels, columns, rows; 0 where it is within FOUND_SIGMAS of its error."""
-        return tuple(math.sqrt(s) if s > FOUND_SIGMAS * e else 0.0 for s, e in zip(self.squares, self.errors, strict=True))
+        return tuple(
+            math.sqrt(s) if s > FOUND_SIGMAS * e else 0.0
+            for s, e in zip(self.squares, self.errors, strict=True)
+        )
 
     def variance_dn2(self, light_dn: FloatArray) -> FloatArray:
         """Variance of a pixel about its neighbours at a level of light."""
@@ -47,19 +50,25 @@ class FixedPattern:
     def words(self) -> str:
         """What was found, or under what it is (two sigmas)."""
         said = []
-        for name, square, error, rms in zip(NAMES, self.squares, self.errors, self.rms, strict=True):
+        for name, square, error, rms in zip(
+            NAMES, self.squares, self.errors, self.rms, strict=True
+        ):
             if not math.isfinite(error):
                 continue
             times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
             found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
-            said.append(f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}")
+            said.append(
+                f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}"
+            )
         return ", ".join(said)
 
 
 NO_PATTERN = FixedPattern()
 
 
-def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]]) -> FixedPattern | None:
+def fixed_pattern(
+    photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]],
+) -> FixedPattern | None:
     """The pattern by products of each two of several photographs, whose noise has mean 0; None with
     fewer than two.
 
@@ -69,7 +78,11 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     """
     pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
     for off, level, use in photographs:
-        use = use & (np.abs(off) < PATTERN_CLIP * math.sqrt(float((off[use] ** 2).mean()))) & (level > 0)
+        use = (
+            use
+            & (np.abs(off) < PATTERN_CLIP * math.sqrt(float((off[use] ** 2).mean())))
+            & (level > 0)
+        )
         off, level = np.where(use, off - off[use].mean(), 0.0), np.where(use, level, 1.0)
         for axis, sums in ((0, columns), (1, rows)):
             count = use.sum(axis=axis)
@@ -77,7 +90,12 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
         # neighbours' differences: what is smooth is the sky's or the lens's
         off, use = (off[:, 1:] - off[:, :-1]) / math.sqrt(2), use[:, 1:] & use[:, :-1]
         level = (level[:, 1:] + level[:, :-1]) / 2
-        for sums, values in ((pixels, off), (shares, off / level), (light, level), (inverse, 1 / level)):
+        for sums, values in (
+            (pixels, off),
+            (shares, off / level),
+            (light, level),
+            (inverse, 1 / level),
+        ):
             sums.add(values, use)
     if pixels.photographs < 2 or not pixels.pairs:
         return None
@@ -85,7 +103,9 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
         one.mean() for one in (columns, rows, pixels, shares)
     )
     height, width = use.shape[0], use.shape[1] + 1
-    (column, column_error), (row, row_error) = _lines_alone((column, column_error), (row, row_error), both, (height, width))
+    (column, column_error), (row, row_error) = _lines_alone(
+        (column, column_error), (row, row_error), both, (height, width)
+    )
     lit, dim = light.mean()[0], inverse.mean()[0]
     both, share = both - max(column, 0.0), share - max(column, 0.0) * dim
     # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
@@ -97,7 +117,9 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     )
     if offset < FOUND_SIGMAS * offset_error:
         response, response_error = both / lit, both_error / lit
-    return FixedPattern((response, offset, column, row), (response_error, offset_error, column_error, row_error))
+    return FixedPattern(
+        (response, offset, column, row), (response_error, offset_error, column_error, row_error)
+    )
 
 
 def _lines_alone(
@@ -127,7 +149,11 @@ class _Pairs:
     def add(self, values: FloatArray, use: BoolArray) -> None:
         self.photographs += 1
         values = np.where(use, values, 0.0)
-        self._sum, self._squares, self._count = self._sum + values, self._squares + values**2, self._count + use
+        self._sum, self._squares, self._count = (
+            self._sum + values,
+            self._squares + values**2,
+            self._count + use,
+        )
 
     @property
     def pairs(self) -> float:
@@ -172,22 +198,33 @@ def sky_level(dn: FloatArray, step: float) -> SkyLevel:
     side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
     rows, columns = max(height // side, 1), max(width // side, 1)
     high, wide = height // rows, width // columns
-    blocks = dn[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
+    blocks = (
+        dn[: rows * high, : columns * wide]
+        .reshape(rows, high, columns, wide)
+        .swapaxes(1, 2)
+        .reshape(rows, columns, -1)
+    )
     middle = np.median(blocks, axis=2, keepdims=True)
     sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
     for _ in range(ROUNDS):
         kept = np.abs(blocks - middle) <= CLIP * sigma
         count = np.maximum(kept.sum(axis=2, keepdims=True), 1)
         middle = (blocks * kept).sum(axis=2, keepdims=True) / count
-        sigma = np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
+        sigma = (
+            np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
+        )
         sigma = np.maximum(sigma, step / 12**0.5)
     level, noise = middle[..., 0], sigma[..., 0]
     if min(level.shape) > 2:  # a block full of a bright star's light is as its neighbours
         others, quiet = (ndimage.median_filter(part, 3, mode="nearest") for part in (level, noise))
         bright = level > others + BRIGHT_BLOCK * quiet
         level, noise = np.where(bright, others, level), np.minimum(noise, NOISY_BLOCK * quiet)
-    places = [(np.arange(size) - (one - 1) / 2) / one for size, one in ((height, high), (width, wide))]
-    return SkyLevel(_between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side)
+    places = [
+        (np.arange(size) - (one - 1) / 2) / one for size, one in ((height, high), (width, wide))
+    ]
+    return SkyLevel(
+        _between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side
+    )
 
 
 def is_round(dn: FloatArray) -> bool:
@@ -275,13 +312,18 @@ def find_sources(sigmas: FloatArray) -> FoundSources:
         for part, same in ((dx * dx, 1), (dy * dy, 1), (dx * dy, 0))
     )
     middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    length, width = np.sqrt(12 * (middle + spread)), np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
+    length, width = (
+        np.sqrt(12 * (middle + spread)),
+        np.sqrt(12 * np.maximum(middle - spread, 1 / 12)),
+    )
     peak = np.zeros(count)
     np.maximum.at(peak, blob, value)
     fwhm = 2 * np.sqrt(np.bincount(blob, value > peak[blob] / 2, minlength=count) / np.pi)
     order = np.argsort(-peak * np.sqrt(area), kind="stable")[:MAX_SOURCES]
     single = _single(sigmas, mx[order], my[order])
-    return FoundSources(mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single)
+    return FoundSources(
+        mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single
+    )
 
 
 def source_mask(sources: FoundSources, sigmas: FloatArray, grow_px: int) -> BoolArray:
@@ -296,7 +338,10 @@ def source_mask(sources: FoundSources, sigmas: FloatArray, grow_px: int) -> Bool
     lit = np.asarray(ndimage.binary_dilation(spots, iterations=grow_px))
     for k in np.flatnonzero(sources.length_px > 2 * grow_px):
         half = min(round(float(sources.length_px[k]) / 2), MAX_MASK_PX) + grow_px
-        lit[max(rows[k] - half, 0) : rows[k] + half + 1, max(columns[k] - half, 0) : columns[k] + half + 1] = True
+        lit[
+            max(rows[k] - half, 0) : rows[k] + half + 1,
+            max(columns[k] - half, 0) : columns[k] + half + 1,
+        ] = True
     return lit
 
 
@@ -315,6 +360,9 @@ def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray
     rows, columns = (np.rint(place).astype(np.intp)[:, None] + reach + 3 for place in (y_px, x_px))
     patch = padded[rows[:, :, None], columns[:, None, :]].reshape(len(x_px), 9)
     best = patch.argmax(axis=1)
-    row, column = np.rint(y_px).astype(np.intp) + best // 3 + 2, np.rint(x_px).astype(np.intp) + best % 3 + 2
+    row, column = (
+        np.rint(y_px).astype(np.intp) + best // 3 + 2,
+        np.rint(x_px).astype(np.intp) + best % 3 + 2,
+    )
     around = [padded[row + dy, column + dx] for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
     return np.asarray(np.mean(around, axis=0) + 0.75 < 0.04 * padded[row, column])

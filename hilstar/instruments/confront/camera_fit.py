@@ -29,9 +29,25 @@ EDGE_PX = 10.0  # beyond an image's edges, to which its lens is used
 # a larger model is taken where it brings the held-out error below this share of the smaller one's
 GAIN = 0.985
 # name -> step that makes a number of order 1
-STEPS = {"log_focal": 1e-3, "centre_x": 10.0, "centre_y": 10.0, "k1": 0.1, "k2": 1.0, "p1": 1e-3, "p2": 1e-3}
+STEPS = {
+    "log_focal": 1e-3,
+    "centre_x": 10.0,
+    "centre_y": 10.0,
+    "k1": 0.1,
+    "k2": 1.0,
+    "p1": 1e-3,
+    "p2": 1e-3,
+}
 # sigma of a number's prior, in its steps: so wide that it decides only what stars leave open
-PRIOR = {"log_focal": 1e3, "centre_x": 10.0, "centre_y": 10.0, "k1": 10.0, "k2": 10.0, "p1": 10.0, "p2": 10.0}
+PRIOR = {
+    "log_focal": 1e3,
+    "centre_x": 10.0,
+    "centre_y": 10.0,
+    "k1": 10.0,
+    "k2": 10.0,
+    "p1": 10.0,
+    "p2": 10.0,
+}
 LENS_NAMES = ("k1", "k2", "p1", "p2")
 ZENITH_PRIOR = 1.5  # sigma of the tangent of a zenith distance
 # error of a place by a lens that folds, of that by the largest that does not: such a lens is what
@@ -61,7 +77,9 @@ class Places:
 
     def at(self, chosen: BoolArray | IntArray) -> "Places":
         """Some of them."""
-        return Places(self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen], self.vectors[chosen])
+        return Places(
+            self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen], self.vectors[chosen]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +104,9 @@ class Pointing:
         """Height of the boresight over the horizon, where the air or refraction told it."""
         if self.air is not None:
             return math.degrees(math.asin(float(np.clip(self.boresight @ self.air.up, -1, 1))))
-        return None if self.zenith is None else 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
+        return (
+            None if self.zenith is None else 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
+        )
 
     def seen(self, vectors: FloatArray) -> FloatArray:
         """Directions (n, 3), ICRS, as the air bends them."""
@@ -146,7 +166,10 @@ def with_values(camera: Camera, values: dict[str, float]) -> Camera:
         old = camera.lens or Lens()
         k1, k2, k3 = old.radial
         p1, p2 = old.tangential
-        lens = Lens((values.get("k1", k1), values.get("k2", k2), k3), (values.get("p1", p1), values.get("p2", p2)))
+        lens = Lens(
+            (values.get("k1", k1), values.get("k2", k2), k3),
+            (values.get("p1", p1), values.get("p2", p2)),
+        )
     cx, cy = camera.principal_point_px
     return replace(
         camera,
@@ -172,39 +195,58 @@ class _CameraLoss:
         self.base, self.pointings, self.names = base, pointings, names
         self.owner = np.repeat(np.arange(len(photographs)), [len(one.x_px) for one in photographs])
         self.x_px, self.y_px, sigma_px = (
-            np.concatenate([getattr(one, name) for one in photographs]) for name in ("x_px", "y_px", "sigma_px")
+            np.concatenate([getattr(one, name) for one in photographs])
+            for name in ("x_px", "y_px", "sigma_px")
         )
         self.sigma_px = np.hypot(sigma_px, floor_px)
         seen = [  # in cam as it is, behind an air that is known
-            (one.air.bent(places.vectors) if one.air is not None else places.vectors) @ to_matrix(one.q_icrs_to_cam).T
+            (one.air.bent(places.vectors) if one.air is not None else places.vectors)
+            @ to_matrix(one.q_icrs_to_cam).T
             for one, places in zip(pointings, photographs, strict=True)
         ]
         self.cam = np.concatenate(seen)
-        self.bent = np.array([one.zenith is not None and one.air is None for one in pointings], dtype=bool)
+        self.bent = np.array(
+            [one.zenith is not None and one.air is None for one in pointings], dtype=bool
+        )
         self.zenith_of = np.cumsum(self.bent) - 1  # the row of a photograph's zenith
 
     def start(self) -> FloatArray:
         """The numbers of the base and the pointings as they are."""
         lens = self.base.lens or Lens()
         own = dict(zip(LENS_NAMES, (*lens.radial[:2], *lens.tangential), strict=True))
-        zeniths = [one.zenith for one, bent in zip(self.pointings, self.bent, strict=True) if bent and one.zenith]
+        zeniths = [
+            one.zenith
+            for one, bent in zip(self.pointings, self.bent, strict=True)
+            if bent and one.zenith
+        ]
         turns = np.zeros(3 * len(self.pointings))
-        return np.concatenate([[own.get(name, 0.0) / STEPS[name] for name in self.names], turns, np.ravel(zeniths)])
+        return np.concatenate(
+            [[own.get(name, 0.0) / STEPS[name] for name in self.names], turns, np.ravel(zeniths)]
+        )
 
     def parts(self, numbers: FloatArray) -> tuple[Camera, FloatArray, FloatArray]:
         """The camera, each photograph's turn (m, 4), and the fitted zeniths (z, 2) of numbers."""
         own, last = len(self.names), len(self.names) + 3 * len(self.pointings)
-        camera = with_values(self.base, {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)})
+        camera = with_values(
+            self.base,
+            {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)},
+        )
         # the image's middle stays where it is when the principal point moves: else the loss is one
         # long valley
-        dx, dy = (a - b for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True))
+        dx, dy = (
+            a - b
+            for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True)
+        )
         follow = np.array([dy, -dx, 0.0]) / camera.focal_length_px
         turns = from_rotation_vectors(ATTITUDE_STEP_RAD * numbers[own:last].reshape(-1, 3) + follow)
         return camera, turns, numbers[last:].reshape(-1, 2)
 
     def unpacked(self, numbers: FloatArray) -> tuple[Camera, tuple[Pointing, ...]]:
         camera, turns, zeniths = self.parts(numbers)
-        found = [replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam)) for p, q in zip(self.pointings, turns, strict=True)]
+        found = [
+            replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam))
+            for p, q in zip(self.pointings, turns, strict=True)
+        ]
         for i in np.flatnonzero(self.bent):
             found[i] = replace(found[i], zenith=tuple(zeniths[self.zenith_of[i]].tolist()))
         return camera, tuple(found)
@@ -218,7 +260,10 @@ class _CameraLoss:
             cam[some] = refracted(cam[some], zeniths[self.zenith_of[self.owner[some]]])
         x, y = camera.project(cam)
         parts = [(self.x_px - x) / self.sigma_px, (self.y_px - y) / self.sigma_px]
-        parts += [numbers[: len(self.names)] / [PRIOR[name] for name in self.names], zeniths.ravel() / ZENITH_PRIOR]
+        parts += [
+            numbers[: len(self.names)] / [PRIOR[name] for name in self.names],
+            zeniths.ravel() / ZENITH_PRIOR,
+        ]
         return np.asarray(np.clip(np.nan_to_num(np.concatenate(parts), nan=1e4), -1e4, 1e4))
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
@@ -235,11 +280,17 @@ class _CameraLoss:
 
         for k in range(own):
             found[:, k] = changed(np.array([k]))
-        each = [(np.arange(own + k, own + 3 * photographs, 3), self.owner, np.arange(stars)) for k in range(3)]
+        each = [
+            (np.arange(own + k, own + 3 * photographs, 3), self.owner, np.arange(stars))
+            for k in range(3)
+        ]
         if self.bent.any():
             lit = np.flatnonzero(self.bent[self.owner])
             zenith = self.zenith_of[self.owner[lit]]
-            each += [(np.arange(own + 3 * photographs + k, len(numbers), 2), zenith, lit) for k in range(2)]
+            each += [
+                (np.arange(own + 3 * photographs + k, len(numbers), 2), zenith, lit)
+                for k in range(2)
+            ]
         for columns, which, rows in each:
             change = changed(columns)
             for first in (0, stars):
@@ -250,7 +301,11 @@ class _CameraLoss:
 
 
 def fit_model(
-    base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], names: tuple[str, ...], floor_px: float
+    base: Camera,
+    pointings: Sequence[Pointing],
+    photographs: Sequence[Places],
+    names: tuple[str, ...],
+    floor_px: float,
 ) -> tuple[Camera, tuple[Pointing, ...], FloatArray]:
     """The camera and pointings that fit places best, and the covariance of the camera's numbers, in
     the order of `names`.
@@ -300,7 +355,9 @@ def minimised(
     return numbers, normal
 
 
-def own_floor_px(residuals: Sequence[FloatArray], photographs: Sequence[Places], numbers: int) -> float:
+def own_floor_px(
+    residuals: Sequence[FloatArray], photographs: Sequence[Places], numbers: int
+) -> float:
     """The error of a place along an axis beyond its own noise, px, by the residuals' spread
     without their tails.
     """
@@ -310,13 +367,22 @@ def own_floor_px(residuals: Sequence[FloatArray], photographs: Sequence[Places],
     low, high = 0.0, 10.0
     for _ in range(40):
         middle = (low + high) / 2
-        spread = scale * MAD_TO_SIGMA * float(np.median(np.abs(off / np.hypot(sigma, middle)))) if len(off) else 0.0
+        spread = (
+            scale * MAD_TO_SIGMA * float(np.median(np.abs(off / np.hypot(sigma, middle))))
+            if len(off)
+            else 0.0
+        )
         low, high = (middle, high) if spread > 1 else (low, middle)
     return high
 
 
 def fit_camera(
-    base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], *, fixed: bool, last: bool
+    base: Camera,
+    pointings: Sequence[Pointing],
+    photographs: Sequence[Places],
+    *,
+    fixed: bool,
+    last: bool,
 ) -> CameraFit:
     """The camera of photographs, least model that held-out stars ask for; `fixed`: the pointings
     alone.
@@ -327,7 +393,11 @@ def fit_camera(
     bare = tuple(pointings)
     count = sum(len(one.x_px) for one in photographs)
     numbers = 3 * len(bare)
-    enough = {name: names for name, names in MODELS.items() if 2 * count > STARS_A_NUMBER * (len(names) + numbers)}
+    enough = {
+        name: names
+        for name, names in MODELS.items()
+        if 2 * count > STARS_A_NUMBER * (len(names) + numbers)
+    }
     models: dict[str, tuple[str, ...]] = {"fixed": ()} if fixed else enough
     if not models:
         models = {"pinhole": MODELS["pinhole"]}
@@ -345,7 +415,8 @@ def fit_camera(
         camera, bare, floor = _settled(base, bare, photographs, names)
     if any(one.air is None for one in bare):
         bent = tuple(
-            one if one.air else _with_zenith(camera, one, places, floor) for one, places in zip(bare, photographs, strict=True)
+            one if one.air else _with_zenith(camera, one, places, floor)
+            for one, places in zip(bare, photographs, strict=True)
         )
         plain_px = best if chosen == largest else _held_out(camera, bare, photographs, names, floor)
         bent_px = _held_out(camera, bent, photographs, names, floor)
@@ -359,7 +430,10 @@ def fit_camera(
 
 
 def _largest(
-    base: Camera, pointings: tuple[Pointing, ...], photographs: Sequence[Places], models: dict[str, tuple[str, ...]]
+    base: Camera,
+    pointings: tuple[Pointing, ...],
+    photographs: Sequence[Places],
+    models: dict[str, tuple[str, ...]],
 ) -> tuple[str, Camera, tuple[Pointing, ...], float]:
     """The largest model that does not fold within the image, its fit, and the error of a place by
     it, so that all weigh alike.
@@ -381,7 +455,9 @@ def _largest(
     return name, camera, turned, floor
 
 
-def k1_camera(base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places]) -> tuple[Camera, list[Pointing]]:
+def k1_camera(
+    base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places]
+) -> tuple[Camera, list[Pointing]]:
     """The camera of least terms that has a distortion, and the pointings."""
     camera, found, _ = _settled(base, tuple(pointings), photographs, MODELS["k1"])
     return _bounded(camera) or camera, list(found)
@@ -398,7 +474,10 @@ def _bounded(camera: Camera) -> Camera | None:
 
 
 def _settled(
-    camera: Camera, pointings: tuple[Pointing, ...], photographs: Sequence[Places], names: tuple[str, ...]
+    camera: Camera,
+    pointings: tuple[Pointing, ...],
+    photographs: Sequence[Places],
+    names: tuple[str, ...],
 ) -> tuple[Camera, tuple[Pointing, ...], float]:
     """A fit whose floor is that of its own residuals."""
     floor = 0.05
@@ -406,13 +485,19 @@ def _settled(
         camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor)
         fit = CameraFit(camera, pointings, "")
         floor = own_floor_px(
-            fit.residuals_px(photographs), photographs, len(names) + sum(3 + 2 * (p.zenith is not None) for p in pointings)
+            fit.residuals_px(photographs),
+            photographs,
+            len(names) + sum(3 + 2 * (p.zenith is not None) for p in pointings),
         )
     return camera, pointings, floor
 
 
 def _held_out(
-    camera: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], names: tuple[str, ...], floor_px: float
+    camera: Camera,
+    pointings: Sequence[Pointing],
+    photographs: Sequence[Places],
+    names: tuple[str, ...],
+    floor_px: float,
 ) -> float:
     """Rms error of stars that were held out, px an axis, weighed by their errors, each counted
     up to HUBER + 1 sigmas.
@@ -434,7 +519,10 @@ def _held_out(
 
 def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: float) -> Pointing:
     def off(trial: Pointing) -> FloatArray:
-        return CameraFit(camera, (trial,), "").residuals_px([places])[0] / np.hypot(places.sigma_px, floor_px)[:, None]
+        return (
+            CameraFit(camera, (trial,), "").residuals_px([places])[0]
+            / np.hypot(places.sigma_px, floor_px)[:, None]
+        )
 
     # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it
     # is known but for its sign
@@ -447,6 +535,9 @@ def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: f
     *_, p, q = np.linalg.lstsq(design, plain, rcond=None)[0].tolist()
     tangent, angle = math.sqrt(2 * math.hypot(p, q) / REFRACTION_RAD), math.atan2(-q, -p) / 2
     tangent = min(max(tangent, 0.3), 3.0)
-    starts = [replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle))) for s in (1, -1)]
+    starts = [
+        replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle)))
+        for s in (1, -1)
+    ]
     fits = [fit_model(camera, [start], [places], (), floor_px)[1][0] for start in starts]
     return min(fits, key=lambda trial: float(np.minimum(off(trial) ** 2, 9).sum()))

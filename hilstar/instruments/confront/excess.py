@@ -49,11 +49,15 @@ class Excess:
 
 def split_excess(session: Session, verdicts: Sequence[Verdict]) -> Excess | None:
     """The parts of the scatter; None with fewer than MIN_STARS stars."""
-    every = [(v, row) for v in verdicts for row in v.stars if row.counted and math.isfinite(row.off_mag)]
+    every = [
+        (v, row) for v in verdicts for row in v.stars if row.counted and math.isfinite(row.off_mag)
+    ]
     if len(every) < MIN_STARS:
         return None
     rows = [row for _, row in every]
-    x, y, off_mag = (np.array([getattr(row, name) for row in rows]) for name in ("x_px", "y_px", "off_mag"))
+    x, y, off_mag = (
+        np.array([getattr(row, name) for row in rows]) for name in ("x_px", "y_px", "off_mag")
+    )
     off = np.array([(row.x_px - row.x_predicted_px, row.y_px - row.y_predicted_px) for row in rows])
     bv = np.nan_to_num(np.array([row.b_v_mag for row in rows]))
     size = session.shots[0].photo.size_px
@@ -67,7 +71,11 @@ def split_excess(session: Session, verdicts: Sequence[Verdict]) -> Excess | None
     noise = np.concatenate([shot_sigma(v, row) for v, row in every])
     whole = _ms(off.ravel())
     parts = [
-        Part("photon and background noise", math.sqrt(_ms(noise)), "the fit's own errors, by the detector's gain and noise"),
+        Part(
+            "photon and background noise",
+            math.sqrt(_ms(noise)),
+            "the fit's own errors, by the detector's gain and noise",
+        ),
         Part(
             "place within the pixel",
             math.sqrt(sum(_taken(phases, off[:, k]) for k in (0, 1)) / 2),
@@ -104,22 +112,38 @@ def _light(
     known = np.array(["variable" in row.flags or "double" in row.flags for row in rows])
     steady = _ms(off_mag[~known]) if (~known).sum() >= MIN_STARS else _ms(off_mag)
     parts = [
-        Part("photon and background noise", math.sqrt(_ms(noise)), "the fit's own errors, by the detector's gain and noise"),
+        Part(
+            "photon and background noise",
+            math.sqrt(_ms(noise)),
+            "the fit's own errors, by the detector's gain and noise",
+        ),
         Part("catalogue: V's own error", math.sqrt(_ms(sigma_v)), "Hipparcos' errors of V"),
         Part(
             "catalogue: variables and doubles",
             math.sqrt(max(_ms(off_mag) - steady, 0.0)),
             f"the scatter with {int(known.sum())} known variables and doubles less that without",
         ),
-        Part("colour", math.sqrt(_taken(np.column_stack([bv, bv**2]), off_mag)), "what goes with B-V: the tracker's curve"),
+        Part(
+            "colour",
+            math.sqrt(_taken(np.column_stack([bv, bv**2]), off_mag)),
+            "what goes with B-V: the tracker's curve",
+        ),
         _blends(session, every),
         Part(
             "pixel response",
             MAG * _response(session)[0],
             "the pixels' response, by products of photographs of different skies, over the pixels that a star lies on",
         ),
-        Part("flat field", math.sqrt(_taken(terms, off_mag)), "what slopes over the field beyond the vignetting in the radius"),
-        Part("place within the pixel", math.sqrt(_taken(phases, off_mag)), "what repeats with the place in the pixel"),
+        Part(
+            "flat field",
+            math.sqrt(_taken(terms, off_mag)),
+            "what slopes over the field beyond the vignetting in the radius",
+        ),
+        Part(
+            "place within the pixel",
+            math.sqrt(_taken(phases, off_mag)),
+            "what repeats with the place in the pixel",
+        ),
         _scintillation(session, every, off_mag, noise),
     ]
     return (*parts, _rest(_ms(off_mag), parts))
@@ -127,7 +151,12 @@ def _light(
 
 def _blends(session: Session, every: Sequence[tuple[Verdict, StarRow]]) -> Part:
     """The light of other stars of the catalogue that a star's own profile takes up."""
-    sigma2 = (float(np.median(session.psf.fwhm_px(*np.array([[row.x_px, row.y_px] for _, row in every]).T))) / FWHM) ** 2
+    sigma2 = (
+        float(
+            np.median(session.psf.fwhm_px(*np.array([[row.x_px, row.y_px] for _, row in every]).T))
+        )
+        / FWHM
+    ) ** 2
     off = []
     for verdict, row in every:
         all_of = verdict.expected
@@ -135,7 +164,11 @@ def _blends(session: Session, every: Sequence[tuple[Verdict, StarRow]]) -> Part:
         taken = all_of.dn * np.exp(-away2 / (4 * sigma2)) * (all_of.star != row.star)
         off.append(MAG * float(taken.sum()) / row.dn_predicted)
     spread = np.array(off) - np.mean(off)
-    return Part("catalogue: blends", math.sqrt(_ms(spread)), "light of the catalogue's other stars within a star's profile")
+    return Part(
+        "catalogue: blends",
+        math.sqrt(_ms(spread)),
+        "light of the catalogue's other stars within a star's profile",
+    )
 
 
 def _response(session: Session) -> tuple[float, float]:
@@ -146,10 +179,17 @@ def _response(session: Session) -> tuple[float, float]:
     middle = np.array([x]), np.array([y]), np.array([np.nan])
     light = session.psf.on_pixels(reach, reach, session.psf.core(*middle))[0][0]
     response = session.pixels.pattern.rms[0]
-    return response * math.sqrt(float((light**2).sum())), response * math.sqrt(float(((light * reach) ** 2).sum()))
+    return response * math.sqrt(float((light**2).sum())), response * math.sqrt(
+        float(((light * reach) ** 2).sum())
+    )
 
 
-def _scintillation(session: Session, every: Sequence[tuple[Verdict, StarRow]], off_mag: FloatArray, noise: FloatArray) -> Part:
+def _scintillation(
+    session: Session,
+    every: Sequence[tuple[Verdict, StarRow]],
+    off_mag: FloatArray,
+    noise: FloatArray,
+) -> Part:
     """What changes from one photograph of a star to another beyond noise; with no star twice,
     Young's law.
     """
@@ -159,18 +199,28 @@ def _scintillation(session: Session, every: Sequence[tuple[Verdict, StarRow]], o
     free = int(twice.sum()) - len(np.unique(star[twice]))
     if free >= MIN_STARS:
         mean = np.bincount(star, off_mag) / np.bincount(star)
-        changed = float(((off_mag - mean[star])[twice] ** 2).sum()) / free - float((noise[twice] ** 2).mean())
+        changed = float(((off_mag - mean[star])[twice] ** 2).sum()) / free - float(
+            (noise[twice] ** 2).mean()
+        )
         how = f"what changes between photographs of a star beyond noise, by {free} stars seen again"
         return Part("scintillation", math.sqrt(max(changed, 0.0)), how)
     tracker = session.file.config.tracker
     masses = [one for one in session.light.masses if one is not None]
     if not masses or tracker.exposure_s <= 0:
-        return Part(LAW, math.nan, "not known: no star is in two photographs, and no air mass, as refraction was not fitted")
+        return Part(
+            LAW,
+            math.nan,
+            "not known: no star is in two photographs, and no air mass, as refraction was not fitted",
+        )
     mass, site = float(np.mean(masses)), session.file.config.site
     height_m = 0.0 if site is None else site.height_m
     sigma = float(young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)[0])
     how = f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
-    return Part(LAW, MAG * sigma, f"{how}; not measured, as no star is in two photographs: it is in what is unexplained")
+    return Part(
+        LAW,
+        MAG * sigma,
+        f"{how}; not measured, as no star is in two photographs: it is in what is unexplained",
+    )
 
 
 def _rest(whole: float, parts: Sequence[Part]) -> Part:

@@ -56,12 +56,16 @@ def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
     """A bench file, or one that has [tracker] alone, and whether it has a monitor. Raises
     InputError.
     """
-    text = read_text(path, "give the path of a bench file, or of one that has [tracker] alone", MAX_TOML_BYTES)
+    text = read_text(
+        path, "give the path of a bench file, or of one that has [tracker] alone", MAX_TOML_BYTES
+    )
     tables = parse_toml(path, text)
     has_screen = "monitor" in tables or "collimator" in tables
     if "site" in tables and "sky" not in tables:
         text = f"{text.rstrip()}\n{UNDATED}"  # photographs have dates of their own
-    return bench_file_of(path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"), has_screen
+    return bench_file_of(
+        path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"
+    ), has_screen
 
 
 def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
@@ -73,8 +77,12 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     lens = camera.lens or Lens()
     sigma = session.camera.sigma
     lines = [f"# fitted to {len(session.shots)} photographs: {session.camera.model}"]
-    for name, value in zip(("k1", "k2", "p1", "p2"), (*lens.radial[:2], *lens.tangential), strict=True):
-        lines.append(f"{name} = {value:.9g}" + (f"  # +- {sigma[name]:.2g}" if name in sigma else ""))
+    for name, value in zip(
+        ("k1", "k2", "p1", "p2"), (*lens.radial[:2], *lens.tangential), strict=True
+    ):
+        lines.append(
+            f"{name} = {value:.9g}" + (f"  # +- {sigma[name]:.2g}" if name in sigma else "")
+        )
     write_whole(folder / NAMES[1], "\n".join(lines) + "\n")
     times, exposure_s = _write_efficiency(folder / NAMES[2], session)
     _write_psf(folder / NAMES[3], session)
@@ -95,32 +103,60 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
         table["frame_hz"] = tracker.frame_hz
     given_tables = parse_toml(session.file.path, session.file.text)
     detector = _detector(session, given_tables["tracker"].get("detector", {}))
-    tables: dict[str, Any] = {"tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}}
+    tables: dict[str, Any] = {
+        "tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}
+    }
     sky = _dated_sky(session, given_tables)
     if session.air is not None and session.shots[0].photo.t_ns is not None:
-        tables["site"] = {k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")}
+        tables["site"] = {
+            k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")
+        }
     tables["sky"] = sky
     level = float(np.median([np.median(shot.level.level) for shot in session.shots]))
-    tables["background"] = {"electrons_per_px": max((level - pixels.pedestal_dn) * pixels.gain_e_per_dn, 0.0)}
+    tables["background"] = {
+        "electrons_per_px": max((level - pixels.pedestal_dn) * pixels.gain_e_per_dn, 0.0)
+    }
     for name in ("monitor", "collimator"):
         tables[name] = dict(given_tables.get(name, {}))
     if not has_screen:
         half = [size / 2 / camera.focal_length_px for size in camera.resolution_px]
         screen = [size * SCREEN_PITCH_UM * 1e-3 for size in SCREEN_PX]
-        focal_mm = FILLED * min(side / 2 / tangent for side, tangent in zip(screen, half, strict=True))
+        focal_mm = FILLED * min(
+            side / 2 / tangent for side, tangent in zip(screen, half, strict=True)
+        )
         tables["monitor"] = {"resolution_px": list(SCREEN_PX), "pixel_pitch_um": SCREEN_PITCH_UM}
         tables["collimator"] = {"focal_length_mm": round(focal_mm, 1)}
-    tables |= {k: v for k, v in given_tables.items() if k not in tables and k in {"render", "attitude", "verify", "sync"}}
+    tables |= {
+        k: v
+        for k, v in given_tables.items()
+        if k not in tables and k in {"render", "attitude", "verify", "sync"}
+    }
     notes = [
         f"By hilstar confront from {', '.join(shot.photo.name for shot in session.shots)}.",
         "Aperture and exposure are those that were given"
-        + (f", but more light came than they give: exposure_s is {times:.3g} times it." if times > 1 else "."),
+        + (
+            f", but more light came than they give: exposure_s is {times:.3g} times it."
+            if times > 1
+            else "."
+        ),
         f"The gain: {pixels.gain_words}.",
-        *([] if has_screen else ["The monitor and the collimator are examples that fill the field: write your own."]),
-        *([f"DN are those of the file, made linear: to the power {1 / session.power:.4f}."] if session.power != 1 else []),
+        *(
+            []
+            if has_screen
+            else [
+                "The monitor and the collimator are examples that fill the field: write your own."
+            ]
+        ),
+        *(
+            [f"DN are those of the file, made linear: to the power {1 / session.power:.4f}."]
+            if session.power != 1
+            else []
+        ),
     ]
     path = folder / NAMES[0]
-    text = "".join(f"# {note}\n" for note in notes) + "\n".join(_toml(_absolute(tables, session.file.folder)))
+    text = "".join(f"# {note}\n" for note in notes) + "\n".join(
+        _toml(_absolute(tables, session.file.folder))
+    )
     write_whole(path, text + "\n")
     return path
 
@@ -194,7 +230,11 @@ def _toml(table: dict[str, Any], name: str = "") -> Iterable[str]:
     """
     if name:
         yield f"\n[{name}]"
-    yield from (f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict))
+    yield from (
+        f"{key} = {json.dumps(value)}"
+        for key, value in table.items()
+        if not isinstance(value, dict)
+    )
     for key, value in table.items():
         if isinstance(value, dict):
             yield from _toml(value, f"{name}.{key}" if name else key)
@@ -210,9 +250,16 @@ def _write_efficiency(path: Path, session: Session) -> tuple[float, float]:
     if not len(curve.wavelength_nm):
         curve = Curve(np.array([300.0, 1100.0]), np.full(2, curve.value[0]))
     exposure_s = session.shots[0].photo.exposure_s or tracker.exposure_s or 1.0
-    wanted = session.pixels.gain_e_per_dn * 10 ** (-0.4 * float(session.light.offsets_mag.mean())) / exposure_s
+    wanted = (
+        session.pixels.gain_e_per_dn
+        * 10 ** (-0.4 * float(session.light.offsets_mag.mean()))
+        / exposure_s
+    )
     share = min(wanted, 1.0 / max(float(curve.value.max()), 1e-9))
-    rows = "\n".join(f"{nm:.2f},{value * share:.7g}" for nm, value in zip(curve.wavelength_nm, curve.value, strict=True))
+    rows = "\n".join(
+        f"{nm:.2f},{value * share:.7g}"
+        for nm, value in zip(curve.wavelength_nm, curve.value, strict=True)
+    )
     write_whole(path, f"wavelength_nm,value\n{rows}\n")
     return wanted / share, exposure_s * wanted / share
 
@@ -235,7 +282,11 @@ def _write_psf(path: Path, session: Session) -> None:
     text = json.dumps(numbers, separators=(",", ":"))  # a FITS card loses spaces at its end
     parts = [f"{MODEL}{text[k : k + 60]}" for k in range(0, len(text), 60)]
     write_glass(
-        path, glass_of(Stack(images, at, facts, PER_PX, False), history=("PSF of photographs, by hilstar confront", *parts))
+        path,
+        glass_of(
+            Stack(images, at, facts, PER_PX, False),
+            history=("PSF of photographs, by hilstar confront", *parts),
+        ),
     )
 
 
@@ -246,7 +297,9 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
     psf, vignetting = _psf_of(file)
     light = LightFit(np.zeros(1), vignetting, NO_CORRECTION, math.nan, math.nan, 1.0)
     detector = tracker.detector
-    read_e = math.sqrt(max(detector.electronics_e**2 - (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2, 0.0))
+    read_e = math.sqrt(
+        max(detector.electronics_e**2 - (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2, 0.0)
+    )
     pixels = PixelFit(
         detector.gain_e_per_dn,
         detector.offset_dn,
@@ -273,14 +326,20 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
     glass = glass_in(tracker, file.folder)
     if glass is None:
         one = read_psf(file.folder / tracker.optics.psf)
-        return _fitted(np.asarray(one.samples)[None], one.per_px, np.array([[size[0] / 2, size[1] / 2]]), size), (0.0, 0.0)
-    own = "".join(str(line).removeprefix(MODEL) for line in glass.history if str(line).startswith(MODEL))
+        return _fitted(
+            np.asarray(one.samples)[None], one.per_px, np.array([[size[0] / 2, size[1] / 2]]), size
+        ), (0.0, 0.0)
+    own = "".join(
+        str(line).removeprefix(MODEL) for line in glass.history if str(line).startswith(MODEL)
+    )
     if own:
         try:
             numbers = msgspec.json.decode(own)
             wing_share, wing_sigma = numbers["wing"]
             a, b = numbers["vignetting"]
-            return StarPsf(np.array(numbers["covariance"]), numbers["colour"], wing_share, wing_sigma, size), (a, b)
+            return StarPsf(
+                np.array(numbers["covariance"]), numbers["colour"], wing_share, wing_sigma, size
+            ), (a, b)
         except (msgspec.MsgspecError, LookupError, TypeError, ValueError):
             # somebody changed it: the images count
             pass
@@ -288,11 +347,17 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
     images = glass.images[:, :, focus].mean(axis=1)
     light = np.log10(np.maximum(glass.illumination[:, :, focus].mean(axis=1), 1e-3)) * -2.5
     r2 = radius2_of(tracker_camera(tracker, file.folder), *glass.places_px.T)
-    a, b = np.linalg.lstsq(np.column_stack([r2, r2**2]), light, rcond=None)[0].tolist() if len(r2) > 2 else (0.0, 0.0)
+    a, b = (
+        np.linalg.lstsq(np.column_stack([r2, r2**2]), light, rcond=None)[0].tolist()
+        if len(r2) > 2
+        else (0.0, 0.0)
+    )
     return _fitted(images, glass.per_px, glass.places_px, size), (a, b)
 
 
-def _fitted(images: FloatArray, per_px: int, places_px: FloatArray, size_px: tuple[int, int]) -> StarPsf:
+def _fitted(
+    images: FloatArray, per_px: int, places_px: FloatArray, size_px: tuple[int, int]
+) -> StarPsf:
     """The PSF that fits images (n, side, side) of `per_px` samples a pixel, each at its place:
     as stars of 1e6 DN.
     """
@@ -304,5 +369,7 @@ def _fitted(images: FloatArray, per_px: int, places_px: FloatArray, size_px: tup
     for stamp, image in zip(stamps, images, strict=True):
         np.add.at(stamp, (at[:, None], at[None, :]), image[np.ix_(kept, kept)])
     columns, rows = np.rint(places_px).T
-    level = Stamps(1e6 * stamps, np.full_like(stamps, 1.0), columns, rows, np.full(len(stamps), 0.65))
+    level = Stamps(
+        1e6 * stamps, np.full_like(stamps, 1.0), columns, rows, np.full(len(stamps), 0.65)
+    )
     return replace(fit_psf(level, columns.copy(), rows.copy(), size_px, 1.0), colour=0.0)

@@ -68,7 +68,9 @@ def paged(array: FloatArray) -> FloatArray:
         return np.memmap(file, dtype=array.dtype, mode="r", shape=array.shape)
 
 
-def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: int | None = None) -> list[Photograph]:
+def read_photographs(
+    path: Path, resolution_px: tuple[int, int] | None, at_ns: int | None = None
+) -> list[Photograph]:
     """The image of a file, or the planes of a mosaic, of this (width, height). Raises
     InputError: what and what to do.
     """
@@ -78,7 +80,9 @@ def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: i
     dn = _grey(path, pixels, facts)
     size = dn.shape[1], dn.shape[0]
     if min(size) < MIN_SIDE_PX:
-        raise InputError(f"{path}: {size[0]} x {size[1]} px is too small to hold a field of stars; give a whole frame")
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px is too small to hold a field of stars; give a whole frame"
+        )
     if resolution_px is not None and size != resolution_px:
         raise InputError(
             f"{path}: is {size[0]} x {size[1]} px, and [tracker] resolution_px is {list(resolution_px)}; give whole frames as"
@@ -118,10 +122,14 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
     if pixels.ndim == 3 and 1 in {pixels.shape[0], pixels.shape[2]}:
         pixels = pixels.squeeze()
     if pixels.ndim != 2 or pixels.dtype.kind not in "uif":
-        raise InputError(f"{path}: is no grey image of one plane ({' x '.join(map(str, pixels.shape))}); {ADVICE}")
+        raise InputError(
+            f"{path}: is no grey image of one plane ({' x '.join(map(str, pixels.shape))}); {ADVICE}"
+        )
     dn = pixels.astype(np.float64)
     if not np.isfinite(dn).all():
-        raise InputError(f"{path}: {int((~np.isfinite(dn)).sum())} pixels are no finite numbers; {ADVICE}")
+        raise InputError(
+            f"{path}: {int((~np.isfinite(dn)).sum())} pixels are no finite numbers; {ADVICE}"
+        )
     return dn
 
 
@@ -134,9 +142,13 @@ def _levels(path: Path, dn: FloatArray) -> tuple[float, float]:
     at_top = dn >= top
     share = float(at_top.mean())
     if share > MAX_SATURATED_SHARE and top > 0:
-        raise InputError(f"{path}: {share:.0%} of its pixels are saturated at {top:g}; expose shorter, or at a darker sky")
+        raise InputError(
+            f"{path}: {share:.0%} of its pixels are saturated at {top:g}; expose shorter, or at a darker sky"
+        )
     if len(values) < 3:
-        raise InputError(f"{path}: every pixel is {' or '.join(f'{v:g}' for v in values)}; give a frame with stars")
+        raise InputError(
+            f"{path}: every pixel is {' or '.join(f'{v:g}' for v in values)}; give a frame with stars"
+        )
     # a saturated level may be one less than a multiple of the step, as 65535 is
     inner = values[:-1]
     step = float(np.diff(inner).min())
@@ -154,13 +166,17 @@ def _planes(found: Photograph, pattern: str) -> Iterator[Photograph]:
         yield replace(found, dn=found.dn[number // 2 :: 2, number % 2 :: 2].copy(), plane=name)
 
 
-def _fits(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
+def _fits(
+    path: Path, data: bytes, resolution_px: tuple[int, int] | None
+) -> tuple[npt.NDArray[Any], _Facts]:
     try:
         fits_image = read_fits_image(data, resolution_px)
     except (InputError, ImageSizeError) as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # whatever a damaged file makes astropy raise
-        raise InputError(f"{path}: cannot be read as FITS ({one_line(str(error))}); {ADVICE}") from error
+        raise InputError(
+            f"{path}: cannot be read as FITS ({one_line(str(error))}); {ADVICE}"
+        ) from error
     if set(fits_image.header) >= MAP_KEYS:
         raise InputError(
             f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
@@ -172,18 +188,26 @@ def _fits(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tup
     return fits_image.pixels, facts
 
 
-def _picture(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
+def _picture(
+    path: Path, data: bytes, resolution_px: tuple[int, int] | None
+) -> tuple[npt.NDArray[Any], _Facts]:
     from PIL import UnidentifiedImageError
 
     try:
         with opened_picture(data, resolution_px) as picture:
             notes: tuple[str, ...] = ()
             if picture.format in {"JPEG", "MPO", "WEBP"}:
-                notes = ("a JPEG: its tone curve is not known, and compression moves faint stars; a raw frame is better",)
+                notes = (
+                    "a JPEG: its tone curve is not known, and compression moves faint stars; a raw frame is better",
+                )
             if picture.mode in {"P", "1", "CMYK"}:
-                raise InputError(f"{path}: holds colours of a palette or of print ({picture.mode}); {ADVICE}")
+                raise InputError(
+                    f"{path}: holds colours of a palette or of print ({picture.mode}); {ADVICE}"
+                )
             begin_ns, exposure_s = _exif(picture.getexif())
-            t_ns = None if begin_ns is None else begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
+            t_ns = (
+                None if begin_ns is None else begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
+            )
             return np.asarray(picture), _Facts(t_ns, exposure_s, "", notes)
     except InputError:
         raise
@@ -192,7 +216,9 @@ def _picture(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> 
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: is no image; {ADVICE}") from error
     except Exception as error:  # whatever a damaged file makes Pillow raise
-        raise InputError(f"{path}: cannot be read as an image ({one_line(str(error))}); {ADVICE}") from error
+        raise InputError(
+            f"{path}: cannot be read as an image ({one_line(str(error))}); {ADVICE}"
+        ) from error
 
 
 def _exif(exif: Any) -> tuple[int | None, float | None]:
@@ -212,5 +238,7 @@ def parse_utc(text: str) -> int:
     """The UTC of `--at`. Raises InputError."""
     found = utc_ns(text)
     if found is None:
-        raise InputError(f"--at {shortened(text)}: is no UTC; write one such as --at 2019-07-29T20:47:26")
+        raise InputError(
+            f"--at {shortened(text)}: is no UTC; write one such as --at 2019-07-29T20:47:26"
+        )
     return found

@@ -95,7 +95,11 @@ class StarRow:
     @property
     def off_mag(self) -> float:
         """Seen less predicted, mag."""
-        return -2.5 * math.log10(self.dn / self.dn_predicted) if self.dn > 0 and self.dn_predicted > 0 else math.nan
+        return (
+            -2.5 * math.log10(self.dn / self.dn_predicted)
+            if self.dn > 0 and self.dn_predicted > 0
+            else math.nan
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +172,9 @@ class Judge:
         file = read_bench_file(tracker)
         config = file.config
         dated = session.shots[0].sky  # each photograph's air is put before its stars below
-        velocity = (0.0, 0.0, 0.0) if dated.velocity_km_s is None else tuple(dated.velocity_km_s.tolist())
+        velocity = (
+            (0.0, 0.0, 0.0) if dated.velocity_km_s is None else tuple(dated.velocity_km_s.tolist())
+        )
         sky = msgspec.structs.replace(
             config.sky,
             faintest_v_mag=ALL_STARS_MAG,
@@ -177,11 +183,15 @@ class Judge:
             observer_velocity_km_s=velocity,
             bodies=type(config.sky.bodies)(),
         )
-        config = msgspec.structs.replace(config, sky=sky, background=type(config.background)(), site=None)
+        config = msgspec.structs.replace(
+            config, sky=sky, background=type(config.background)(), site=None
+        )
         self._simulator = Simulator(replace(file, config=config), refuse=False)
         self._stars = self._simulator.stars
         tracker_keys = config.tracker
-        self._own_mag = -2.5 * math.log10(max(tracker_keys.exposure_s, 1e-12) / tracker_keys.detector.gain_e_per_dn)
+        self._own_mag = -2.5 * math.log10(
+            max(tracker_keys.exposure_s, 1e-12) / tracker_keys.detector.gain_e_per_dn
+        )
         self.hot, self.dead = self._defects()
 
     def close(self) -> None:
@@ -196,7 +206,9 @@ class Judge:
         shape = session.shots[0].photo.dn.shape
         counts = np.zeros((2, *shape), dtype=np.int16)
         for shot in session.shots:
-            off = (shot.photo.dn - shot.level.level) / np.sqrt(session.pixels.variance_dn2(shot.level.level))
+            off = (shot.photo.dn - shot.level.level) / np.sqrt(
+                session.pixels.variance_dn2(shot.level.level)
+            )
             # what the eight about it have: a star's light is there too
             around = ndimage.uniform_filter(off, 3) * 9 - off
             alone = around < HOT_LIGHT * np.abs(off) + 3 * math.sqrt(8)
@@ -221,13 +233,18 @@ class Judge:
         rows = self._rows(number, expected)
         dim, cells = _dim_regions(rows, shot.photo.size_px)
         rows = [
-            replace(row, flags=(*row.flags, "dim region")) if cells(row) and "missing" not in row.flags else row for row in rows
+            replace(row, flags=(*row.flags, "dim region"))
+            if cells(row) and "missing" not in row.flags
+            else row
+            for row in rows
         ]
         light_sigma = light_dn / np.sqrt(variance)
         chi = residual[self._background(shot, light_sigma)]
         chi = chi[np.abs(chi) < MAX_CHI]
         counted = [row for row in rows if row.counted]
-        off = np.array([(row.x_px - row.x_predicted_px, row.y_px - row.y_predicted_px) for row in counted]).reshape(-1, 2)
+        off = np.array(
+            [(row.x_px - row.x_predicted_px, row.y_px - row.y_predicted_px) for row in counted]
+        ).reshape(-1, 2)
         mag = np.array([row.off_mag for row in counted])
         return Verdict(
             shot=shot,
@@ -238,7 +255,9 @@ class Judge:
             rms_mag=_rms(mag[np.isfinite(mag)]),
             counted=len(counted),
             background_chi2=float((chi**2).mean()) if len(chi) else math.nan,
-            star_chi2=float(np.median(shot.found.chi2[shot.clean])) if shot.clean.any() else math.nan,
+            star_chi2=float(np.median(shot.found.chi2[shot.clean]))
+            if shot.clean.any()
+            else math.nan,
             dim=dim,
             dated=self._dated(number),
             fainter=self._fainter(number, expected),
@@ -251,7 +270,12 @@ class Judge:
         """The stars' light (height, width), DN, by `simulate`'s own code, behind the air of this
         photograph.
         """
-        session, stars, simulator, shot = self.session, self._stars, self._simulator, self.session.shots[number]
+        session, stars, simulator, shot = (
+            self.session,
+            self._stars,
+            self._simulator,
+            self.session.shots[number],
+        )
         pointing = session.camera.pointings[number]
         air, rate = shot.sky.air, stars.electrons_per_s
         if air is not None and session.air is not None:
@@ -275,8 +299,15 @@ class Judge:
         width, height = shot.photo.size_px
         x, y = session.camera.pointings[number].places_px(session.camera.camera, shot.sky.vectors)
         with np.errstate(invalid="ignore"):
-            star = np.flatnonzero((x > -EDGE_PX) & (x < width - 1 + EDGE_PX) & (y > -EDGE_PX) & (y < height - 1 + EDGE_PX))
-        return Expected(star, x[star], y[star], session.predicted_dn(number, star, x[star], y[star]))
+            star = np.flatnonzero(
+                (x > -EDGE_PX)
+                & (x < width - 1 + EDGE_PX)
+                & (y > -EDGE_PX)
+                & (y < height - 1 + EDGE_PX)
+            )
+        return Expected(
+            star, x[star], y[star], session.predicted_dn(number, star, x[star], y[star])
+        )
 
     def _rows(self, number: int, expected: Expected) -> list[StarRow]:
         """Rows of the stars that are seen, and of those that should be."""
@@ -285,27 +316,55 @@ class Judge:
         _, double, variable = sky.within(shot.star)
         place = {star: k for k, star in enumerate(expected.star.tolist())}
         v_mag, bv_mag, hip = sky.v_mag, sky.bv_mag, sky.hip
-        kinds = {"saturated": shot.saturated, "blended": shot.blended, "double": double, "variable": variable}
+        kinds = {
+            "saturated": shot.saturated,
+            "blended": shot.blended,
+            "double": double,
+            "variable": variable,
+        }
 
         def row(star: int, seen: Iterable[float], flags: tuple[str, ...]) -> StarRow:
             x, y, dn, sigma = (float(value) for value in seen)
             k = place[star]
             predicted = float(expected.x_px[k]), float(expected.y_px[k])
             light, v, bv = float(expected.dn[k]), float(v_mag[star]), float(bv_mag[star])
-            return StarRow(star, int(hip[star]), sky.name(star), x, y, *predicted, dn, sigma, light, v, bv, flags)
+            return StarRow(
+                star,
+                int(hip[star]),
+                sky.name(star),
+                x,
+                y,
+                *predicted,
+                dn,
+                sigma,
+                light,
+                v,
+                bv,
+                flags,
+            )
 
         rows = []
         for k, star in enumerate(shot.star.tolist()):
             flags = tuple(name for name, which in kinds.items() if which is not None and which[k])
             if star in place:
-                rows.append(row(star, (found.x_px[k], found.y_px[k], found.dn[k], found.sigma_dn[k]), flags))
-        noise = math.sqrt(float(np.median(self.session.pixels.variance_dn2(shot.level.level))) * NEFF_PX)
+                rows.append(
+                    row(star, (found.x_px[k], found.y_px[k], found.dn[k], found.sigma_dn[k]), flags)
+                )
+        noise = math.sqrt(
+            float(np.median(self.session.pixels.variance_dn2(shot.level.level))) * NEFF_PX
+        )
         width, height = shot.photo.size_px
-        near, sources = _saturated(shot), cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
+        near, sources = (
+            _saturated(shot),
+            cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])),
+        )
         seen = set(shot.star.tolist())
         for star in expected.star[expected.dn > EXPECTED_SNR * noise].tolist():
             x, y = expected.x_px[place[star]], expected.y_px[place[star]]
-            inside = 2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
+            inside = (
+                2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX
+                and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
+            )
             if star in seen or not inside or near(x, y) or sources.query([x, y])[0] <= 2 * MATCH_PX:
                 continue
             # its light may be part of a larger source
@@ -320,31 +379,57 @@ class Judge:
         """
         session, shot = self.session, self.session.shots[number]
         sources, sky = shot.sources, shot.sky
-        tree = cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
-        planets, satellites = self._planets(number), self._satellites(number) if sources.trail.any() else {}
+        tree = (
+            cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
+        )
+        planets, satellites = (
+            self._planets(number),
+            self._satellites(number) if sources.trail.any() else {},
+        )
         pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
         near, hot = _saturated(shot), ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         height, width = light_sigma.shape
-        trails = [(sources.x_px[k], sources.y_px[k], sources.length_px[k] / 2 + MASK_PX) for k in np.flatnonzero(sources.trail)]
+        trails = [
+            (sources.x_px[k], sources.y_px[k], sources.length_px[k] / 2 + MASK_PX)
+            for k in np.flatnonzero(sources.trail)
+        ]
         reach = max(3.0, PLANET_RAD * session.camera.camera.focal_length_px)
 
         def why(k: int) -> str:
             at = float(sources.x_px[k]), float(sources.y_px[k])
-            planet = next((name for name, place in planets.items() if math.dist(place, at) < reach), "")
+            planet = next(
+                (name for name, place in planets.items() if math.dist(place, at) < reach), ""
+            )
             if planet or sources.trail[k]:
-                reach_px = sources.length_px[k] / 2 + SATELLITE_RAD * session.camera.camera.focal_length_px
-                name = next((name for name, place in satellites.items() if math.dist(place, at) < reach_px), "a trail")
+                reach_px = (
+                    sources.length_px[k] / 2 + SATELLITE_RAD * session.camera.camera.focal_length_px
+                )
+                name = next(
+                    (name for name, place in satellites.items() if math.dist(place, at) < reach_px),
+                    "a trail",
+                )
                 return planet or f"{name}, {sources.length_px[k]:.0f} px long"
             light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
-            beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
+            beside = (
+                []
+                if tree is None
+                else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
+            )
             if beside and expected.dn[beside].sum() > light_dn:
                 return sky.name(int(expected.star[max(beside, key=lambda j: expected.dn[j])]))
-            column, row = min(max(round(at[0]), 0), width - 1), min(max(round(at[1]), 0), height - 1)
+            column, row = (
+                min(max(round(at[0]), 0), width - 1),
+                min(max(round(at[1]), 0), height - 1),
+            )
             if hot[row, column] or sources.single[k]:
                 return "a hot pixel" if hot[row, column] else "one pixel: hot, or a cosmic ray"
             if any(math.dist(at, (x, y)) < half for x, y, half in trails):
                 return "beside a trail"
-            return "light of a bright star" if near(*at) or light_sigma[row, column] > sources.snr[k] / 4 else ""
+            return (
+                "light of a bright star"
+                if near(*at) or light_sigma[row, column] > sources.snr[k] / 4
+                else ""
+            )
 
         return [
             SourceRow(float(sources.x_px[k]), float(sources.y_px[k]), float(sources.snr[k]), why(k))
@@ -358,7 +443,11 @@ class Judge:
         seen = planets_seen(shot.photo.t_ns)
         camera = self.session.camera
         x, y = camera.pointings[number].places_px(camera.camera, np.array(list(seen.values())))
-        return {n: (float(a), float(b)) for n, a, b in zip(seen, x, y, strict=True) if math.isfinite(a) and math.isfinite(b)}
+        return {
+            n: (float(a), float(b))
+            for n, a, b in zip(seen, x, y, strict=True)
+            if math.isfinite(a) and math.isfinite(b)
+        }
 
     def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
         """Places of satellites in the middle of the exposure, by the bench's list; none without
@@ -369,17 +458,28 @@ class Judge:
         if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
             return {}
         utc = f"{np.datetime64(photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
-        sky = msgspec.structs.replace(config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear)
-        moving, pointing = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder), camera.pointings[number]
+        sky = msgspec.structs.replace(
+            config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear
+        )
+        moving, pointing = (
+            bench_moving(msgspec.structs.replace(config, sky=sky), file.folder),
+            camera.pointings[number],
+        )
         if moving is None or moving.satellites is None:
             return {}
         moving.air = self.session.air
-        seen = moving.passing(Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0), 0)
+        seen = moving.passing(
+            Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0),
+            0,
+        )
         if seen is None:
             return {}
         directions = seen.directions(slice(None), np.zeros(len(seen)))
         x, y = camera.camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
-        return {moving.satellites.names[k]: (float(a), float(b)) for k, a, b in zip(seen.index, x, y, strict=True)}
+        return {
+            moving.satellites.names[k]: (float(a), float(b))
+            for k, a, b in zip(seen.index, x, y, strict=True)
+        }
 
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
         """Pixels without light of stars and sources."""
@@ -399,9 +499,18 @@ class Judge:
         places = np.column_stack([shot.found.x_px, shot.found.y_px])[shot.clean]
         near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
         depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
-        reached, v_mag = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR), shot.sky.v_mag[expected.star]
-        every = float((v_mag <= complete).sum()) * 10 ** ((COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * sine) * (reached - complete))
-        return Fainter(complete, reached, max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0)
+        reached, v_mag = (
+            float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR),
+            shot.sky.v_mag[expected.star],
+        )
+        every = float((v_mag <= complete).sum()) * 10 ** (
+            (COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * sine) * (reached - complete)
+        )
+        return Fainter(
+            complete,
+            reached,
+            max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0,
+        )
 
     def _dated(self, number: int) -> DatedBy | None:
         """How far off the date is by the stars that move fastest over the image; None without
@@ -413,15 +522,22 @@ class Judge:
             return None
         star = shot.star[use]
         some = shot.sky.catalog.taken(shot.sky.order[star])
-        later = unit_vectors_icrs(some, shot.sky.epoch_jyear + 1) - unit_vectors_icrs(some, shot.sky.epoch_jyear)
+        later = unit_vectors_icrs(some, shot.sky.epoch_jyear + 1) - unit_vectors_icrs(
+            some, shot.sky.epoch_jyear
+        )
         pointing, camera = session.camera.pointings[number], session.camera.camera
         vectors = shot.sky.vectors[star]
-        here, there = (np.column_stack(pointing.places_px(camera, part)) for part in (vectors, vectors + later))
+        here, there = (
+            np.column_stack(pointing.places_px(camera, part)) for part in (vectors, vectors + later)
+        )
         off = np.column_stack([shot.found.x_px[use], shot.found.y_px[use]]) - here
         sigma = np.hypot(shot.found.sigma_px[use], max(session.camera.floor_px, 0.02))[:, None]
         motion = (there - here) / sigma
         information = float((motion**2).sum())
-        return DatedBy(float((motion * off / sigma).sum()) / max(information, 1e-12), max(information, 1e-12) ** -0.5)
+        return DatedBy(
+            float((motion * off / sigma).sum()) / max(information, 1e-12),
+            max(information, 1e-12) ** -0.5,
+        )
 
 
 def _rms(values: FloatArray) -> float:
@@ -435,7 +551,9 @@ def _saturated(shot: Shot) -> Callable[[float, float], bool]:
     return lambda a, b: bool((np.hypot(x - a, y - b) < HALO_PX).any())
 
 
-def _dim_regions(rows: Sequence[StarRow], size_px: tuple[int, int]) -> tuple[list[str], Callable[[StarRow], bool]]:
+def _dim_regions(
+    rows: Sequence[StarRow], size_px: tuple[int, int]
+) -> tuple[list[str], Callable[[StarRow], bool]]:
     """Parts of the image whose stars are missing or dim, in words, and whether a star is in one
     of them.
     """
@@ -444,19 +562,31 @@ def _dim_regions(rows: Sequence[StarRow], size_px: tuple[int, int]) -> tuple[lis
 
     def cell(row: StarRow) -> tuple[int, int]:
         across, down = row.x_predicted_px / width, row.y_predicted_px / height
-        return min(int(CELLS * max(down, 0)), CELLS - 1), min(int(CELLS * max(across, 0)), CELLS - 1)
+        return min(int(CELLS * max(down, 0)), CELLS - 1), min(
+            int(CELLS * max(across, 0)), CELLS - 1
+        )
 
-    trusted = [r for r in rows if "missing" in r.flags or (not NOT_COUNTED & set(r.flags) and r.dn > EXPECTED_SNR * r.sigma_dn)]
+    trusted = [
+        r
+        for r in rows
+        if "missing" in r.flags
+        or (not NOT_COUNTED & set(r.flags) and r.dn > EXPECTED_SNR * r.sigma_dn)
+    ]
     for row in trusted:
         cells.setdefault(cell(row), []).append(row)
     dim: dict[tuple[int, int], tuple[int, int, float]] = {}
-    spread = MAD * float(np.median(np.abs(every))) if len(every := np.array([r.off_mag for r in trusted if r.dn > 0])) else 0.1
+    spread = (
+        MAD * float(np.median(np.abs(every)))
+        if len(every := np.array([r.off_mag for r in trusted if r.dn > 0]))
+        else 0.1
+    )
     for place, some in cells.items():
         lost = sum("missing" in r.flags for r in some)
         off = np.array([r.off_mag for r in some if r.dn > 0])
         middle = float(np.median(off)) if len(off) else math.nan
         if len(some) >= DIM_STARS and (
-            2 * lost >= len(some) or middle > max(DIM_MAG, DIM_SIGMAS * spread / math.sqrt(len(off)))
+            2 * lost >= len(some)
+            or middle > max(DIM_MAG, DIM_SIGMAS * spread / math.sqrt(len(off)))
         ):
             dim[place] = lost, len(some), middle
     parts: dict[str, list[tuple[int, int, float]]] = {}
@@ -468,7 +598,9 @@ def _dim_regions(rows: Sequence[StarRow], size_px: tuple[int, int]) -> tuple[lis
         lost, count = sum(one[0] for one in every_cell), sum(one[1] for one in every_cell)
         depth = [one[2] for one in every_cell if math.isfinite(one[2])]
         deep = f", those seen {np.median(depth):.2f} mag too faint" if depth else ""
-        words.append(f"{name}: {lost} of {count} stars are missing{deep}: cloud, an obstacle, or vignetting")
+        words.append(
+            f"{name}: {lost} of {count} stars are missing{deep}: cloud, an obstacle, or vignetting"
+        )
     faint = max(DIM_MAG, DIM_SIGMAS * spread)
 
     def in_dim(row: StarRow) -> bool:

@@ -102,7 +102,9 @@ class LightFit:
         return np.asarray(10 ** (-0.4 * (a * radius2 + b * radius2**2)))
 
 
-def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: LightFit | None = None) -> LightFit:
+def fit_light(
+    stars: StarLight, images: int, magnitudes: Magnitudes, held: LightFit | None = None
+) -> LightFit:
     """The light of stars; `magnitudes` are theirs (n,) through a quantum efficiency of a tilt.
 
     With `held` the camera is that one's, and each photograph's offset (the air, the exposure) alone
@@ -131,9 +133,13 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
     terms = (*found.values[images : len(found.values) - len(own)].tolist(), 0.0, 0.0)[:2]
     colours, colour_terms = np.zeros(images), {}
     for k, plane in enumerate(planes if own else ()):
-        colours[np.unique(stars.image[stars.plane == plane])] = found.values[len(found.values) - len(own) + k]
+        colours[np.unique(stars.image[stars.plane == plane])] = found.values[
+            len(found.values) - len(own) + k
+        ]
         here = use & (stars.plane == plane)
-        colour_terms[" rgb"[plane]] = float(_about_v(stars, base, here, ones[:, ones[here].any(axis=0)], ()).values[1])
+        colour_terms[" rgb"[plane]] = float(
+            _about_v(stars, base, here, ones[:, ones[here].any(axis=0)], ()).values[1]
+        )
     about_v = _about_v(stars, base, use, ones, vignetting[chosen])
     sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
     sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
@@ -151,7 +157,9 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
     )
 
 
-def with_extinction(light: LightFit, stars: StarLight, masses: Sequence[float | None], *, known: bool) -> LightFit:
+def with_extinction(
+    light: LightFit, stars: StarLight, masses: Sequence[float | None], *, known: bool
+) -> LightFit:
     """The light with the slope of the photographs' offsets over their air masses, where these span
     MIN_MASSES.
 
@@ -170,7 +178,9 @@ def with_extinction(light: LightFit, stars: StarLight, masses: Sequence[float | 
     slope, _ = np.linalg.lstsq(design, light.offsets_mag / sigma, rcond=None)[0]
     error = math.sqrt(float(np.linalg.inv(design.T @ design)[0, 0]))
     name = "extinction_beyond_table" if known else "extinction"
-    return replace(found, extinction_mag=float(slope), sigma=light.sigma | {f"{name}_mag_per_air_mass": error})
+    return replace(
+        found, extinction_mag=float(slope), sigma=light.sigma | {f"{name}_mag_per_air_mass": error}
+    )
 
 
 def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
@@ -187,7 +197,9 @@ def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
     return found if found.sum() >= MIN_STARS else clean
 
 
-def _correction(stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray) -> Correction:
+def _correction(
+    stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray
+) -> Correction:
     """Tilt and bow of the quantum efficiency by which stars of all colours fit best."""
     count = sum(int(use.sum()) >= least + plain.shape[1] for least in STARS_FOR_CORRECTION)
     if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
@@ -202,24 +214,35 @@ def _correction(stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use
         off, kept = target - magnitudes(_pair(values))[use], np.ones(len(target))
         for _ in range(CORRECTION_ROUNDS):
             rows = plain * (np.sqrt(kept) / weight)[:, None]
-            left = (off - plain @ np.linalg.lstsq(rows, off * np.sqrt(kept) / weight, rcond=None)[0]) / weight
+            left = (
+                off - plain @ np.linalg.lstsq(rows, off * np.sqrt(kept) / weight, rcond=None)[0]
+            ) / weight
             kept = np.minimum(1.0, CORRECTION_HUBER / np.maximum(np.abs(left), CORRECTION_HUBER))
         size = np.abs(left)
-        huber = np.where(size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2))
+        huber = np.where(
+            size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2)
+        )
         return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), left, kept
 
     values: FloatArray = np.zeros(2)
     best, off, kept = loss(values)
     for _ in range(CORRECTION_ROUNDS):
         base = magnitudes(_pair(values))[use]
-        moved = [magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]]
-        slopes = np.column_stack([*plain.T, *((one - base) / CORRECTION_STEP for one in moved)]) / weight[:, None]
+        moved = [
+            magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]
+        ]
+        slopes = (
+            np.column_stack([*plain.T, *((one - base) / CORRECTION_STEP for one in moved)])
+            / weight[:, None]
+        )
         prior = np.zeros(slopes.shape[1])
         prior[plain.shape[1] :] = 1 / CORRECTION_PRIOR[:count] ** 2
         downhill = slopes.T @ (kept * off)
         downhill[plain.shape[1] :] -= values[:count] * prior[plain.shape[1] :]
         step = np.zeros(2)
-        step[:count] = np.linalg.solve(slopes.T @ (kept[:, None] * slopes) + np.diag(prior + 1e-9), downhill)[plain.shape[1] :]
+        step[:count] = np.linalg.solve(
+            slopes.T @ (kept[:, None] * slopes) + np.diag(prior + 1e-9), downhill
+        )[plain.shape[1] :]
         for share in (1.0, 0.4, 0.15, 0.05):
             trial = np.clip(values + share * step, -MAX_CORRECTION, MAX_CORRECTION)
             new = loss(trial)
@@ -239,16 +262,29 @@ def _pair(values: FloatArray) -> Correction:
 
 
 def _about_v(
-    stars: StarLight, base: FloatArray, use: BoolArray, ones: FloatArray, vignetting: Sequence[FloatArray]
+    stars: StarLight,
+    base: FloatArray,
+    use: BoolArray,
+    ones: FloatArray,
+    vignetting: Sequence[FloatArray],
 ) -> "_Robust":
     """The power of the light that DN follow, and about V the colour term and zero points."""
     bv = np.nan_to_num(stars.bv_mag)
-    both = _robust(np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use)
+    both = _robust(
+        np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use
+    )
     # a zero point at V = 0 of a line with a free slope lies far from the stars: that of slope 1 is
     # stated
-    plain = _robust(np.column_stack([bv, ones, *vignetting]), stars.instrument_mag - stars.v_mag, stars.sigma_mag, use)
+    plain = _robust(
+        np.column_stack([bv, ones, *vignetting]),
+        stars.instrument_mag - stars.v_mag,
+        stars.sigma_mag,
+        use,
+    )
     return replace(
-        both, values=np.concatenate([both.values[:1], plain.values]), sigma=np.concatenate([both.sigma[:1], plain.sigma])
+        both,
+        values=np.concatenate([both.values[:1], plain.values]),
+        sigma=np.concatenate([both.sigma[:1], plain.sigma]),
     )
 
 
@@ -278,9 +314,15 @@ def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bool
             break
         weight = 1 / np.hypot(sigma, floor)[kept]
         rows = design[kept] * weight[:, None]
-        values = np.asarray(np.linalg.lstsq(rows, target[kept] * weight, rcond=None)[0], dtype=np.float64)
+        values = np.asarray(
+            np.linalg.lstsq(rows, target[kept] * weight, rcond=None)[0], dtype=np.float64
+        )
         off = target - design @ values
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept]))) * math.sqrt(kept.sum() / (kept.sum() - design.shape[1]))
+        spread = (
+            MAD_TO_SIGMA
+            * float(np.median(np.abs(off[kept])))
+            * math.sqrt(kept.sum() / (kept.sum() - design.shape[1]))
+        )
         floor = math.sqrt(max(spread**2 - float(np.median(sigma[kept])) ** 2, 1e-6))
         covariance = np.linalg.pinv(rows.T @ rows)
         kept = use & (np.abs(off) < PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01)))

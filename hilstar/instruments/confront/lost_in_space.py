@@ -88,17 +88,28 @@ def solve_lost(
     if near is not None:
         reach = 2.5 * math.atan(field.diagonal_px / 2 / focal_length_px)
         rows = np.flatnonzero(vectors @ near > math.cos(min(reach, math.pi)))
-        found = _solved(field, focal_length_px, vectors[rows], _triangles_of_sky(vectors[rows], smaller_rad, near, reach))
+        found = _solved(
+            field,
+            focal_length_px,
+            vectors[rows],
+            _triangles_of_sky(vectors[rows], smaller_rad, near, reach),
+        )
         return None if found is None else replace(found, star=rows[found.star])
     kept = _KEPT.get(smaller_rad)
-    if kept is None or kept[0].shape != vectors.shape or np.abs(kept[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD:
+    if (
+        kept is None
+        or kept[0].shape != vectors.shape
+        or np.abs(kept[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD
+    ):
         kept = vectors, _triangles_of_sky(vectors, smaller_rad)
         _KEPT.clear()
         _KEPT[smaller_rad] = kept
     return _solved(field, focal_length_px, vectors, kept[1])
 
 
-def _solved(field: SourceField, focal_length_px: float, vectors: FloatArray, sky: Triangles) -> SolvedField | None:
+def _solved(
+    field: SourceField, focal_length_px: float, vectors: FloatArray, sky: Triangles
+) -> SolvedField | None:
     tries = (_by_hypothesis(field, focal_length_px * times, vectors, sky) for times in HYPOTHESES)
     return next((found for found in tries if found is not None), None)
 
@@ -119,7 +130,9 @@ def _triangles_of_sky(
     centres = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
     if near is not None:
         centres = centres[centres @ near > math.cos(min(reach, math.pi))]
-    within = cKDTree(bright).query_ball_point(centres, 2 * math.sin(radius_rad / 2), return_sorted=True)
+    within = cKDTree(bright).query_ball_point(
+        centres, 2 * math.sin(radius_rad / 2), return_sorted=True
+    )
     sets = [row[:STARS_A_CIRCLE] for row in within if len(row) >= 3]
     every = []
     for size in range(3, STARS_A_CIRCLE + 1):
@@ -164,7 +177,9 @@ def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
     seen: set[tuple[int, int, int]] = set()
     found: list[tuple[int, int, int]] = []
     for x, y in itertools.product(*ways):
-        near = np.flatnonzero(np.hypot(field.places_px[:, 0] - x, field.places_px[:, 1] - y) < radius)[:SOURCES_A_CIRCLE]
+        near = np.flatnonzero(
+            np.hypot(field.places_px[:, 0] - x, field.places_px[:, 1] - y) < radius
+        )[:SOURCES_A_CIRCLE]
         for triple in itertools.combinations(near.tolist(), 3):
             if triple not in seen:
                 seen.add(triple)
@@ -172,7 +187,9 @@ def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
     yield from sorted(found, key=sum)
 
 
-def _by_hypothesis(field: SourceField, focal_px: float, vectors: FloatArray, sky: Triangles) -> SolvedField | None:
+def _by_hypothesis(
+    field: SourceField, focal_px: float, vectors: FloatArray, sky: Triangles
+) -> SolvedField | None:
     triples, turns, tree = sky
     rays = field.rays(focal_px)
     mine = np.array(list(_image_triples(field)), dtype=np.intp).reshape(-1, 3)
@@ -204,7 +221,9 @@ class _Proof:
         self.places = field.places_px[:MAX_SOURCES]
         self.tree = cKDTree(self.places)
         self.radius_px = NEAR * field.diagonal_px
-        self.chance = min(0.5, len(self.places) * math.pi * self.radius_px**2 / (field.width_px * field.height_px))
+        self.chance = min(
+            0.5, len(self.places) * math.pi * self.radius_px**2 / (field.width_px * field.height_px)
+        )
         self.sky = cKDTree(vectors)
 
     def of(self, sources: IntArray, stars: IntArray, focal_px: float) -> SolvedField | None:
@@ -229,21 +248,27 @@ class _Proof:
         radius = math.atan(self.field.diagonal_px / 2 / focal_px)
         near = np.sort(self.sky.query_ball_point(matrix[2], 2 * math.sin(radius / 2)))
         at = self._places(self.vectors[near], matrix, focal_px)
-        inside = (np.abs(at[:, 0]) < self.field.width_px / 2) & (np.abs(at[:, 1]) < self.field.height_px / 2)
+        inside = (np.abs(at[:, 0]) < self.field.width_px / 2) & (
+            np.abs(at[:, 1]) < self.field.height_px / 2
+        )
         return np.asarray(near[inside][: len(self.places)], dtype=np.intp)
 
     def _places(self, vectors: FloatArray, matrix: FloatArray, focal_px: float) -> FloatArray:
         cam = vectors @ matrix.T
         return np.asarray(focal_px * cam[:, :2] / cam[:, 2:])
 
-    def _pairs(self, seen: IntArray, matrix: FloatArray, focal_px: float) -> tuple[IntArray, IntArray]:
+    def _pairs(
+        self, seen: IntArray, matrix: FloatArray, focal_px: float
+    ) -> tuple[IntArray, IntArray]:
         """Stars and the sources on which they lie, each once."""
         places = self._places(self.vectors[seen], matrix, focal_px)
         one, source = nearest_once(self.tree, places, self.radius_px)
         return seen[one], source
 
 
-def nearest_once(tree: cKDTree, places_px: FloatArray, radius_px: float) -> tuple[IntArray, IntArray]:
+def nearest_once(
+    tree: cKDTree, places_px: FloatArray, radius_px: float
+) -> tuple[IntArray, IntArray]:
     """Which places (n, 2), brightest first, have a source of a tree within a radius, each source
     once, and that source.
     """
@@ -261,7 +286,9 @@ def turned(cam: FloatArray, icrs: FloatArray) -> FloatArray:
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
-def _refined(places: FloatArray, vectors: FloatArray, matrix: FloatArray, focal_px: float) -> tuple[FloatArray, float]:
+def _refined(
+    places: FloatArray, vectors: FloatArray, matrix: FloatArray, focal_px: float
+) -> tuple[FloatArray, float]:
     """Attitude and focal length by all pairs."""
     cam = vectors @ matrix.T
     plane = cam[:, :2] / cam[:, 2:]

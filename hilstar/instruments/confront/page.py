@@ -52,7 +52,9 @@ def page_pictures(session: Session, verdict: Verdict) -> Pictures:
     rows, columns = np.linspace(0, height, 13).astype(int), np.linspace(0, width, 17).astype(int)
     clipped = np.minimum(verdict.residual**2, 25.0)
     sums = np.add.reduceat(np.add.reduceat(clipped, rows[:-1], axis=0), columns[:-1], axis=1)
-    return Pictures(tuple(_jpeg(grey) for grey in greys), sums / np.outer(np.diff(rows), np.diff(columns)))
+    return Pictures(
+        tuple(_jpeg(grey) for grey in greys), sums / np.outer(np.diff(rows), np.diff(columns))
+    )
 
 
 def _jpeg(grey: FloatArray) -> bytes:
@@ -69,13 +71,17 @@ def _jpeg(grey: FloatArray) -> bytes:
 def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> None:
     """Write the page, which needs no other file. Raises InputError where it cannot be written."""
     verdict = (
-        "beyond the limits: " + "; ".join(found.failures) if found.failures else "the simulator explains these photographs"
+        "beyond the limits: " + "; ".join(found.failures)
+        if found.failures
+        else "the simulator explains these photographs"
     )
     body = [
         f"<style>{STYLE.read_text()}</style>",
         f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b> {escaped(verdict)}.</p>',
         *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
-        "<h2>Verdicts</h2><ul>" + "".join(f"<li>{escaped(line)}</li>" for line in found.lines) + "</ul>",
+        "<h2>Verdicts</h2><ul>"
+        + "".join(f"<li>{escaped(line)}</li>" for line in found.lines)
+        + "</ul>",
         _summary(found.verdicts),
     ]
     for one, views in zip(found.verdicts, pictures, strict=True):
@@ -91,13 +97,36 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
             rows += [(one.name, None if math.isnan(one.rms) else one.rms, one.how) for one in parts]
             body.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
     body.append(_lists(found.verdicts))
-    write_whole(path, page_of("Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]))
+    write_whole(
+        path,
+        page_of(
+            "Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]
+        ),
+    )
 
 
 def _summary(verdicts: Sequence[Verdict]) -> str:
-    header = ("photograph", "stars to V = 6.5", "px rms", "mag rms", "background chi²", "star chi²", "unexplained", "missing")
+    header = (
+        "photograph",
+        "stars to V = 6.5",
+        "px rms",
+        "mag rms",
+        "background chi²",
+        "star chi²",
+        "unexplained",
+        "missing",
+    )
     rows = [
-        (v.shot.photo.name, v.counted, v.rms_px, v.rms_mag, v.background_chi2, v.star_chi2, len(v.unexplained), len(v.missing))
+        (
+            v.shot.photo.name,
+            v.counted,
+            v.rms_px,
+            v.rms_mag,
+            v.background_chi2,
+            v.star_chi2,
+            len(v.unexplained),
+            len(v.missing),
+        )
         for v in verdicts
     ]
     return table_of(rows, header, 3)
@@ -110,7 +139,8 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
         for s in verdict.unexplained
     ]
     marks += [
-        f'<circle cx="{r.x_predicted_px:.0f}" cy="{r.y_predicted_px:.0f}" r="10" stroke="#6cb6ff"/>' for r in verdict.missing
+        f'<circle cx="{r.x_predicted_px:.0f}" cy="{r.y_predicted_px:.0f}" r="10" stroke="#6cb6ff"/>'
+        for r in verdict.missing
     ]
     over = f'<svg viewBox="-0.5 -0.5 {width} {height}" fill="none" stroke-width="1.5">{"".join(marks)}</svg>'
     images = "".join(
@@ -127,7 +157,12 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
 
 
 def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
-    rows = [row for verdict in found.verdicts for row in verdict.stars if row.dn > 0 and row.dn_predicted > 0]
+    rows = [
+        row
+        for verdict in found.verdicts
+        for row in verdict.stars
+        if row.dn > 0 and row.dn_predicted > 0
+    ]
     good = [row for row in rows if not NOT_COUNTED & set(row.flags)]
     charts = [("Flux and colour", _flux(found, good))] if good else []
     if good:
@@ -140,7 +175,10 @@ def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, 
 
 
 def _flux(found: Confronted, rows: Sequence[Any]) -> str:
-    v, bv, dn, off = (np.array([getattr(row, name) for row in rows]) for name in ("v_mag", "b_v_mag", "dn", "off_mag"))
+    v, bv, dn, off = (
+        np.array([getattr(row, name) for row in rows])
+        for name in ("v_mag", "b_v_mag", "dn", "off_mag")
+    )
     light = found.session.light
     counted = np.array([row.counted for row in rows])
     rms = math.sqrt(float((off[counted] ** 2).mean())) if counted.any() else math.nan
@@ -152,7 +190,9 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
             (panels[1], v, off, ("V [mag]", "off [mag]")),
             (panels[2], bv, off, ("B-V [mag]", "off [mag]")),
         ):
-            axes.plot(x[~counted], y[~counted], "o", ms=2.5, mfc="none", color=MUTED, rasterized=True)
+            axes.plot(
+                x[~counted], y[~counted], "o", ms=2.5, mfc="none", color=MUTED, rasterized=True
+            )
             axes.plot(x[counted], y[counted], "o", ms=3.5, color=BLUE)
             axes.set(xlabel=names[0], ylabel=names[1])
         for axes in panels[1:]:
@@ -161,20 +201,33 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
         if math.isfinite(light.zero_point_mag):
             line = np.array([v.min(), v.max()])
             panels[0].plot(
-                line, line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)), color=ORANGE, lw=1.2
+                line,
+                line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)),
+                color=ORANGE,
+                lw=1.2,
             )
-    return drawing_of(panels[0].figure, "flux against V, and what is left of it against V and colour")
+    return drawing_of(
+        panels[0].figure, "flux against V, and what is left of it against V and colour"
+    )
 
 
 def _places(rows: Sequence[Any]) -> str:
     some = [row for row in rows if row.dn > 20 * row.sigma_dn]
-    x, y = (np.array([getattr(row, name) for row in some]) for name in ("x_predicted_px", "y_predicted_px"))
+    x, y = (
+        np.array([getattr(row, name) for row in some])
+        for name in ("x_predicted_px", "y_predicted_px")
+    )
     dx = np.array([row.x_px - row.x_predicted_px for row in some])
     dy = np.array([row.y_px - row.y_predicted_px for row in some])
     rms = math.sqrt(float((dx**2 + dy**2).mean() / 2)) if some else math.nan
-    with panels_of(f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places", height_inch=4.6) as panels:
+    with panels_of(
+        f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places",
+        height_inch=4.6,
+    ) as panels:
         axes = panels[0]
-        arrows = axes.quiver(x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width")
+        arrows = axes.quiver(
+            x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width"
+        )
         axes.quiverkey(arrows, 0.86, 0.04, 0.1, "0.1 px", labelpos="E")
         axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
         axes.invert_yaxis()
@@ -184,19 +237,29 @@ def _places(rows: Sequence[Any]) -> str:
 def _psf_grid(session: Session) -> str:
     psf = session.psf
     width, height = psf.size_px
-    places = [(x, y) for y in np.linspace(0, height - 1, GRID) for x in np.linspace(0, width - 1, GRID)]
+    places = [
+        (x, y) for y in np.linspace(0, height - 1, GRID) for x in np.linspace(0, width - 1, GRID)
+    ]
     fwhm = psf.fwhm_px(*np.array(places).T)
     finding = f"Full width at half maximum {fwhm.min():.2f} to {fwhm.max():.2f} px, pixel included"
     tiles = np.array([np.sqrt(psf.samples(x, y, TILE_PER_PX, TILE_HALF_PX)) for x, y in places])
     side = tiles.shape[-1]
     mosaic = tiles.reshape(GRID, GRID, side, side).swapaxes(1, 2).reshape(GRID * side, GRID * side)
     with panels_of(
-        finding, note="Width and height of each tile: 6 px. Numbers: place and width, px.", height_inch=6.6
+        finding,
+        note="Width and height of each tile: 6 px. Numbers: place and width, px.",
+        height_inch=6.6,
     ) as panels:
         axes = panels[0]  # one picture: 25 panels of their own take a second
         axes.imshow(mosaic, cmap="gray_r", extent=(0, GRID, GRID, 0))
         for number, ((x, y), wide) in enumerate(zip(places, fwhm, strict=True)):
-            axes.text(number % GRID + 0.03, number // GRID + 0.97, f"{x:.0f}, {y:.0f}: {wide:.2f}", fontsize=7, color=MUTED)
+            axes.text(
+                number % GRID + 0.03,
+                number // GRID + 0.97,
+                f"{x:.0f}, {y:.0f}: {wide:.2f}",
+                fontsize=7,
+                color=MUTED,
+            )
         axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
         axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
     return drawing_of(panels[0].figure, "point spread functions over the field")
@@ -222,7 +285,9 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
     rows = math.ceil(len(verdicts) / columns)
     finding = f"The background's chi² is {min(chi2):.3f} to {max(chi2):.3f}"
     note = "Mean square of all residuals in a part of the image, stars among them, each up to 5 sigmas."
-    with panels_of(finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows) as panels:
+    with panels_of(
+        finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows
+    ) as panels:
         for axes, one, views in zip(panels, verdicts, pictures, strict=False):
             drawn = axes.imshow(views.chi2_map, vmin=0.5, vmax=2.0, cmap="RdBu_r", aspect="auto")
             axes.set_xticks([])
@@ -237,7 +302,9 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
 
 def _lists(verdicts: Sequence[Verdict]) -> str:
     sources: list[tuple[object, ...]] = [
-        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr) for v in verdicts for s in v.unexplained
+        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr)
+        for v in verdicts
+        for s in v.unexplained
     ]
     sources.sort(key=lambda row: -float(str(row[3])))
     named: list[tuple[object, ...]] = [
@@ -258,6 +325,8 @@ def _lists(verdicts: Sequence[Verdict]) -> str:
         ("Stars that are missing", missing, ("photograph", "star", "V", "x px", "y px")),
     ):
         if rows:
-            more = f"<p>{len(rows) - MAX_ROWS} more in the tables.</p>" if len(rows) > MAX_ROWS else ""
+            more = (
+                f"<p>{len(rows) - MAX_ROWS} more in the tables.</p>" if len(rows) > MAX_ROWS else ""
+            )
             parts.append(f"<h2>{title}</h2>{table_of(rows[:MAX_ROWS], header)}{more}")
     return "".join(parts)

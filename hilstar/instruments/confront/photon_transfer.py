@@ -53,7 +53,11 @@ class PixelFit:
     def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
         """Variance of a pixel at a level."""
         light = np.maximum(level_dn - self.pedestal_dn, 0)
-        noise = light / self.gain_e_per_dn + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12
+        noise = (
+            light / self.gain_e_per_dn
+            + (self.read_noise_e / self.gain_e_per_dn) ** 2
+            + self.step_dn**2 / 12
+        )
         return np.asarray(noise + self.pattern.variance_dn2(light))
 
     @property
@@ -221,7 +225,9 @@ def _by_one_level(
         f" read noise, {read_e:g} e-"
     )
     sigma = bench.sigma | {"gain_e_per_dn": gain * error}
-    return replace(bench, gain_e_per_dn=gain, sigma=sigma, notes=(*bench.notes, note), gain_told=True)
+    return replace(
+        bench, gain_e_per_dn=gain, sigma=sigma, notes=(*bench.notes, note), gain_told=True
+    )
 
 
 def _by_response(
@@ -266,7 +272,9 @@ def _by_response(
 def _response_alone(square: float, sigma: float, offsets_dn: float = 0.0) -> FixedPattern:
     """The response of one photograph's pixels, beside offsets that the bench file gives."""
     offsets_sigma = math.inf if offsets_dn == 0 else 0.0
-    return FixedPattern((max(square, 0.0), offsets_dn**2, 0.0, 0.0), (sigma, offsets_sigma, math.inf, math.inf))
+    return FixedPattern(
+        (max(square, 0.0), offsets_dn**2, 0.0, 0.0), (sigma, offsets_sigma, math.inf, math.inf)
+    )
 
 
 def _median_error(values: FloatArray) -> float:
@@ -321,7 +329,9 @@ def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
         sigma = spread * np.sqrt(np.diag(normal)) / size
         near = np.abs(off) < CLIP * spread * scale
     squares = (float(values[2]), float(sigma[2])) if square else (0.0, 0.0)
-    return _Curve(float(values[0]), float(values[1]), squares[0], float(sigma[0]), float(sigma[1]), squares[1])
+    return _Curve(
+        float(values[0]), float(values[1]), squares[0], float(sigma[0]), float(sigma[1]), squares[1]
+    )
 
 
 def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
@@ -348,12 +358,24 @@ def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[floa
             off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
             return float((off**2).sum())
 
-        return float(minimize_scalar(loss, bounds=(lowest - 2 * abs(lowest), 0.98 * lowest), method="bounded").x)
+        return float(
+            minimize_scalar(
+                loss, bounds=(lowest - 2 * abs(lowest), 0.98 * lowest), method="bounded"
+            ).x
+        )
 
     whole = best(levels)
     if len(levels) == 2:
         return whole, abs(whole) / 2
     parts = [best([*levels[:k], *levels[k + 1 :]]) for k in range(len(levels))]
-    usable = [p for k, p in enumerate(parts) if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)]
-    sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1)) if len(usable) > 1 else abs(whole) / 2
+    usable = [
+        p
+        for k, p in enumerate(parts)
+        if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)
+    ]
+    sigma = (
+        float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1))
+        if len(usable) > 1
+        else abs(whole) / 2
+    )
     return whole, max(sigma, 0.01 * min(medians))

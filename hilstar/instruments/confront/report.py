@@ -65,14 +65,18 @@ class Confronted:
                 "colour_terms": light.colour_terms,
                 "vignetting_mag": list(light.vignetting_mag),
                 "extinction_mag_per_air_mass": extinction_of(session),
-                "linearity_power": session.power * light.linearity if session.power != 1.0 else light.linearity,
+                "linearity_power": session.power * light.linearity
+                if session.power != 1.0
+                else light.linearity,
                 "tone_curve": session.power != 1.0,
                 "fixed_pattern": None
                 if not math.isfinite(pixels.pattern.errors[0])
                 else dict(zip(KINDS, pixels.pattern.rms, strict=True)),
                 "hot_pixels": self.defects[0],
                 "dead_pixels": self.defects[1],
-                "sigma": {"focal_length_px": focal * sigma["log_focal"] if "log_focal" in sigma else None}
+                "sigma": {
+                    "focal_length_px": focal * sigma["log_focal"] if "log_focal" in sigma else None
+                }
                 | {"principal_point_px": [sigma.get("centre_x"), sigma.get("centre_y")]}
                 | {name: sigma[name] for name in ("k1", "k2", "p1", "p2") if name in sigma}
                 | {name: _number(value) for name, value in (light.sigma | pixels.sigma).items()},
@@ -150,7 +154,10 @@ def sky_v_mag(session: Session, number: int) -> float | None:
 
 def _fwhms(session: Session) -> FloatArray:
     width, height = session.camera.camera.resolution_px
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0, width - 1, 5), np.linspace(0, height - 1, 5)))
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(np.linspace(0, width - 1, 5), np.linspace(0, height - 1, 5))
+    )
     return session.psf.fwhm_px(x, y)
 
 
@@ -162,7 +169,9 @@ def words_of(verdict: Verdict) -> str:
     )
 
 
-def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | None, defects: tuple[int, int]) -> list[str]:
+def lines_of(
+    session: Session, verdicts: Sequence[Verdict], excess: Excess | None, defects: tuple[int, int]
+) -> list[str]:
     """Verdicts in words: what the simulator explains, and what it does not."""
     camera, light, pixels = session.camera, session.light, session.pixels
     lens = camera.camera.lens
@@ -177,7 +186,9 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
     if math.isfinite(pixels.pattern.errors[0]) and not session.fixed:
         found.append(f"fixed pattern: {pixels.pattern.words()}")
     if not session.fixed:
-        zero = f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
+        zero = (
+            f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
+        )
         zero += "".join(f", {plane} {term:+.3f}" for plane, term in light.colour_terms.items())
         found.append(f"light: {zero}; {_tone(session)}")
     if session.fixed:
@@ -195,13 +206,20 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
         )
     skies = [v for k in range(len(session.shots)) if (v := sky_v_mag(session, k)) is not None]
     if skies:
-        found.append(f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of [site] sky_spectrum")
+        found.append(
+            f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of [site] sky_spectrum"
+        )
     if defects[0] or defects[1]:
         found.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
     for verdict in verdicts:
-        found += [f"{verdict.shot.photo.name}: {line}" for line in (*verdict.dim, *_beyond(verdict), *_dated(verdict))]
+        found += [
+            f"{verdict.shot.photo.name}: {line}"
+            for line in (*verdict.dim, *_beyond(verdict), *_dated(verdict))
+        ]
     if excess is not None:
-        found.append(f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis, {excess.rms_mag:.3f} mag")
+        found.append(
+            f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis, {excess.rms_mag:.3f} mag"
+        )
     return found
 
 
@@ -213,7 +231,11 @@ def _tone(session: Session) -> str:
     sigma = light.sigma["linearity"]
     said = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
     bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
-    return f"{said}: a tone curve that is no power, which stays in all figures" if bent else f"{said}: no tone curve"
+    return (
+        f"{said}: a tone curve that is no power, which stays in all figures"
+        if bent
+        else f"{said}: no tone curve"
+    )
 
 
 def _beyond(verdict: Verdict) -> Iterator[str]:
@@ -244,7 +266,9 @@ def failures_of(verdicts: Sequence[Verdict]) -> list[str]:
     for verdict in verdicts:
         name = verdict.shot.photo.name
         if verdict.counted < MIN_STARS_JUDGED:
-            found.append(f"{name}: {verdict.counted} clean stars to V = 6.5 are too few to judge by")
+            found.append(
+                f"{name}: {verdict.counted} clean stars to V = 6.5 are too few to judge by"
+            )
         for what, value, limit, unit in (
             ("places", verdict.rms_px, MAX_RMS_PX, "px"),
             ("light", verdict.rms_mag, MAX_RMS_MAG, "mag"),
@@ -252,6 +276,8 @@ def failures_of(verdicts: Sequence[Verdict]) -> list[str]:
             if value > limit:
                 found.append(f"{name}: {what} are {value:.3f} {unit} rms off, over {limit:g}")
         if not CHI2[0] <= verdict.background_chi2 <= CHI2[1]:
-            found.append(f"{name}: background chi2 {verdict.background_chi2:.2f} is outside {CHI2[0]:g} to {CHI2[1]:g}")
+            found.append(
+                f"{name}: background chi2 {verdict.background_chi2:.2f} is outside {CHI2[0]:g} to {CHI2[1]:g}"
+            )
         found += [f"{name}: {line}" for line in verdict.dim]
     return found

@@ -90,7 +90,11 @@ def confront(
     finally:
         judge.close()
     excess = split_excess(session, verdicts)
-    notes = list(dict.fromkeys([*(f"{p.name}: {note}" for p in photos for note in p.notes), *session.pixels.notes]))
+    notes = list(
+        dict.fromkeys(
+            [*(f"{p.name}: {note}" for p in photos for note in p.notes), *session.pixels.notes]
+        )
+    )
     result = Confronted(
         session,
         tuple(verdicts),
@@ -98,7 +102,11 @@ def confront(
         tuple(lines_of(session, verdicts, excess, defects)),
         tuple(failures_of(verdicts)),
         tuple(notes),
-        tuple(str(output / name) for name in OUTPUTS if name not in NAMES or not (fixed and has_screen)),
+        tuple(
+            str(output / name)
+            for name in OUTPUTS
+            if name not in NAMES or not (fixed and has_screen)
+        ),
         defects,
     )
     _write_tables(output, verdicts, hot)
@@ -126,7 +134,12 @@ def _write_tables(output: Path, verdicts: Sequence[Verdict], hot: Any) -> None:
         return f"{value:.4f}" if math.isfinite(value) else ""
 
     stars = [
-        (v.shot.photo.name, r.hip, *map(text, r.figures), " ".join(flag.replace(" ", "-") for flag in r.flags))
+        (
+            v.shot.photo.name,
+            r.hip,
+            *map(text, r.figures),
+            " ".join(flag.replace(" ", "-") for flag in r.flags),
+        )
         for v in verdicts
         for r in v.stars
     ]

@@ -26,7 +26,13 @@ from hilstar.instruments.confront.background import (
     sky_level,
     source_mask,
 )
-from hilstar.instruments.confront.camera_fit import CameraFit, Places, Pointing, fit_camera, k1_camera
+from hilstar.instruments.confront.camera_fit import (
+    CameraFit,
+    Places,
+    Pointing,
+    fit_camera,
+    k1_camera,
+)
 from hilstar.instruments.confront.images import Photograph, paged
 from hilstar.instruments.confront.light import (
     LINEAR_OFF,
@@ -47,7 +53,12 @@ from hilstar.instruments.confront.lost_in_space import (
     nearest_once,
     solve_lost,
 )
-from hilstar.instruments.confront.photon_transfer import PixelFit, fit_pedestal, fit_pixels, transfer_points
+from hilstar.instruments.confront.photon_transfer import (
+    PixelFit,
+    fit_pedestal,
+    fit_pixels,
+    transfer_points,
+)
 from hilstar.instruments.confront.sky import DatedSky, dated_sky
 from hilstar.instruments.confront.star_psf import (
     HALF,
@@ -147,7 +158,9 @@ class Session:
         config, folder = self.file.config, self.file.folder
         optics = bench_optics(config.tracker, folder)
         corrected_by = NO_CORRECTION if self.fixed else self.light.correction
-        optics = replace(optics, quantum_efficiency=corrected(optics.quantum_efficiency, corrected_by))
+        optics = replace(
+            optics, quantum_efficiency=corrected(optics.quantum_efficiency, corrected_by)
+        )
         site = msgspec.structs.replace(config.site or SiteSettings(0.0, 0.0), sky_v_mag_arcsec2=0.0)
         glow = site_glow_e_per_s_sr(msgspec.structs.replace(config, site=site), folder, optics)
         return float(magnitude(np.array([glow / ARCSEC_PER_RAD**2]))[0])
@@ -156,10 +169,14 @@ class Session:
         """By how much stars of V, B-V and V-I (3, n) are fainter to a plane of a mosaic than to
         the tracker as a whole, mag.
         """
-        colour = self.light.colours[number] * (np.nan_to_num(columns[1], nan=MEAN_BV_MAG) - MEAN_BV_MAG)
+        colour = self.light.colours[number] * (
+            np.nan_to_num(columns[1], nan=MEAN_BV_MAG) - MEAN_BV_MAG
+        )
         return np.asarray(colour + _channel_mag(self.file, self.shots[number].photo.plane, columns))
 
-    def predicted_dn(self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    def predicted_dn(
+        self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray
+    ) -> FloatArray:
         """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
         sky, light = self.shots[number].sky, self.light
         columns = sky.columns(sky.order[star])
@@ -195,7 +212,9 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     matched = replace(found, source=kept[found.source])
     wide_px = float(np.median(sources.fwhm_px[np.sort(matched.source)[:BRIGHTEST]]))
     if wide_px > WIDE_PX:
-        raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
+        raise InputError(
+            f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus"
+        )
     return Shot(
         photo,
         level,
@@ -210,11 +229,15 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
 
 def _field(sources: FoundSources, points: BoolArray, photo: Photograph) -> SourceField:
     width, height = photo.size_px
-    places = np.column_stack([sources.x_px - (width - 1) / 2, sources.y_px - (height - 1) / 2])[points]
+    places = np.column_stack([sources.x_px - (width - 1) / 2, sources.y_px - (height - 1) / 2])[
+        points
+    ]
     return SourceField(places, width, height)
 
 
-def _solve(field: SourceField, base: Camera, sky: DatedSky, start: FloatArray | None) -> SolvedField | None:
+def _solve(
+    field: SourceField, base: Camera, sky: DatedSky, start: FloatArray | None
+) -> SolvedField | None:
     if start is not None:
         near = rotate(conjugate(start), np.array([[0.0, 0.0, 1.0]]))[0]
         found = solve_lost(field, base.focal_length_px, sky.vectors, near)
@@ -224,26 +247,38 @@ def _solve(field: SourceField, base: Camera, sky: DatedSky, start: FloatArray | 
 
 
 def _why_not(
-    field: SourceField, base: Camera, sky: DatedSky, sources: FoundSources, points: BoolArray, start: FloatArray | None
+    field: SourceField,
+    base: Camera,
+    sky: DatedSky,
+    sources: FoundSources,
+    points: BoolArray,
+    start: FloatArray | None,
 ) -> str:
     """What is seen of a photograph without an attitude, and what to do."""
     bright = np.flatnonzero(points)[:BRIGHTEST]
     length, width = np.median(sources.length_px[bright]), np.median(sources.width_px[bright])
-    if sources.trail.sum() >= MIN_MATCHED or (length > TRAILED_PX and length > TRAILED_RATIO * width):
-        trails = sources.length_px[sources.trail] if sources.trail.sum() >= MIN_MATCHED else np.array([length])
-        return (
-            f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
+    if sources.trail.sum() >= MIN_MATCHED or (
+        length > TRAILED_PX and length > TRAILED_RATIO * width
+    ):
+        trails = (
+            sources.length_px[sources.trail]
+            if sources.trail.sum() >= MIN_MATCHED
+            else np.array([length])
         )
+        return f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
     if (wide := np.median(sources.fwhm_px[bright])) > WIDE_PX:
         return f"its sources are {wide:.0f} px wide; focus the lens, or give a frame in focus"
     mirrored = replace(field, places_px=field.places_px * [-1, 1])
     if _solve(mirrored, base, sky, start) is not None:
-        return "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
+        return (
+            "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
+        )
     seen = f"has {len(field.places_px)} sources, and no part of the sky fits them"
     degrees = math.degrees(2 * math.atan(field.width_px / 2 / base.focal_length_px))
     asked = " near --radec" if start is not None else ""
-    return f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and pixel_pitch_um" + (
-        "" if start is not None else ", or give --radec RA,DEC,ROLL"
+    return (
+        f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and pixel_pitch_um"
+        + ("" if start is not None else ", or give --radec RA,DEC,ROLL")
     )
 
 
@@ -263,7 +298,11 @@ def run_session(
     shots = [open_shot(file, photo, base, start) for photo in photos]
     focal = float(np.median([shot.focal_length_px for shot in shots]))
     base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
-    air = None if shots[0].sky.air is None else site_air(file.config, file.folder, shots[0].sky.catalog)
+    air = (
+        None
+        if shots[0].sky.air is None
+        else site_air(file.config, file.folder, shots[0].sky.catalog)
+    )
     fit = partial(_fitted, file, base, fixed, air)
     session = fit(shots)
     off = abs(session.light.linearity - 1)
@@ -277,7 +316,9 @@ def run_session(
     before, undone = (0.0, math.log(session.light.linearity)), math.log(session.light.linearity)
     for _ in range(TONE_ROUNDS):
         power = math.exp(undone)
-        linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
+        linear = [
+            _linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)
+        ]
         trial = fit(linear, power=power, before=session.camera)
         left = math.log(max(trial.light.linearity, 0.1))
         if abs(left) < LINEAR_DONE:
@@ -348,7 +389,9 @@ def _fitted(
         if before is not None:
             continue
         places = [_places(shot) for shot in shots]
-        camera = fit_camera(base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
+        camera = fit_camera(
+            base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1
+        )
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)
@@ -361,11 +404,18 @@ def _fitted(
         ]
     )
     light = fit_light(
-        stars, len(shots), lambda corrected: magnitudes(corrected) + extinct, None if fixed is None else fixed.light
+        stars,
+        len(shots),
+        lambda corrected: magnitudes(corrected) + extinct,
+        None if fixed is None else fixed.light,
     )
-    masses = [_masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)]
+    masses = [
+        _masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)
+    ]
     light = with_extinction(light, stars, masses, known=air is not None)
-    return Session(file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, air)
+    return Session(
+        file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, air
+    )
 
 
 def _seen_at(shot: Shot, star: IntArray, source: IntArray) -> Places:
@@ -386,8 +436,13 @@ def _outward(
     places, now = first, list(pointings)
     for _ in range(MAX_ROUNDS):
         camera, turned = k1_camera(base, now, places)
-        found = [_beyond(shot, camera, *one) for shot, one in zip(shots, zip(turned, places, strict=True), strict=True)]
-        if max(_reach_px(camera, one) for one in found) < FURTHER * max(_reach_px(camera, one) for one in places):
+        found = [
+            _beyond(shot, camera, *one)
+            for shot, one in zip(shots, zip(turned, places, strict=True), strict=True)
+        ]
+        if max(_reach_px(camera, one) for one in found) < FURTHER * max(
+            _reach_px(camera, one) for one in places
+        ):
             break
         places, now = found, turned
     return (first, list(pointings)) if places is first else (places, turned)
@@ -396,7 +451,11 @@ def _outward(
 def _reach_px(camera: Camera, places: Places) -> float:
     """The radius about the principal point that holds 95 % of places."""
     cx, cy = camera.principal_point_px
-    return float(np.quantile(np.hypot(places.x_px - cx, places.y_px - cy), 0.95)) if len(places.x_px) else 0.0
+    return (
+        float(np.quantile(np.hypot(places.x_px - cx, places.y_px - cy), 0.95))
+        if len(places.x_px)
+        else 0.0
+    )
 
 
 def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> Places:
@@ -407,10 +466,18 @@ def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> 
     points = points[np.hypot(sources.x_px[points] - cx, sources.y_px[points] - cy) < reach_px]
     x, y = pointing.places_px(camera, shot.sky.vectors)
     with np.errstate(invalid="ignore"):
-        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1) & (np.hypot(x - cx, y - cy) < reach_px)
+        inside = (
+            (x > 0)
+            & (x < width - 1)
+            & (y > 0)
+            & (y < height - 1)
+            & (np.hypot(x - cx, y - cy) < reach_px)
+        )
     star = np.flatnonzero(inside)[: len(points)]
     tree = cKDTree(np.column_stack([sources.x_px[points], sources.y_px[points]]))
-    one, source = nearest_once(tree, np.column_stack([x[star], y[star]]), NEAR * math.hypot(width, height))
+    one, source = nearest_once(
+        tree, np.column_stack([x[star], y[star]]), NEAR * math.hypot(width, height)
+    )
     return _seen_at(shot, star[one], points[source])
 
 
@@ -430,7 +497,9 @@ def extinct_mag(air: SiteAir | None, sky: DatedSky, star: IntArray) -> FloatArra
     """What the air over `[site]` takes of stars (n,), mag; nothing without a site or a date."""
     if air is None or sky.air is None:
         return np.zeros(len(star))
-    return np.asarray(magnitude(air.shares(sky.order[star], sky.air.altitude_rad(sky.vectors[star]))[0]))
+    return np.asarray(
+        magnitude(air.shares(sky.order[star], sky.air.altitude_rad(sky.vectors[star]))[0])
+    )
 
 
 def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
@@ -444,7 +513,10 @@ def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
 def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     """The detector by the background of all photographs."""
     masks = [source_mask(s.sources, s.level.above(s.photo.dn), SOURCE_PX) for s in shots]
-    points = [transfer_points(s.photo.dn, s.level.level, mask) for s, mask in zip(shots, masks, strict=True)]
+    points = [
+        transfer_points(s.photo.dn, s.level.level, mask)
+        for s, mask in zip(shots, masks, strict=True)
+    ]
     height, width = shots[0].photo.dn.shape
     side = shots[0].level.block_px
     y, x = np.mgrid[side // 2 : height : side, side // 2 : width : side]
@@ -453,12 +525,18 @@ def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     # stars too faint to be seen are pixels' own where two photographs have one part of the sky
     apart: list[int] = []
     for k, shot in enumerate(shots):
-        moved = [np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight) * shot.focal_length_px for j in apart]
+        moved = [
+            np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight)
+            * shot.focal_length_px
+            for j in apart
+        ]
         if all(px > APART_PX for px in moved):
             apart.append(k)
     zero = assumed.offset_dn if pedestal is None else pedestal[0]
     pattern = fixed_pattern(
-        (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k]) for k, s in enumerate(shots) if k in apart
+        (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k])
+        for k, s in enumerate(shots)
+        if k in apart
     )
     exposure_s = shots[0].photo.exposure_s or 0.0
     dsnu_e = math.hypot(assumed.dsnu_e, assumed.dsnu_e_per_s * exposure_s)
@@ -474,7 +552,9 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
     width, height = shot.photo.size_px
     x, y = pointing.places_px(camera, shot.sky.vectors)
     with np.errstate(invalid="ignore"):
-        inside = np.flatnonzero((x > HALF) & (x < width - 1 - HALF) & (y > HALF) & (y < height - 1 - HALF))
+        inside = np.flatnonzero(
+            (x > HALF) & (x < width - 1 - HALF) & (y > HALF) & (y < height - 1 - HALF)
+        )
     tree = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
     one, source = nearest_once(tree, np.column_stack([x[inside], y[inside]]), MATCH_PX)
     star = inside[one]
@@ -492,8 +572,16 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
     shot.star = star
     above = shot.photo.dn - shot.level.level
     variance = shot.level.noise**2
-    shot.stamps = cut_stamps(above, variance, shot.sources.x_px[source], shot.sources.y_px[source], shot.sky.bv_mag[star])
-    top = cut_stamps(shot.photo.dn, variance, shot.sources.x_px[source], shot.sources.y_px[source], shot.sky.bv_mag[star])
+    shot.stamps = cut_stamps(
+        above, variance, shot.sources.x_px[source], shot.sources.y_px[source], shot.sky.bv_mag[star]
+    )
+    top = cut_stamps(
+        shot.photo.dn,
+        variance,
+        shot.sources.x_px[source],
+        shot.sources.y_px[source],
+        shot.sky.bv_mag[star],
+    )
     middle = top.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
     shot.saturated = middle.max(axis=(1, 2)) >= SATURATED_SHARE * shot.photo.full_dn
     shot.blended = blended
@@ -502,10 +590,18 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
 def _psf(shots: Sequence[Shot], gain: float) -> StarPsf:
     """The PSF by the brightest clean stars of all shots."""
     clean = [shot.clean for shot in shots]
-    stamps = join([shot.stamps.at(mask) for shot, mask in zip(shots, clean, strict=True) if shot.stamps is not None])
+    stamps = join(
+        [
+            shot.stamps.at(mask)
+            for shot, mask in zip(shots, clean, strict=True)
+            if shot.stamps is not None
+        ]
+    )
     if len(stamps) < 3:
         stamps = join([shot.stamps for shot in shots if shot.stamps is not None])
-    light = stamps.values[:, 2:-2, 2:-2].sum(axis=(1, 2)) / np.sqrt(np.median(stamps.variance, axis=(1, 2)))
+    light = stamps.values[:, 2:-2, 2:-2].sum(axis=(1, 2)) / np.sqrt(
+        np.median(stamps.variance, axis=(1, 2))
+    )
     best = np.zeros(len(stamps), dtype=bool)
     best[np.argsort(-light)[:PSF_STARS]] = True
     stamps = stamps.at(best)
@@ -517,7 +613,9 @@ def _middles(stamps: Stamps) -> tuple[FloatArray, FloatArray]:
     part = np.maximum(stamps.values[:, HALF - 2 : HALF + 3, HALF - 2 : HALF + 3], 0)
     total = np.maximum(part.sum(axis=(1, 2)), 1e-9)
     reach = np.arange(-2, 3)
-    return stamps.column + part.sum(axis=1) @ reach / total, stamps.row + part.sum(axis=2) @ reach / total
+    return stamps.column + part.sum(axis=1) @ reach / total, stamps.row + part.sum(
+        axis=2
+    ) @ reach / total
 
 
 def _measure(shot: Shot, psf: StarPsf, gain: float) -> None:
@@ -534,7 +632,9 @@ def _places(shot: Shot) -> Places:
     if use.sum() < 3:
         use = np.ones(len(shot.star), dtype=bool)
     found = shot.found
-    return Places(found.x_px[use], found.y_px[use], found.sigma_px[use], shot.sky.vectors[shot.star[use]])
+    return Places(
+        found.x_px[use], found.y_px[use], found.sigma_px[use], shot.sky.vectors[shot.star[use]]
+    )
 
 
 def radius2_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -576,7 +676,9 @@ class _Magnitudes:
     def __call__(self, correction: Correction) -> FloatArray:
         if correction not in self._kept:
             optics = bench_optics(self._file.config.tracker, self._file.folder)
-            optics = replace(optics, quantum_efficiency=corrected(optics.quantum_efficiency, correction))
+            optics = replace(
+                optics, quantum_efficiency=corrected(optics.quantum_efficiency, correction)
+            )
             rates = channel_rates(self._file.config.sky, optics)
             self._kept[correction] = magnitude(rates(*self._columns))
         return self._kept[correction]
@@ -591,7 +693,10 @@ def corrected(curve: Curve, correction: Correction) -> Curve:
     if correction == NO_CORRECTION:
         return curve
     ends = curve.wavelength_nm[[0, -1]]
-    nm = np.union1d(curve.wavelength_nm, np.linspace(ends[0], ends[-1], max(2, round(float(np.ptp(ends)) / KNOT_NM))))
+    nm = np.union1d(
+        curve.wavelength_nm,
+        np.linspace(ends[0], ends[-1], max(2, round(float(np.ptp(ends)) / KNOT_NM))),
+    )
     nm = np.unique(np.round(nm, 2))  # as it is written
     x = np.log(nm / PIVOT_NM)
     value = curve(nm) * np.exp(correction[0] * x + correction[1] * x * x)

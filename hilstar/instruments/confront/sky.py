@@ -48,7 +48,9 @@ class DatedSky:
 
     def masses(self, direction: FloatArray) -> float | None:
         """Air masses before a direction outside the air (3,); None without a site or a date."""
-        return None if self.air is None else float(air_mass(self.air.altitude_rad(direction[None]))[0])
+        return (
+            None if self.air is None else float(air_mass(self.air.altitude_rad(direction[None]))[0])
+        )
 
     @property
     def v_mag(self) -> FloatArray:
@@ -67,7 +69,9 @@ class DatedSky:
 
     def columns(self, row: IntArray) -> FloatArray:
         """V, B-V and V-I (3, k) of rows of the catalogue."""
-        return np.stack([self.catalog.v_mag[row], self.catalog.bv_mag[row], self.catalog.vi_mag[row]])
+        return np.stack(
+            [self.catalog.v_mag[row], self.catalog.bv_mag[row], self.catalog.vi_mag[row]]
+        )
 
     def within(self, star: IntArray) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Of some stars (k,): the error of V, mag, and whether they are known doubles or
@@ -95,10 +99,20 @@ def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
     if file.config.site is not None and t_ns is not None:
         ground = Ground(file.config.site)
         velocity = earth_velocity_km_s(t_ns) + ground.state(t_ns)[1]
-        air = AirAbove(ground.up(t_ns), site_refraction(file.config.site, bench_optics(file.config.tracker, file.folder)))
+        air = AirAbove(
+            ground.up(t_ns),
+            site_refraction(file.config.site, bench_optics(file.config.tracker, file.folder)),
+        )
     order = np.argsort(catalog.v_mag, kind="stable")
     vectors = unit_vectors_icrs(catalog, epoch)[order]
-    return DatedSky(catalog, epoch, velocity, vectors if velocity is None else aberrate(vectors, velocity), order, air)
+    return DatedSky(
+        catalog,
+        epoch,
+        velocity,
+        vectors if velocity is None else aberrate(vectors, velocity),
+        order,
+        air,
+    )
 
 
 @lru_cache(maxsize=64)
@@ -133,5 +147,6 @@ def planets_seen(t_ns: int) -> dict[str, FloatArray]:
                 found[name] = erfa.plan94(UNIX_JD, t_ns / DAY_NS, number)["p"] - earth
         found["the Moon"] = erfa.moon98(UNIX_JD, t_ns / DAY_NS)["p"]
     return {
-        name: np.asarray(aberrate((v / np.linalg.norm(v))[None], earth_velocity_km_s(t_ns))[0]) for name, v in found.items()
+        name: np.asarray(aberrate((v / np.linalg.norm(v))[None], earth_velocity_km_s(t_ns))[0])
+        for name, v in found.items()
     }

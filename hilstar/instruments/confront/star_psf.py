@@ -19,7 +19,10 @@ from hilstar.instruments.confront.camera_fit import minimised
 STAMP_PX = 11
 HALF = STAMP_PX // 2
 # nodes within a pixel
-GAUSS3 = np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]), np.array([5 / 18, 8 / 18, 5 / 18])
+GAUSS3 = (
+    np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]),
+    np.array([5 / 18, 8 / 18, 5 / 18]),
+)
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
 PLACE_STEPS, SHAPE_ROUNDS = 8, 2
@@ -50,7 +53,9 @@ class StarPsf:
         """Covariances (n, 3) at places."""
         terms = field_terms(x_px, y_px, self.size_px)[:, : self.covariance.shape[1]]
         found = terms @ self.covariance.T
-        found *= np.clip(1 + self.colour * (np.nan_to_num(bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG), 0.3, 3.0)[:, None]
+        found *= np.clip(
+            1 + self.colour * (np.nan_to_num(bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG), 0.3, 3.0
+        )[:, None]
         found[:, :2] = np.clip(found[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
         limit = 0.9 * np.sqrt(found[:, 0] * found[:, 1])
         found[:, 2] = np.clip(found[:, 2], -limit, limit)
@@ -61,23 +66,35 @@ class StarPsf:
         made round.
         """
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
-        narrow, wide = (core[:, 0] + core[:, 1]) / 2 + 1 / 12, np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
+        narrow, wide = (
+            (core[:, 0] + core[:, 1]) / 2 + 1 / 12,
+            np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12),
+        )
         radius = np.linspace(0, 12, 1201)
         parts = ((1 - self.wing_share, narrow), (self.wing_share, wide))
-        light = np.sum([share / v[:, None] * np.exp(-(radius**2) / (2 * v[:, None])) for share, v in parts], axis=0)
+        light = np.sum(
+            [share / v[:, None] * np.exp(-(radius**2) / (2 * v[:, None])) for share, v in parts],
+            axis=0,
+        )
         return np.asarray(2 * radius[(light > light[:, :1] / 2).sum(axis=1) - 1])
 
-    def on_pixels(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def on_pixels(
+        self, dx: FloatArray, dy: FloatArray, core: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Shares of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars, (n,
         rows, columns).
 
         With them their derivatives by the star's x and y.
         """
         share = self.wing_share
-        both = (1 - share) * _gaussian(dx, dy, core) + share * _gaussian(dx, dy, self._wing(len(core)))
+        both = (1 - share) * _gaussian(dx, dy, core) + share * _gaussian(
+            dx, dy, self._wing(len(core))
+        )
         return both[0], both[1], both[2]
 
-    def by_shape(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def by_shape(
+        self, dx: FloatArray, dy: FloatArray, core: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the
         wings' share and sigma.
         """
@@ -111,7 +128,9 @@ def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) ->
     return np.column_stack([np.ones_like(u), u * u + v * v, u, v, u * u - v * v, u * v])
 
 
-def _gaussian(dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: bool = False) -> FloatArray:
+def _gaussian(
+    dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: bool = False
+) -> FloatArray:
     """Integrals (3, n, rows, columns) of Gaussians over pixels and their derivatives by the
     centre's x and y.
 
@@ -160,13 +179,22 @@ class Stamps:
 
     def at(self, chosen: BoolArray) -> "Stamps":
         """Some of them."""
-        return Stamps(self.values[chosen], self.variance[chosen], self.column[chosen], self.row[chosen], self.bv_mag[chosen])
+        return Stamps(
+            self.values[chosen],
+            self.variance[chosen],
+            self.column[chosen],
+            self.row[chosen],
+            self.bv_mag[chosen],
+        )
 
 
 def join(parts: Sequence[Stamps]) -> Stamps:
     """All stamps of several photographs."""
     return Stamps(
-        *(np.concatenate([getattr(one, name) for one in parts]) for name in ("values", "variance", "column", "row", "bv_mag"))
+        *(
+            np.concatenate([getattr(one, name) for one in parts])
+            for name in ("values", "variance", "column", "row", "bv_mag")
+        )
     )
 
 
@@ -184,7 +212,9 @@ class Measured:
     chi2: FloatArray
 
 
-def cut_stamps(above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray) -> Stamps:
+def cut_stamps(
+    above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray
+) -> Stamps:
     """Stamps of an image above its background about places (n,), and the variance of its pixels
     without the stars'.
     """
@@ -192,12 +222,25 @@ def cut_stamps(above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: 
     reach = np.arange(-HALF, HALF + 1)
     column, row = np.rint(x_px), np.rint(y_px)
     columns, rows = column[:, None] + reach, row[:, None] + reach
-    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    at = np.clip(rows, 0, height - 1).astype(np.intp)[:, :, None], np.clip(columns, 0, width - 1).astype(np.intp)[:, None, :]
-    return Stamps(np.where(inside, above[at], 0.0), np.where(inside, variance[at], np.inf), column, row, bv_mag)
+    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[
+        :, None, :
+    ]
+    at = (
+        np.clip(rows, 0, height - 1).astype(np.intp)[:, :, None],
+        np.clip(columns, 0, width - 1).astype(np.intp)[:, None, :],
+    )
+    return Stamps(
+        np.where(inside, above[at], 0.0),
+        np.where(inside, variance[at], np.inf),
+        column,
+        row,
+        bv_mag,
+    )
 
 
-def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, gain_e_per_dn: float) -> Measured:
+def measure(
+    stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, gain_e_per_dn: float
+) -> Measured:
     """Stars by least squares of place, flux and a level, from starting places; photon noise by
     `gain_e_per_dn`.
     """
@@ -207,16 +250,28 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
     weight = 1 / stamps.variance
     flux, level = np.zeros(len(x)), np.zeros(len(x))
     for number in range(PLACE_STEPS):
-        dx, dy = stamps.column[:, None] + reach - x[:, None], stamps.row[:, None] + reach - y[:, None]
+        dx, dy = (
+            stamps.column[:, None] + reach - x[:, None],
+            stamps.row[:, None] + reach - y[:, None],
+        )
         shape, by_x, by_y = psf.on_pixels(dx, dy, core)
         # photon noise of the model, not of what was seen: else faint stars come out too faint
         if number:
             star = np.maximum(flux, 0)[:, None, None] * shape
             weight = 1 / (stamps.variance + star / gain_e_per_dn + (MODEL_ERROR * star) ** 2)
-        flux = np.maximum(flux, 1e-3) if number else _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
-        columns = np.stack([flux[:, None, None] * by_x, flux[:, None, None] * by_y, shape, np.ones_like(shape)], axis=1)
+        flux = (
+            np.maximum(flux, 1e-3)
+            if number
+            else _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
+        )
+        columns = np.stack(
+            [flux[:, None, None] * by_x, flux[:, None, None] * by_y, shape, np.ones_like(shape)],
+            axis=1,
+        )
         flat = columns.reshape(len(x), 4, -1)
-        off = (stamps.values - flux[:, None, None] * shape - level[:, None, None]).reshape(len(x), -1)
+        off = (stamps.values - flux[:, None, None] * shape - level[:, None, None]).reshape(
+            len(x), -1
+        )
         w = weight.reshape(len(x), -1)
         normal = np.einsum("nik,nk,njk->nij", flat, w, flat) + 1e-12 * np.eye(4)
         move = np.linalg.solve(normal, np.einsum("nik,nk,nk->ni", flat, w, off)[..., None])[..., 0]
@@ -232,7 +287,9 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
     return Measured(x, y, flux, place, np.sqrt(covariance[:, 2, 2]), chi2)
 
 
-def _linear(shape: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _linear(
+    shape: FloatArray, values: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Flux and level (n,) by least squares."""
     s, v, w = (part.reshape(len(shape), -1) for part in (shape, values, weight))
     sw, s1, ss = w.sum(axis=1), (w * s).sum(axis=1), (w * s * s).sum(axis=1)
@@ -241,21 +298,36 @@ def _linear(shape: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[
     return (vs * sw - v1 * s1) / det, (ss * v1 - s1 * vs) / det
 
 
-def fit_psf(stamps: Stamps, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], gain_e_per_dn: float) -> StarPsf:
+def fit_psf(
+    stamps: Stamps,
+    x_px: FloatArray,
+    y_px: FloatArray,
+    size_px: tuple[int, int],
+    gain_e_per_dn: float,
+) -> StarPsf:
     """The PSF of stars that stand alone and are not saturated, from starting places."""
     terms = next(count for least, count in STARS_FOR if len(stamps) >= least)
     start = np.zeros((3, terms))
     start[:2, 0] = 0.8
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
     psf = replace(
-        psf, covariance=np.array([[s, *np.zeros(terms - 1)] for s in (_first_width(stamps), _first_width(stamps), 0.0)])
+        psf,
+        covariance=np.array(
+            [[s, *np.zeros(terms - 1)] for s in (_first_width(stamps), _first_width(stamps), 0.0)]
+        ),
     )
     x, y = x_px, y_px
     found = measure(stamps, psf, x, y, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
         psf = _shape(stamps, found, psf, gain_e_per_dn, wide=number > 0)
         near = np.hypot(found.x_px - x_px, found.y_px - y_px) < 2
-        found = measure(stamps, psf, np.where(near, found.x_px, x_px), np.where(near, found.y_px, y_px), gain_e_per_dn)
+        found = measure(
+            stamps,
+            psf,
+            np.where(near, found.x_px, x_px),
+            np.where(near, found.y_px, y_px),
+            gain_e_per_dn,
+        )
     return psf
 
 
@@ -268,14 +340,19 @@ def _first_width(stamps: Stamps) -> float:
     return float(np.clip(1 / (2 * math.pi * np.clip(peak, 0.02, 0.6)), 0.15, 9.0))
 
 
-def _shape(stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, wide: bool) -> StarPsf:
+def _shape(
+    stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, wide: bool
+) -> StarPsf:
     """The PSF's numbers with the stars where they are; flux and level of each follow."""
     reach = np.arange(-HALF, HALF + 1)
     dx = stamps.column[:, None] + reach - at.x_px[:, None]
     dy = stamps.row[:, None] + reach - at.y_px[:, None]
     count = psf.covariance.shape[1]
     terms = field_terms(at.x_px, at.y_px, psf.size_px)[:, :count]
-    light = np.maximum(at.dn, 0)[:, None, None] * psf.on_pixels(dx, dy, psf.core(at.x_px, at.y_px, stamps.bv_mag))[0]
+    light = (
+        np.maximum(at.dn, 0)[:, None, None]
+        * psf.on_pixels(dx, dy, psf.core(at.x_px, at.y_px, stamps.bv_mag))[0]
+    )
     weight = 1 / (stamps.variance + light / gain_e_per_dn + (MODEL_ERROR * light) ** 2)
     root = np.sqrt(weight)
     redder = np.nan_to_num(stamps.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
@@ -290,8 +367,17 @@ def _shape(stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, 
         covariance = numbers[: 3 * count].reshape(3, count)
         if not wide:
             return replace(psf, covariance=covariance)
-        share, sigma = 0.5 * float(expit(numbers[-2])), math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX)))
-        return replace(psf, covariance=covariance, colour=float(numbers[-3]), wing_share=share, wing_sigma_px=sigma)
+        share, sigma = (
+            0.5 * float(expit(numbers[-2])),
+            math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX))),
+        )
+        return replace(
+            psf,
+            covariance=covariance,
+            colour=float(numbers[-3]),
+            wing_share=share,
+            wing_sigma_px=sigma,
+        )
 
     def residuals(numbers: FloatArray) -> FloatArray:
         trial = of(numbers)
@@ -305,11 +391,16 @@ def _shape(stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, 
         trial = of(numbers)
         shape, by = trial.by_shape(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))
         redness = 1 + trial.colour * redder
-        columns = [by[k] * (redness * terms[:, t])[:, None, None] for k in range(3) for t in range(count)]
+        columns = [
+            by[k] * (redness * terms[:, t])[:, None, None] for k in range(3) for t in range(count)
+        ]
         if wide:
             plain = terms @ trial.covariance.T
             columns.append(sum(by[k] * (plain[:, k] * redder)[:, None, None] for k in range(3)))
-            columns += [by[3] * trial.wing_share * (1 - 2 * trial.wing_share), by[4] * trial.wing_sigma_px]
+            columns += [
+                by[3] * trial.wing_share * (1 - 2 * trial.wing_share),
+                by[4] * trial.wing_sigma_px,
+            ]
         flux = _linear(shape, stamps.values, weight)[0][:, None, None]
         left = []
         for column in columns:

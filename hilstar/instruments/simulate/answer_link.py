@@ -21,13 +21,21 @@ STAR_DECIMALS = 4
 
 def json_answer(answer: Answer) -> bytes:
     """An answer as a JSON object in one line, without its end."""
-    said: dict[str, Any] = {"t_ns": answer.t_ns, "valid": answer.valid, "mode": answer.mode, "stars": answer.star_count}
+    said: dict[str, Any] = {
+        "t_ns": answer.t_ns,
+        "valid": answer.valid,
+        "mode": answer.mode,
+        "stars": answer.star_count,
+    }
     for name, vector in (("q", answer.q_icrs_to_cam), ("rate", answer.rate_cam_rad_s)):
         if vector is not None:
             said[name] = vector.tolist()
     if answer.rms_arcsec is not None:
         said["rms_arcsec"] = answer.rms_arcsec
-    said["centroids"] = [[part if part is None else round(part, STAR_DECIMALS) for part in star] for star in answer.centroids]
+    said["centroids"] = [
+        [part if part is None else round(part, STAR_DECIMALS) for part in star]
+        for star in answer.centroids
+    ]
     for star in said["centroids"]:
         if star[-1] is None:
             star.pop()
@@ -45,7 +53,9 @@ MODE_FLAGS = {
 def answer_packet(answer: Answer, sequence: int) -> AnswerPacket:
     """An answer as a packet of the wire."""
     q, rate = answer.q_icrs_to_cam, answer.rate_cam_rad_s
-    known = protocol.ANSWER_VALID * (q is not None) + protocol.ANSWER_RATE_VALID * (rate is not None)
+    known = protocol.ANSWER_VALID * (q is not None) + protocol.ANSWER_RATE_VALID * (
+        rate is not None
+    )
     q = np.array([1.0, 0.0, 0.0, 0.0]) if q is None else q
     rate = np.zeros(3) if rate is None else rate
     return AnswerPacket(
@@ -65,7 +75,9 @@ class AnswerLink(Closing):
     Raises InputError where the target cannot be opened.
     """
 
-    def __init__(self, target: str, form: str, connect: bool, babble: np.random.Generator | None) -> None:
+    def __init__(
+        self, target: str, form: str, connect: bool, babble: np.random.Generator | None
+    ) -> None:
         self._end, self._form, self._babble = open_sender(target, connect=connect), form, babble
         self.endpoint = self._end.endpoint
         self.sent = self.babbled = 0
@@ -76,7 +88,9 @@ class AnswerLink(Closing):
             self._put_raw(self._babble.bytes(int(self._babble.integers(1, MAX_BABBLE_BYTES))))
             self.babbled += 1
         if self._form == "json":
-            self._put_raw(json_answer(answer) + (b"\n" if isinstance(self._end, SerialSender) else b""))
+            self._put_raw(
+                json_answer(answer) + (b"\n" if isinstance(self._end, SerialSender) else b"")
+            )
         else:
             self._end.put(encode(answer_packet(answer, self.sent)))
         self.sent += 1

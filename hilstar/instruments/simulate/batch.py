@@ -32,7 +32,10 @@ from hilstar.server.bench.scenario import Scenario, Timetable
 
 
 def log_views(
-    samples: list[AttitudeSample], frame_count: int | None, exposure_s: float, max_rate_rad_s: float = math.inf
+    samples: list[AttitudeSample],
+    frame_count: int | None,
+    exposure_s: float,
+    max_rate_rad_s: float = math.inf,
 ) -> list[View]:
     """The exposures along a log: in the middle of each its attitude, and the mean rate over the
     exposure.
@@ -59,7 +62,9 @@ def view_at(timeline: Timeline, span_ns: tuple[int, int], t_ns: int, exposure_s:
         raise AssertionError("a log has a sample")
     rate = np.zeros(3)
     if ends_ns[1] > ends_ns[0]:
-        rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S)
+        rate = rate_between_rad_s(
+            begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S
+        )
     return View.exposure(middle.q_icrs_to_cam, rate, exposure_s, t_ns)
 
 
@@ -76,7 +81,9 @@ class LogFaults:
         cannot be drawn.
         """
         timetable = Timetable(
-            self.scenario, simulator_view(simulator, self.scenario).prepare, simulator.config.tracker.exposure_s
+            self.scenario,
+            simulator_view(simulator, self.scenario).prepare,
+            simulator.config.tracker.exposure_s,
         )
         timeline = log_timeline(self.samples, Policy(0, NS_PER_S, self.max_rate_rad_s))
         zero_ns = self.samples[0].t_ns
@@ -87,10 +94,14 @@ class LogFaults:
                 raise AssertionError("a log has a sample")
             return found.q_icrs_to_cam
 
-        return [pieces_of(view, (view.t_ns or 0) - zero_ns, timetable, attitude_at) for view in views]
+        return [
+            pieces_of(view, (view.t_ns or 0) - zero_ns, timetable, attitude_at) for view in views
+        ]
 
 
-def faulty_exposure(simulator: Simulator, view: View, scenario: Scenario, run_ns: int) -> FaultyExposure:
+def faulty_exposure(
+    simulator: Simulator, view: View, scenario: Scenario, run_ns: int
+) -> FaultyExposure:
     """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError
     (see `FaultView.prepare`).
     """
@@ -111,7 +122,9 @@ def simulate_views(
     (seed, number).
     """
     with Simulator(file) as first:  # an error in the bench file is reported once, here
-        pieces: list[tuple[ExposurePiece, ...]] = [()] * len(views) if faults is None else faults.pieces(first, views)
+        pieces: list[tuple[ExposurePiece, ...]] = (
+            [()] * len(views) if faults is None else faults.pieces(first, views)
+        )
     make_directory(directory)
     scenario = None if faults is None else faults.scenario
     tasks = iter(enumerate(zip(views, pieces, strict=True)))
@@ -124,7 +137,9 @@ def simulate_views(
                 if news == "error":
                     raise said
                 if news == "died":
-                    raise MachineError(f"a process of the pool ended with code {said}; is there enough memory?")
+                    raise MachineError(
+                        f"a process of the pool ended with code {said}; is there enough memory?"
+                    )
                 if news == "answer":
                     done += 1
                     on_done(done)

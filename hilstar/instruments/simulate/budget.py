@@ -114,19 +114,30 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
     # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the
     # frames.
-    dark = bench.faintest_shown_e_per_s / solar_drive(bench) or bench.calibration.response.half_step * white
+    dark = (
+        bench.faintest_shown_e_per_s / solar_drive(bench)
+        or bench.calibration.response.half_step * white
+    )
     nothing = zero_mag + magnitude(dark)
     half = np.array([-0.5, 0.5])
     # a star on the corner of four pixels
     corner_share = float(bench.psf.shares(half, half[:, None]).max())
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
-    primaries = None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
+    primaries = (
+        None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
+    )
     ends_nm = [RED_NM] if spectra is None else [RED_NM, reddest_nm(spectra)]
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation
-        + (" with bit stealing" if render.bit_stealing else ", each primary" if bench.colours else ""),
+        + (
+            " with bit stealing"
+            if render.bit_stealing
+            else ", each primary"
+            if bench.colours
+            else ""
+        ),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
         clips_v_mag_at_best=zero_mag + magnitude(white / corner_share),
@@ -138,7 +149,10 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         black_e_per_s_px=bench.calibration.response.black * bench.flux_at_white_e_per_s,
         rows=rows,
         centroider=by,
-        centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
+        centroid_rms_px=next(
+            (row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG),
+            dict.fromkeys(FAMILY),
+        ),
         primaries=primaries,
         near_infrared=red_shares(channels, ends_nm),
         out_of_gamut=out_of_gamut(bench),
@@ -162,9 +176,14 @@ def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[s
     """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in
     each `channel` of several.
     """
-    every = {"all": all_channels(list(channels.values())), **(channels if len(channels) > 1 else {})}
+    every = {
+        "all": all_channels(list(channels.values())),
+        **(channels if len(channels) > 1 else {}),
+    }
     return [
-        {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)} for nm in ends_nm for name, one in every.items()
+        {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)}
+        for nm in ends_nm
+        for name, one in every.items()
     ]
 
 
@@ -196,7 +215,9 @@ def not_drawn(bench: Bench) -> NotDrawn:
     over, do not count.
     """
     rates = bench.stars.rates_e_per_s
-    missing = rates[(bench.stars.electrons_per_s * bench.drive)[: len(rates)] < bench.faintest_shown_e_per_s]
+    missing = rates[
+        (bench.stars.electrons_per_s * bench.drive)[: len(rates)] < bench.faintest_shown_e_per_s
+    ]
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 
 
@@ -208,7 +229,9 @@ def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     psf = bench.psf
     sprites, _ = phase_grid(PHASES, psf)
     bright = phase_image(sprites, psf)
-    judge = Judge(bright, line_places(sprites), psf.width_px, target.seen.blur_px, target.seen.pixel_px)
+    judge = Judge(
+        bright, line_places(sprites), psf.width_px, target.seen.blur_px, target.seen.pixel_px
+    )
     panel, balance = Panel(bench.calibration.response, WHITE), Balance(psf, target.seen)
     found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
@@ -261,10 +284,16 @@ def write_report(directory: Path, found: LightBudget) -> None:
     rows = [asdict(row) for row in found.rows]
     for row in rows:  # each kind of centroider has a column of its own
         row.update({f"axis_rms_px_{kind}": value for kind, value in row.pop("axis_rms_px").items()})
-    write_csv(directory / "budget.csv", list(rows[0]), [["" if v is None else v for v in row.values()] for row in rows])
+    write_csv(
+        directory / "budget.csv",
+        list(rows[0]),
+        [["" if v is None else v for v in row.values()] for row in rows],
+    )
     reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
     finding = f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip, within "
-    finding += f"{FLUX_LIMITS_MAG[1]:g} mag over {'no' if reach is None else f'{reach:g}'} magnitudes"
+    finding += (
+        f"{FLUX_LIMITS_MAG[1]:g} mag over {'no' if reach is None else f'{reach:g}'} magnitudes"
+    )
     shown = [row for row in found.rows if row.flux_max_mag is not None]
     v_mag = np.array([row.v_mag for row in shown])
     note = f"Left of the first grey line stars clip (V = {found.clips_v_mag:.2f}), right of the second they show nothing (V ="
@@ -280,11 +309,19 @@ def write_report(directory: Path, found: LightBudget) -> None:
                 values = np.maximum.accumulate(values.astype(float)) if name == "max" else values
                 axis.semilogy(v_mag, np.maximum(values, MIN_ERROR), color=colour, label=word)
             for limit in limits:
-                axis.axhline(limit, color=RED, linestyle=":", linewidth=1.4, label=f"limit {limit:g} {unit}")
+                axis.axhline(
+                    limit, color=RED, linestyle=":", linewidth=1.4, label=f"limit {limit:g} {unit}"
+                )
             axis.set_ylabel(label)
         for kind, colour in zip(FAMILY, SERIES, strict=True):
             values = np.array([row.axis_rms_px[kind] for row in shown])
-            axes[2].semilogy(v_mag, np.maximum(values, MIN_ERROR), "--" if kind == "fit" else "-", color=colour, label=kind)
+            axes[2].semilogy(
+                v_mag,
+                np.maximum(values, MIN_ERROR),
+                "--" if kind == "fit" else "-",
+                color=colour,
+                label=kind,
+            )
         axes[2].set_ylabel("rms along an axis [monitor px]")
         axes[2].set_xlabel("V of a star of the Sun's colour [mag]")
         for axis in axes:
@@ -295,8 +332,13 @@ def write_report(directory: Path, found: LightBudget) -> None:
 
 def budget_lines(found: LightBudget) -> list[str]:
     """The budget for a person."""
-    within = ", ".join(f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}" for limit, value in found.within.items())
-    each = ", ".join(f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items())
+    within = ", ".join(
+        f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}"
+        for limit, value in found.within.items()
+    )
+    each = ", ".join(
+        f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items()
+    )
     lines = [
         f"{'method':22}{found.method}, {found.bits} bits",
         f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel, {found.clips_v_mag_at_best:.2f} on a corner",
@@ -312,24 +354,41 @@ def budget_lines(found: LightBudget) -> list[str]:
     if found.primaries is not None:
         one = found.primaries
         figure = _number(one.condition, ".2f")
-        lines.append(f"{'condition number':22}{figure}, electrons of each channel by each primary at full light:")
+        lines.append(
+            f"{'condition number':22}{figure}, electrons of each channel by each primary at full light:"
+        )
         if found.out_of_gamut is not None:
             what = "electrons by channel" if len(one.channels) > 1 else "mean wavelength"
-            lines.insert(-1, f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries cannot show")
+            lines.insert(
+                -1,
+                f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries cannot show",
+            )
         for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
-            shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
+            shares = (
+                f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True)
+            )
             lines.append(f"{channel:22}{', '.join(shares)}")
     for red in found.near_infrared:
         by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red["by_class"].items())
         name = f"from {red['from_nm']:.0f} nm, % of e-"
-        lines.append(f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}"))
+        lines.append(
+            f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}")
+        )
     every = found.centroider == "all"
-    kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
-    lines += ["", f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}" + ("" if every else f"{'max arcsec':>12}")]
+    kinds = (
+        f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
+    )
+    lines += [
+        "",
+        f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}"
+        + ("" if every else f"{'max arcsec':>12}"),
+    ]
     for row in found.rows:
         line = f"{row.v_mag:6.2f}{_number(row.flux_rms_mag, '.4f'):>12}{_number(row.flux_max_mag, '.4f'):>10}"
         if every:
-            line += " " * 4 + "".join(f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY)
+            line += " " * 4 + "".join(
+                f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY
+            )
         else:
             line += f"{_number(row.centroid_rms_px, '.4f'):>14}"
         line += f"{_number(row.centroid_max_px, '.4f'):>9}"

@@ -27,16 +27,34 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
     def of(x: FloatArray, y: FloatArray) -> FloatArray:
         if not isinstance(psf, GlassPsf):
             offsets = near - x[:, None], near - y[:, None]
-            return np.stack([psf.shares(across[None, :], down[:, None]) for across, down in zip(*offsets, strict=True)])
+            return np.stack(
+                [
+                    psf.shares(across[None, :], down[:, None])
+                    for across, down in zip(*offsets, strict=True)
+                ]
+            )
         places, own = (columns + x, rows + y), psf.footprint_px
-        light = psf.of_stars(*places, psf.mean_shares if shares is None else shares, np.ones(len(x)))
+        light = psf.of_stars(
+            *places, psf.mean_shares if shares is None else shares, np.ones(len(x))
+        )
         light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
         # The glass's square is about the pixel nearest to the star, this one about its own.
         to = [
-            np.clip(middle[:, None] + near - np.floor(place + 0.5).astype(np.intp)[:, None] + own // 2 + 1, 0, own + 1)
+            np.clip(
+                middle[:, None]
+                + near
+                - np.floor(place + 0.5).astype(np.intp)[:, None]
+                + own // 2
+                + 1,
+                0,
+                own + 1,
+            )
             for place, middle in zip(places, (columns, rows), strict=True)
         ]
-        return np.asarray(light[np.arange(len(x))[:, None, None], to[1][:, :, None], to[0][:, None, :]], dtype=np.float64)
+        return np.asarray(
+            light[np.arange(len(x))[:, None, None], to[1][:, :, None], to[0][:, None, :]],
+            dtype=np.float64,
+        )
 
     return of
 
@@ -60,11 +78,18 @@ class ErrorSplit:
 
     def rms_px(self) -> dict[str, float]:
         """The rms distance of each part, px."""
-        parts = {"total": self.total, "distortion": self.distortion, "colour": self.colour, "psf": self.psf}
+        parts = {
+            "total": self.total,
+            "distortion": self.distortion,
+            "colour": self.colour,
+            "psf": self.psf,
+        }
         return {name: float(np.sqrt((part**2).sum(axis=1).mean())) for name, part in parts.items()}
 
 
-def split_errors(places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArray, size_px: tuple[int, int]) -> ErrorSplit:
+def split_errors(
+    places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArray, size_px: tuple[int, int]
+) -> ErrorSplit:
     """Errors (n, 2) of stars at places (n, 2): by least squares a cubic of the place, and B-V times
     a line of the place.
 
@@ -73,7 +98,10 @@ def split_errors(places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArra
     """
     if len(places_px) < MIN_STARS:
         raise ValueError(f"{len(places_px)} stars; a split takes {MIN_STARS}")
-    u, v = ((place - (size - 1) / 2) / (size / 2) for place, size in zip(places_px.T, size_px, strict=True))
+    u, v = (
+        (place - (size - 1) / 2) / (size / 2)
+        for place, size in zip(places_px.T, size_px, strict=True)
+    )
     by_place = np.stack([u**j * v**k for j in range(4) for k in range(4 - j)], axis=1)
     by_colour = (bv_mag - bv_mag.mean())[:, None] * np.stack([np.ones_like(u), u, v], axis=1)
     found = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]

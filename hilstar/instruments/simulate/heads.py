@@ -64,12 +64,17 @@ class _Head:
         self.finder = replace(finder, settings=replace(finder.settings, window_sigma_px=width_px))
         self.mounting = Mounting(twin.config.tracker.q_body_to_cam)
 
-    def solved(self, q_icrs_to_body: FloatArray, first_frame: int) -> tuple[FloatArray, FloatArray] | None:
+    def solved(
+        self, q_icrs_to_body: FloatArray, first_frame: int
+    ) -> tuple[FloatArray, FloatArray] | None:
         """The body's attitude as this head's stars have it, from linear light and from codes;
         None with too few stars.
         """
         seen = self.twin.field(multiply(self.mounting.q_body_to_cam, q_icrs_to_body), first_frame)
-        sky, shown = (self.finder.match(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e))
+        sky, shown = (
+            self.finder.match(image_e, seen.x_px, seen.y_px)
+            for image_e in (seen.sky_e, seen.shown_e)
+        )
         stars = np.flatnonzero(self._usable(seen, sky, shown))
         if len(stars) < MIN_STARS:
             return None
@@ -87,13 +92,18 @@ class _Head:
         radius_px = self.finder.settings.radius_px
         margin = radius_px + EDGE_PX
         inside = (
-            (seen.x_px > margin) & (seen.x_px < width - 1 - margin) & (seen.y_px > margin) & (seen.y_px < height - 1 - margin)
+            (seen.x_px > margin)
+            & (seen.x_px < width - 1 - margin)
+            & (seen.y_px > margin)
+            & (seen.y_px < height - 1 - margin)
         )
         bench = self.twin.bench
         reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
         screen_w, screen_h = bench.camera.resolution_px
         x, y = truth["x_px"], truth["y_px"]
-        inside &= (x > reach) & (x < screen_w - 1 - reach) & (y > reach) & (y < screen_h - 1 - reach)
+        inside &= (
+            (x > reach) & (x < screen_w - 1 - reach) & (y > reach) & (y < screen_h - 1 - reach)
+        )
         near = crowded(seen.x_px, seen.y_px, truth["electrons_per_s"], radius_px, self.finder.psf)
         found = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
         return np.asarray(inside & found & truth["drawn"] & ~truth["clipped"] & ~near)
@@ -106,11 +116,15 @@ class _Head:
         place = matched.index[stars]
         return self._directions(matched.found.x_px[place], matched.found.y_px[place])
 
-    def _body(self, q_icrs_to_body: FloatArray, found: FloatArray, wanted: FloatArray, weights: FloatArray) -> FloatArray:
+    def _body(
+        self, q_icrs_to_body: FloatArray, found: FloatArray, wanted: FloatArray, weights: FloatArray
+    ) -> FloatArray:
         q_body_to_cam = self.mounting.q_body_to_cam
         # turns the camera's true axes into those solved
         off = from_matrix(rotation_between(wanted, found, weights))
-        return multiply(conjugate(q_body_to_cam), multiply(off, multiply(q_body_to_cam, q_icrs_to_body)))
+        return multiply(
+            conjugate(q_body_to_cam), multiply(off, multiply(q_body_to_cam, q_icrs_to_body))
+        )
 
 
 def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray) -> FloatArray:
@@ -122,7 +136,10 @@ def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray)
 
 
 def verify_heads(
-    heads: HeadsFile, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
+    heads: HeadsFile,
+    fields: int,
+    rng: np.random.Generator,
+    on_field: Callable[[int], None] = lambda done: None,
 ) -> list[HeadsErrors]:
     """Show `fields` random attitudes of the body on all heads, and solve the angles between each
     two of them.
@@ -146,4 +163,6 @@ def verify_heads(
 
 def _apart_arcsec(one: FloatArray, other: FloatArray) -> float:
     """The angle between two solutions of one body's attitude."""
-    return float(np.linalg.norm(to_rotation_vector(multiply(one, conjugate(other))))) * ARCSEC_PER_RAD
+    return (
+        float(np.linalg.norm(to_rotation_vector(multiply(one, conjugate(other))))) * ARCSEC_PER_RAD
+    )

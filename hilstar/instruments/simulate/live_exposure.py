@@ -87,7 +87,9 @@ class WatchedFrames:
     def add(self, frame: ShownFrame) -> None:
         """Take a frame. One that is older than the last begins a new run."""
         last = self._frames[-1].head if self._frames else None
-        if last is not None and (frame.head.lit_ns <= last.lit_ns or frame.head.frame <= last.frame):
+        if last is not None and (
+            frame.head.lit_ns <= last.lit_ns or frame.head.frame <= last.frame
+        ):
             self._frames.clear()
         elif last is not None:
             self.missing += frame.head.frame - last.frame - 1
@@ -120,9 +122,13 @@ class WatchedFrames:
                 turns.append((q, share))
         lit, first = np.unique(np.concatenate(places), return_inverse=True)
         columns = np.concatenate(lights).T
-        light = np.array([np.bincount(first, one, minlength=len(lit)) for one in columns], dtype=np.float64).T
+        light = np.array(
+            [np.bincount(first, one, minlength=len(lit)) for one in columns], dtype=np.float64
+        ).T
         shown = sum((share for _, share in turns), 0.0)
-        return Exposed((begin_ns, end_ns), lit.astype(np.intp), light, _mean(turns), len(places), shown)
+        return Exposed(
+            (begin_ns, end_ns), lit.astype(np.intp), light, _mean(turns), len(places), shown
+        )
 
 
 def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
@@ -130,7 +136,10 @@ def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
     if not turns:
         return None
     first, total = turns[0][0], sum(share for _, share in turns)
-    about = np.sum([share / total * to_rotation_vector(multiply(q, conjugate(first))) for q, share in turns], axis=0)
+    about = np.sum(
+        [share / total * to_rotation_vector(multiply(q, conjugate(first))) for q, share in turns],
+        axis=0,
+    )
     return normalise(multiply(from_rotation_vector(about), first))
 
 
@@ -175,8 +184,15 @@ class LiveTracker(Closing):
             self._colours = DisplayColours.of(bench)
             self._optics = TwinOptics(true_geometry(bench, self.camera), bench.tracker_psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
-            noise_e2 = tracker.detector.noise(np.median(glow_e_per_s) * self.exposure_s, self.exposure_s).total_e2
-            faintest = SEEN_SIGMAS * float(np.sqrt(noise_e2)) / self.canvas.psf.peak_share / self.exposure_s
+            noise_e2 = tracker.detector.noise(
+                np.median(glow_e_per_s) * self.exposure_s, self.exposure_s
+            ).total_e2
+            faintest = (
+                SEEN_SIGMAS
+                * float(np.sqrt(noise_e2))
+                / self.canvas.psf.peak_share
+                / self.exposure_s
+            )
             self.stars, _ = split_by_rate(bench.stars, max(faintest, bench.faintest_shown_e_per_s))
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
         glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
@@ -189,8 +205,14 @@ class LiveTracker(Closing):
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
-        panels, columns = self._panel.primaries or (self._panel,), levels.reshape(len(levels), math.prod(levels.shape[1:])).T
-        lights = [one.response.light[k] * one.flux_at_white_e_per_s for one, k in zip(panels, columns, strict=True)]
+        panels, columns = (
+            self._panel.primaries or (self._panel,),
+            levels.reshape(len(levels), math.prod(levels.shape[1:])).T,
+        )
+        lights = [
+            one.response.light[k] * one.flux_at_white_e_per_s
+            for one, k in zip(panels, columns, strict=True)
+        ]
         light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:
             light = light * self._panel.uniformity.ravel()[frame.lit, None]
@@ -200,10 +222,18 @@ class LiveTracker(Closing):
         """Take a frame. Raises InputError for one of another display."""
         head = frame.head
         kind = head.width, head.height, head.bits, head.channels
-        mine = *self._size_px, self._bits, 1 if self._rgb is None and not self._panel.primaries else 3
+        mine = (
+            *self._size_px,
+            self._bits,
+            1 if self._rgb is None and not self._panel.primaries else 3,
+        )
         if kind != mine:
-            shown, wanted = ("{} x {} pixels of {} bits in {} channels".format(*each) for each in (kind, mine))
-            raise InputError(f"frames of {shown}, the bench file has {wanted}; give the bench file of serve")
+            shown, wanted = (
+                "{} x {} pixels of {} bits in {} channels".format(*each) for each in (kind, mine)
+            )
+            raise InputError(
+                f"frames of {shown}, the bench file has {wanted}; give the bench file of serve"
+            )
         self.frames.add(frame)
 
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
@@ -222,7 +252,9 @@ class LiveTracker(Closing):
         settings = self.config.tracker.detector
         if np.count_nonzero(dn == 2**settings.bits - 1) > BLINDED_SHARE * dn.size:
             return self._answered(Solved(exposed, BLINDED, found))
-        identified = None if expected is None else identify(found, expected, self._near, self._place)
+        identified = (
+            None if expected is None else identify(found, expected, self._near, self._place)
+        )
         mode = TRACKING
         if identified is None and self.lost_in_space is not None and len(found):
             mode = LOST
@@ -244,7 +276,9 @@ class LiveTracker(Closing):
             return exposed.q_icrs_to_cam
         if self._last is None or exposed.middle_ns - self._last[0] > STALE_S * NS_PER_S:
             return None
-        return propagate(self._last[1], self.rate_cam_rad_s(), (exposed.middle_ns - self._last[0]) / NS_PER_S)
+        return propagate(
+            self._last[1], self.rate_cam_rad_s(), (exposed.middle_ns - self._last[0]) / NS_PER_S
+        )
 
     def rate_cam_rad_s(self) -> FloatArray:
         """The turn between the last two attitudes (3,), cam; 0 where there are none of the last
@@ -255,13 +289,26 @@ class LiveTracker(Closing):
             return np.zeros(3)
         return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
 
-    def _found(self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None) -> FoundStars:
+    def _found(
+        self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None
+    ) -> FoundStars:
         psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
-        streak_px = float(np.linalg.norm(self.rate_cam_rad_s()[:2])) * self.exposure_s * self.camera.focal_length_px
-        window_px = max(1.0, *psf_px, min(streak_px / np.sqrt(12), MAX_WINDOW_PX) if streak_px > STREAK_PX else 0.0)
+        streak_px = (
+            float(np.linalg.norm(self.rate_cam_rad_s()[:2]))
+            * self.exposure_s
+            * self.camera.focal_length_px
+        )
+        window_px = max(
+            1.0,
+            *psf_px,
+            min(streak_px / np.sqrt(12), MAX_WINDOW_PX) if streak_px > STREAK_PX else 0.0,
+        )
         still = streak_px <= STREAK_PX
         image = software_image(dn, self.config.tracker.detector)
-        seen = find_stars(image, CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None))
+        seen = find_stars(
+            image,
+            CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None),
+        )
         good = ~seen.at_edge
         x_px, y_px = seen.x_px[good], seen.y_px[good]
         flux_e = seen.flux[good] * self.config.tracker.detector.gain_e_per_dn
@@ -269,10 +316,23 @@ class LiveTracker(Closing):
 
     def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
         """The brightest stars of an exposure, as a tracker reports them."""
-        found, pairs, gain = solved.found, solved.identified, self.config.tracker.detector.gain_e_per_dn
-        hip = {} if pairs is None else dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
+        found, pairs, gain = (
+            solved.found,
+            solved.identified,
+            self.config.tracker.detector.gain_e_per_dn,
+        )
+        hip = (
+            {}
+            if pairs is None
+            else dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
+        )
         return tuple(
-            ReportedStar(float(found.x_px[k]), float(found.y_px[k]), float(found.flux_e[k]) / gain, hip.get(k) or None)
+            ReportedStar(
+                float(found.x_px[k]),
+                float(found.y_px[k]),
+                float(found.flux_e[k]) / gain,
+                hip.get(k) or None,
+            )
             for k in range(min(len(found), MAX_REPORTED))
         )
 

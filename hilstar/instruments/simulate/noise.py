@@ -40,7 +40,14 @@ from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY, Centroider, star_places
 from hilstar.tracker.centroids import CentroidSettings
 from hilstar.tracker.detector import Detector
-from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL, in_pixels, of_colour, software_image, software_psf_px
+from hilstar.tracker.mosaic import (
+    CHANNELS,
+    SUPERPIXEL,
+    in_pixels,
+    of_colour,
+    software_image,
+    software_psf_px,
+)
 from hilstar.tracker.settings import DetectorSettings, PixelNoise
 
 PHASES = 6  # along a side of a pixel
@@ -67,8 +74,14 @@ NEA_COLUMNS = [f"{kind}_{way}_arcsec" for kind in WHO for way in ("across", "abo
 # many pixels are left out because they clip.
 NOISE_DTYPE = np.dtype(
     [(f"{source}_e", "f8") for source in SOURCES]
-    + [(name, "f8") for name in ("total_e", "snr", "detection", "bound_px", "bound_x_px", "bound_y_px")]
-    + [(name, "f8") for name in ("bound_flux_e", "bound_flux_sky_e", "star_e", "effective_px", "clipped_px")]
+    + [
+        (name, "f8")
+        for name in ("total_e", "snr", "detection", "bound_px", "bound_x_px", "bound_y_px")
+    ]
+    + [
+        (name, "f8")
+        for name in ("bound_flux_e", "bound_flux_sky_e", "star_e", "effective_px", "clipped_px")
+    ]
 )
 Table = npt.NDArray[np.void]
 
@@ -88,7 +101,12 @@ class NoisyStar:
     """
 
     def __init__(
-        self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES, mosaic: FloatArray | None = None
+        self,
+        psf: Psf,
+        detector: DetectorSettings,
+        exposure_s: float,
+        phases: int = PHASES,
+        mosaic: FloatArray | None = None,
     ) -> None:
         self.psf, self.detector, self.exposure_s, self.mosaic = psf, detector, exposure_s, mosaic
         self.side_px = max(psf.footprint_px | 1, 7)
@@ -103,7 +121,12 @@ class NoisyStar:
         even, count = np.ones_like(by_x), phases**2 * len(seen)
         self.shares, *slopes = (
             (pattern[:, None] * one).reshape(count, -1)
-            for pattern, one in ((seen, self.stamps(x_px, y_px)), (seen, by_x), (seen, by_y), (sky, even))
+            for pattern, one in (
+                (seen, self.stamps(x_px, y_px)),
+                (seen, by_x),
+                (seen, by_y),
+                (sky, even),
+            )
         )
         self._sky = slopes[2] if mosaic is not None else np.ones((1, 1))
         # by x, y, flux, background; of one electron
@@ -118,32 +141,48 @@ class NoisyStar:
             return np.ones((2, 1, 1, 1))
         side = self.side_px
         whole = in_mosaic(self.mosaic, self.detector.bayer, (side + 1, side + 1))
-        return np.stack([whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1)
+        return np.stack(
+            [whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1
+        )
 
     def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Shares (n, side, side) of stars so far (n,) from the middle of their square."""
         at = np.arange(self.side_px) - self.side_px // 2
-        return np.asarray(self.psf.shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]))
+        return np.asarray(
+            self.psf.shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None])
+        )
 
-    def noise(self, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> Table:
+    def noise(
+        self, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
+    ) -> Table:
         """Rows of NOISE_DTYPE of stars of `star_e` (n,) electrons before `background_e` (n,) in
         a pixel, in one exposure.
         """
         found = np.empty(len(star_e), NOISE_DTYPE)
         for at in range(0, len(star_e), CHUNK):
             part = slice(at, at + CHUNK)
-            self._fill(found[part], star_e[part, None, None], background_e[part, None, None], finder)
+            self._fill(
+                found[part], star_e[part, None, None], background_e[part, None, None], finder
+            )
         return found
 
     def fisher(self, weight: FloatArray, star_e: FloatArray) -> FloatArray:
         """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n,
         1, 1) by 1 / pixels' variance.
         """
-        unit = (weight.transpose(1, 0, 2) @ self._pairs).transpose(1, 0, 2).reshape(*weight.shape[:2], 4, 4)
-        scale = np.concatenate([star_e, star_e, np.ones_like(star_e), np.ones_like(star_e)], axis=-1)
+        unit = (
+            (weight.transpose(1, 0, 2) @ self._pairs)
+            .transpose(1, 0, 2)
+            .reshape(*weight.shape[:2], 4, 4)
+        )
+        scale = np.concatenate(
+            [star_e, star_e, np.ones_like(star_e), np.ones_like(star_e)], axis=-1
+        )
         return np.asarray(unit * scale.transpose(0, 2, 1)[:, None] * scale[:, None])
 
-    def _fill(self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> None:
+    def _fill(
+        self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
+    ) -> None:
         shares, under_e = self.shares, background_e * self._sky
         light_e = star_e * shares + under_e
         noise, sky = (self.detector.noise(one, self.exposure_s) for one in (light_e, under_e))
@@ -155,30 +194,57 @@ class NoisyStar:
         effective_px = squared.sum(axis=-1, keepdims=True)
         even = (sky.dark_e2, sky.read_e2, sky.reset_e2, sky.quantisation_e2)
         shot, background, prnu = (
-            (squared * e2).sum(axis=-1, keepdims=True) for e2 in (star_e * shares, under_e, noise.prnu_e2)
+            (squared * e2).sum(axis=-1, keepdims=True)
+            for e2 in (star_e * shares, under_e, noise.prnu_e2)
         )
-        variances = (shot, background, *(effective_px * e2 for e2 in even), prnu, effective_px * sky.dsnu_e2)
+        variances = (
+            shot,
+            background,
+            *(effective_px * e2 for e2 in even),
+            prnu,
+            effective_px * sky.dsnu_e2,
+        )
         for source, e2 in zip(SOURCES, variances, strict=True):
             found[f"{source}_e"] = np.sqrt(e2.mean(axis=(1, 2)))
-        found["total_e"] = np.sqrt(np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0))
+        found["total_e"] = np.sqrt(
+            np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0)
+        )
         # Where one pixel is left, it cannot tell place from flux: a bound is then large, and not an
         # error.
-        information = self.fisher(weight, star_e) * (1 + NO_INFORMATION * np.eye(4)) + NO_INFORMATION * np.eye(4)
+        information = self.fisher(weight, star_e) * (
+            1 + NO_INFORMATION * np.eye(4)
+        ) + NO_INFORMATION * np.eye(4)
         known, free = (
-            np.sqrt(np.linalg.inv(information[..., :size, :size]).diagonal(axis1=-2, axis2=-1).mean(axis=1)) for size in (3, 4)
+            np.sqrt(
+                np.linalg.inv(information[..., :size, :size])
+                .diagonal(axis1=-2, axis2=-1)
+                .mean(axis=1)
+            )
+            for size in (3, 4)
         )
-        for name, one in zip(("x_px", "y_px", "flux_e", "flux_sky_e"), (*known.T, free[:, 2]), strict=True):
+        for name, one in zip(
+            ("x_px", "y_px", "flux_e", "flux_sky_e"), (*known.T, free[:, 2]), strict=True
+        ):
             found[f"bound_{name}"] = one
         found["bound_px"] = np.sqrt((found["bound_x_px"] ** 2 + found["bound_y_px"] ** 2) / 2)
         found["effective_px"] = effective_px.mean(axis=(1, 2))
         # somewhere within a pixel nothing is left of them
         found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan
-        found["star_e"], found["clipped_px"] = star_e[:, 0, 0], (~unclipped).sum(axis=-1).mean(axis=-1)
+        found["star_e"], found["clipped_px"] = (
+            star_e[:, 0, 0],
+            (~unclipped).sum(axis=-1).mean(axis=-1),
+        )
         found["snr"] = found["star_e"] / found["total_e"]
-        found["detection"] = found_share(self._above(star_e, under_e, (noise, sky), finder), finder.minimum_pixels)
+        found["detection"] = found_share(
+            self._above(star_e, under_e, (noise, sky), finder), finder.minimum_pixels
+        )
 
     def _above(
-        self, star_e: FloatArray, under_e: FloatArray, noises: "tuple[PixelNoise, PixelNoise]", finder: CentroidSettings
+        self,
+        star_e: FloatArray,
+        under_e: FloatArray,
+        noises: "tuple[PixelNoise, PixelNoise]",
+        finder: CentroidSettings,
     ) -> FloatArray:
         """The probability (n, phases, pixels) that a pixel is above the threshold, by its noise
         with a star and without.
@@ -189,19 +255,29 @@ class NoisyStar:
         noise, sky = noises
         if self.detector.takes_superpixels:
             light, variance, dark = (
-                superpixels(np.broadcast_to(one, noise.total_e2.shape).reshape(-1, self.side_px, self.side_px), squared=k > 0)
+                superpixels(
+                    np.broadcast_to(one, noise.total_e2.shape).reshape(
+                        -1, self.side_px, self.side_px
+                    ),
+                    squared=k > 0,
+                )
                 for k, one in enumerate((star_e * self.shares, noise.total_e2, sky.total_e2))
             )
             limit_e = finder.threshold_sigma * np.sqrt(dark.mean(axis=(1, 2), keepdims=True))
             above = np.pad(ndtr((light - limit_e) / np.sqrt(variance)), ((0, 0), (0, 1), (0, 1)))
-            each = np.stack([above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)], axis=1)
+            each = np.stack(
+                [above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)],
+                axis=1,
+            )
             best = each[np.arange(len(each)), np.prod(1 - each, axis=2).argmin(axis=1)]
             return np.asarray(best.reshape(*noise.total_e2.shape[:2], -1))
         # The first code over the threshold begins half a step below it, and rounding is no noise of
         # its own.
         step_e = self.detector.gain_e_per_dn
         level_dn = (under_e + sky.dark_e2) / step_e + self.detector.offset_dn
-        first_dn = np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
+        first_dn = (
+            np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
+        )
         sigma_e = np.sqrt(np.maximum(noise.total_e2 - step_e**2 / 12, NO_NOISE_E2))
         return np.asarray(ndtr((star_e * self.shares - (first_dn - level_dn) * step_e) / sigma_e))
 
@@ -229,7 +305,9 @@ def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
     return np.asarray(1 - fewer.sum(axis=0).mean(axis=-1))
 
 
-def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSettings, rng: np.random.Generator) -> FloatArray:
+def measured_px(
+    star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSettings, rng: np.random.Generator
+) -> FloatArray:
     """The rms error along an axis, px, that each kind of FAMILY has with simulated stars that the
     threshold finds; NaN for few.
 
@@ -237,11 +315,19 @@ def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSe
     and dead pixels. What all are off by in common is no error.
     """
     side, shape = star.side_px, (TRIALS * star.side_px,) * 2
-    plain = {"hot_pixel_fraction": 0.0, "dead_pixel_fraction": 0.0, "false_stars": 0, "cosmic_rays_per_cm2_s": 0.0}
+    plain = {
+        "hot_pixel_fraction": 0.0,
+        "dead_pixel_fraction": 0.0,
+        "false_stars": 0,
+        "cosmic_rays_per_cm2_s": 0.0,
+    }
     device = Detector(structs.replace(star.detector, blooming=False, **plain), shape)
     place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
     light_e, under_e = (
-        (star_e * star.stamps(*place_px)).reshape(TRIALS, TRIALS, side, side).swapaxes(1, 2).reshape(shape),
+        (star_e * star.stamps(*place_px))
+        .reshape(TRIALS, TRIALS, side, side)
+        .swapaxes(1, 2)
+        .reshape(shape),
         sky_e,
     )
     bayer, superpixel = star.detector.bayer, star.detector.takes_superpixels
@@ -253,13 +339,19 @@ def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSe
     seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - under_e - noise.dark_e2
     stamps = seen_e.reshape(TRIALS, side, TRIALS, side).swapaxes(1, 2).reshape(-1, side, side)
     stamps = superpixels(stamps) if superpixel else stamps
-    threshold_e = finder.threshold_sigma * math.sqrt(noise.total_e2) * (float(np.sum(SUPERPIXEL**2)) if superpixel else 1.0)
+    threshold_e = (
+        finder.threshold_sigma
+        * math.sqrt(noise.total_e2)
+        * (float(np.sum(SUPERPIXEL**2)) if superpixel else 1.0)
+    )
     above = stamps > threshold_e
     found = above.sum(axis=(1, 2)) >= finder.minimum_pixels
     if found.sum() < MIN_FOUND:
         return np.full(len(FAMILY), np.nan)
     width_px = software_psf_px(star.psf.width_px, star.detector)
-    off = [np.stack(star_places(stamps[found], kind, width_px)) - place_px[:, found] for kind in FAMILY]
+    off = [
+        np.stack(star_places(stamps[found], kind, width_px)) - place_px[:, found] for kind in FAMILY
+    ]
     # an offset of all, as by coma, is the calibration's
     return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))
 
@@ -279,7 +371,10 @@ def turns_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     rays, turns = normalise(camera.rays(x_px, y_px)), np.empty((len(x_px), 2, 3))
     for k, axis in enumerate(np.eye(3)):
         moved = TURN_RAD * np.cross(axis, rays)
-        there, back = (np.stack(camera.project((rays + way * moved) @ camera.cam_to_image.T)) for way in (1, -1))
+        there, back = (
+            np.stack(camera.project((rays + way * moved) @ camera.cam_to_image.T))
+            for way in (1, -1)
+        )
         turns[:, :, k] = ((there - back) / (2 * TURN_RAD)).T
     return turns
 
@@ -296,7 +391,9 @@ def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -
     usable = weight.all(axis=1).cumsum() >= MIN_STARS
     # Two stars in one place leave the turn about them open: it comes out as large, and not as an
     # error.
-    information += NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    information += (
+        NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    )
     found = np.full((2, len(usable)), np.inf)
     x, y, z = np.linalg.inv(information[usable]).diagonal(axis1=1, axis2=2).T
     found[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
@@ -332,14 +429,21 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
     tracker, mosaic, bayer = file.config.tracker, None, file.config.tracker.detector.bayer
     if bayer is not None:
         of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
-        levels = [np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]) for one in CHANNELS]
+        levels = [
+            np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]) for one in CHANNELS
+        ]
         mosaic = np.array([of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0)])
         mosaic[0, [k for k in range(len(CHANNELS)) if channel not in (None, k)]] = 0.0
-    return NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s, mosaic=mosaic)
+    return NoisyStar(
+        tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s, mosaic=mosaic
+    )
 
 
 def noise_budget(
-    file: BenchFile, q_icrs_to_cam: FloatArray | None, finder: CentroidSettings, rng: np.random.Generator
+    file: BenchFile,
+    q_icrs_to_cam: FloatArray | None,
+    finder: CentroidSettings,
+    rng: np.random.Generator,
 ) -> NoiseBudget:
     """The noise of a bench's tracker at rest and its limits, in one field or, without an attitude,
     all over the sky.
@@ -352,7 +456,9 @@ def noise_budget(
     if not tracker.exposure_s:
         raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
     if not len(stars):
-        raise InputError(f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude")
+        raise InputError(
+            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude"
+        )
     background = TrackerBackground(config, file.folder, camera)
     sights, levels_e = [], []
     for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
@@ -366,20 +472,32 @@ def noise_budget(
         sights.append(field_stars(stars, camera, normalise(q)))
     middle_e = float(np.median(levels_e))
     star = noisy_star(file, sky_e)
-    brightest = float((stars.v_mag if q_icrs_to_cam is None or not len(sights[0]) else sights[0]["v_mag"]).min())
-    zero_e = float(star_rates(config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]) * tracker.exposure_s
-    v_mag: FloatArray = math.floor(brightest / STEP_MAG) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
+    brightest = float(
+        (stars.v_mag if q_icrs_to_cam is None or not len(sights[0]) else sights[0]["v_mag"]).min()
+    )
+    zero_e = (
+        float(star_rates(config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0])
+        * tracker.exposure_s
+    )
+    v_mag: FloatArray = math.floor(
+        brightest / STEP_MAG
+    ) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
     all_e, under_e = zero_e * flux_ratio(v_mag), np.full(len(v_mag), middle_e)
     noise = star.noise(all_e, under_e, finder)
     shown = slice(0, int((noise["detection"][::BETWEEN] >= UNSEEN).sum()) * BETWEEN + 1, BETWEEN)
-    measured = np.array([measured_px(star, one, middle_e, finder, rng) for one in noise["star_e"][shown].tolist()]).T
+    measured = np.array(
+        [measured_px(star, one, middle_e, finder, rng) for one in noise["star_e"][shown].tolist()]
+    ).T
     reached = {f"{kind}_px": one for kind, one in zip(FAMILY, measured, strict=True)}
     channels = {}
     if star.mosaic is not None:
         for number, (name, share, sky) in enumerate(zip(CHANNELS, *star.mosaic, strict=True)):
             alone = noisy_star(file, sky_e, number).noise(all_e[shown], under_e[shown], finder)
             reached[f"snr_{name}"] = alone["snr"]
-            channels[name] = {"star_share": float(share), "background_e_per_px": float(sky * middle_e)}
+            channels[name] = {
+                "star_share": float(share),
+                "background_e_per_px": float(sky * middle_e),
+            }
     listed = None
     curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
     for field in sights:
@@ -389,11 +507,20 @@ def noise_budget(
             pixels = np.ceil(np.stack([field["y_px"], field["x_px"]]) - 0.5).astype(np.intp)
             own = star.noise(star_e, software_image(sky_e, tracker.detector)[tuple(pixels)], finder)
             bounds = np.stack([own["bound_x_px"], own["bound_y_px"], own["detection"]])
-            listed = _rows({name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")}, own, {})
+            listed = _rows(
+                {name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")}, own, {}
+            )
         turns = turns_of(camera, field["x_px"], field["y_px"])
-        others = [np.stack([np.interp(-np.log(star_e), -np.log(noise["star_e"][shown]), one)] * 2) for one in measured]
-        curves.append(np.stack([nea_arcsec(turns, one, bounds[2]) for one in [bounds[:2], *others]]))
-    faintest = min(config.sky.faintest_v_mag, math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG)
+        others = [
+            np.stack([np.interp(-np.log(star_e), -np.log(noise["star_e"][shown]), one)] * 2)
+            for one in measured
+        ]
+        curves.append(
+            np.stack([nea_arcsec(turns, one, bounds[2]) for one in [bounds[:2], *others]])
+        )
+    faintest = min(
+        config.sky.faintest_v_mag, math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
+    )
     nea = _nea_rows(sights, curves, faintest)
     return NoiseBudget(
         threshold_sigma=finder.threshold_sigma,
@@ -404,7 +531,10 @@ def noise_budget(
         rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
         stars=listed,
         nea=nea,
-        nea_arcsec={kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")} for kind in WHO},
+        nea_arcsec={
+            kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")}
+            for kind in WHO
+        },
         channels=channels,
     )
 
@@ -426,9 +556,13 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
             sky_e = background.of_view_e(View.exposure(q, STILL, tracker.exposure_s))
             star = star or noisy_star(file, sky_e)
             under_e = np.full(len(field), float(sky_e.mean()))
-            own = star.noise(field["electrons_per_s"] * tracker.exposure_s, under_e, CentroidSettings())
+            own = star.noise(
+                field["electrons_per_s"] * tracker.exposure_s, under_e, CentroidSettings()
+            )
             bounds = np.stack([own["bound_x_px"], own["bound_y_px"]])
-            nea = nea_arcsec(turns_of(camera, field["x_px"], field["y_px"]), bounds, own["detection"])
+            nea = nea_arcsec(
+                turns_of(camera, field["x_px"], field["y_px"]), bounds, own["detection"]
+            )
             found[k] = nea[:, -1:].ravel() if nea.size else np.inf
     return found
 
@@ -438,25 +572,37 @@ def between(noise: Table, star_e: FloatArray) -> FloatArray:
     between those of a table.
     """
     grid, at = -np.log(noise["star_e"]), -np.log(star_e)
-    bounds = [np.exp(np.interp(at, grid, np.log(noise[name]))) for name in ("bound_x_px", "bound_y_px")]
+    bounds = [
+        np.exp(np.interp(at, grid, np.log(noise[name]))) for name in ("bound_x_px", "bound_y_px")
+    ]
     return np.stack([*bounds, np.interp(at, grid, noise["detection"])])
 
 
 def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[dict[str, Any]]:
     columns = before | {name: noise[name] for name in NOISE_DTYPE.names or ()} | after
-    return [dict(zip(columns, row, strict=True)) for row in zip(*(one.tolist() for one in columns.values()), strict=True)]
+    return [
+        dict(zip(columns, row, strict=True))
+        for row in zip(*(one.tolist() for one in columns.values()), strict=True)
+    ]
 
 
-def _nea_rows(sights: list[Table], curves: list[FloatArray], faintest_v_mag: float) -> list[dict[str, Any]]:
+def _nea_rows(
+    sights: list[Table], curves: list[FloatArray], faintest_v_mag: float
+) -> list[dict[str, Any]]:
     """Medians over fields by the faintest star used, from the first limit at which half of the
     fields have an attitude.
     """
     first = min(one["v_mag"].min(initial=faintest_v_mag) for one in sights)
-    limits = np.arange(math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG)
+    limits = np.arange(
+        math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG
+    )
     none, rows = np.full((len(WHO), 2), np.inf), []
     for limit in [*limits.tolist(), faintest_v_mag]:
         counts = [int(np.searchsorted(field["v_mag"], limit, side="right")) for field in sights]
-        median = np.median([curve[..., n - 1] if n else none for curve, n in zip(curves, counts, strict=True)], axis=0)
+        median = np.median(
+            [curve[..., n - 1] if n else none for curve, n in zip(curves, counts, strict=True)],
+            axis=0,
+        )
         row = {"v_mag": limit, "stars": float(np.median(counts))}
         rows.append(row | dict(zip(NEA_COLUMNS, median.ravel().tolist(), strict=True)))
     seen = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
@@ -469,7 +615,10 @@ def write_noise(directory: Path, found: NoiseBudget) -> None:
     """
     for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
         if rows:
-            texts = [["" if isinstance(v, float) and not math.isfinite(v) else v for v in row.values()] for row in rows]
+            texts = [
+                ["" if isinstance(v, float) and not math.isfinite(v) else v for v in row.values()]
+                for row in rows
+            ]
             write_csv(directory / f"{name}.csv", list(rows[0]), texts)
     if math.isfinite(found.nea_arcsec["limit"]["about"]):
         _draw(directory / "nea", found)
@@ -483,14 +632,18 @@ def _draw(path: Path, found: NoiseBudget) -> None:
     where = "the field" if found.fields == 1 else f"{found.fields} fields all over the sky, median"
     note = f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated {own}."
     with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
-        for axes, key, label in zip(panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True):
+        for axes, key, label in zip(
+            panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True
+        ):
             # the last one of a number of stars
             rows = list({row[key]: row for row in found.nea}.values())
             for way, colour in (("about", ORANGE), ("across", BLUE)):
                 for kind, style in ((own, "--"), ("limit", "-")):
                     values = [row[f"{kind}_{way}_arcsec"] for row in rows]
                     name = f"{way}, {kind}" if key == "stars" else "_"
-                    axes.semilogy([row[key] for row in rows], values, style, color=colour, label=name)
+                    axes.semilogy(
+                        [row[key] for row in rows], values, style, color=colour, label=name
+                    )
             axes.set_xlabel(label)
         panels[0].set_ylabel("NEA [arcsec]")
         panels[1].set_xscale("log")
@@ -507,7 +660,11 @@ def noise_lines(found: NoiseBudget) -> Iterator[str]:
         yield f"{'pixels of ' + name:22}{figures}"
     for kind, nea in found.nea_arcsec.items():
         told = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
-        told = told if math.isfinite(nea["about"]) else f"none: fewer than {MIN_STARS} stars with a place"
+        told = (
+            told
+            if math.isfinite(nea["about"])
+            else f"none: fewer than {MIN_STARS} stars with a place"
+        )
         yield f"{'NEA, ' + kind:22}{told}"
     yield ""
     snr = [f"snr_{name}" for name in found.channels]

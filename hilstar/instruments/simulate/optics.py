@@ -99,9 +99,15 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     colours, psf = bench.colours, bench.tracker_psf
     if colours is None:
         return ALL_ALIKE
-    spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if isinstance(psf, GlassPsf) else None
+    spectra = (
+        colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
+        if isinstance(psf, GlassPsf)
+        else None
+    )
     places = [(float(x), float(y)) for x, y in colours.places_px]
-    return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
+    return tuple(
+        Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +136,9 @@ class DisplayColours:
             return cls(bayer, colours.by_primary, colours.by_primary @ colours.of_white)
         white = mean_share(stars.colours, stars)
         if primaries is not None:
-            white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
+            white = channel_matrix(
+                primaries, named_channels(config.tracker, folder), 1.0
+            ).e_per_s.sum(axis=1)
         return cls(bayer, white[:, None], white)
 
     def shown(self, images: FloatArray) -> FloatArray:
@@ -141,7 +149,11 @@ class DisplayColours:
 
     def grey(self, image: FloatArray) -> FloatArray:
         """The black level's light (h, w) in the detector's pixels."""
-        return image if self.bayer is None else in_pixels(np.multiply.outer(self.white, image), self.bayer)
+        return (
+            image
+            if self.bayer is None
+            else in_pixels(np.multiply.outer(self.white, image), self.bayer)
+        )
 
 
 class TwinOptics(Closing):
@@ -156,16 +168,25 @@ class TwinOptics(Closing):
         # A pixel farther than this from the detector lights none of it, though it be twice as large
         # there as on the axis.
         self._reach_px = 2 * side_px + self._psf.footprint_px / 2 + 1
-        self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
+        self._renderer = open_backend(
+            Target(geometry.tracker.resolution_px, self._psf), headless_context()
+        )
 
-    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:
+    def images_e_per_s(
+        self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]
+    ) -> FloatArray:
         """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w),
         float64.
         """
-        images = [self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)]
+        images = [
+            self.image_e_per_s(light, one)
+            for light, one in zip(lights_e_per_s, primaries, strict=True)
+        ]
         return np.array(images) if len(images) > 1 else images[0][None]
 
-    def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
+    def image_e_per_s(
+        self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]
+    ) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit
         ones or all (H, W), float64.
         """
@@ -183,7 +204,9 @@ class TwinOptics(Closing):
         of.
         """
         rows, columns = np.divmod(lit.place, self.geometry.monitor.resolution_px[0])
-        x_px, y_px = self.geometry.to_tracker(columns.astype(np.float64), rows.astype(np.float64), primary.place_px)
+        x_px, y_px = self.geometry.to_tracker(
+            columns.astype(np.float64), rows.astype(np.float64), primary.place_px
+        )
         width, height = self.geometry.tracker.resolution_px
         near = (x_px >= -self._reach_px) & (x_px < width + self._reach_px)
         near &= (y_px >= -self._reach_px) & (y_px < height + self._reach_px)
@@ -192,7 +215,9 @@ class TwinOptics(Closing):
     def _points(self, lit: LitLight, primary: Primary) -> FloatArray:
         dx, dy = (step.ravel() for step in np.meshgrid(self._steps, self._steps))
         rows, columns = np.divmod(lit.place[:, None], self.geometry.monitor.resolution_px[0])
-        x_px, y_px = self.geometry.to_tracker((columns + dx).ravel(), (rows + dy).ravel(), primary.place_px)
+        x_px, y_px = self.geometry.to_tracker(
+            (columns + dx).ravel(), (rows + dy).ravel(), primary.place_px
+        )
         light = np.repeat(lit.e_per_s / len(dx), len(dx))
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
@@ -226,7 +251,9 @@ class TwinOptics(Closing):
         """The glow of the detector's rows from `first` to before `last`."""
         width, _ = self.geometry.tracker.resolution_px
         y, x = np.mgrid[first:last, 0:width].astype(np.float64)
-        seen_x, seen_y = (part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
+        seen_x, seen_y = (
+            part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel())
+        )
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
         # Beyond a lens there is no place: a pixel whose neighbour looks there has no density
         # either.
@@ -236,7 +263,9 @@ class TwinOptics(Closing):
         on_screen &= np.abs(seen_y - (screen_h - 1) / 2) <= screen_h / 2
         light = np.full(on_screen.shape, panel.response.black * panel.flux_at_white_e_per_s)
         if panel.uniformity is not None:
-            column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(np.intp)
+            column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(
+                np.intp
+            )
             row = np.clip(np.rint(np.where(on_screen, seen_y, 0)), 0, screen_h - 1).astype(np.intp)
             light = light * panel.uniformity[row, column]
         return np.asarray(np.where(on_screen, light * density, 0.0))

@@ -47,7 +47,9 @@ class Imager(Protocol):
     stars: Stars
 
 
-def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise) -> None:
+def write_exposure_fits(
+    path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise
+) -> None:
     """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how
     both were made.
     """
@@ -58,7 +60,9 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     header = sky_header(simulator.file.sha256, epoch_jyear, q, simulator.camera)
     header["BUNIT"] = ("adu", "digital numbers (DN)")
     header["EXPTIME"] = (tracker.exposure_s, "[s]")
-    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.view.turn.rate_cam_rad_s), strict=True):
+    for name, rate in zip(
+        ("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.view.turn.rate_cam_rad_s), strict=True
+    ):
         header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
     header["NOISE"] = (noise.kind, "full, or none: the mean signal through the ADC")
     header["SEED"] = (noise.seed, "of the frame's noise")
@@ -68,13 +72,18 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
     header["BITS"] = (tracker.detector.bits, "of the ADC")
     if tracker.detector.bayer is not None:
-        header["BAYERPAT"] = (tracker.detector.bayer.upper(), "colours, from the first pixel of the file")
+        header["BAYERPAT"] = (
+            tracker.detector.bayer.upper(),
+            "colours, from the first pixel of the file",
+        )
         header["XBAYROFF"] = header["YBAYROFF"] = 0
         header["ROWORDER"] = ("TOP-DOWN", "the first row of the file is the top")
     if exposure.faults:
         header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")
-    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
+    hdus = fits.HDUList(
+        [fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")]
+    )
     write_fits(path, hdus)
 
 
@@ -94,7 +103,10 @@ def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     from PIL import Image
 
     tiff = path.suffix.lower() in {".tif", ".tiff"}
-    written(path, lambda file: Image.fromarray(dn).save(file, "TIFF") if tiff else file.write(png_of(dn)))
+    written(
+        path,
+        lambda file: Image.fromarray(dn).save(file, "TIFF") if tiff else file.write(png_of(dn)),
+    )
 
 
 class TrackerPictures:
@@ -107,7 +119,12 @@ class TrackerPictures:
     which faults of a scenario are on.
     """
 
-    def __init__(self, bench: Bench, scenario: Scenario = NO_SCENARIO, now: Callable[[], tuple[Now, ...]] = tuple) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        scenario: Scenario = NO_SCENARIO,
+        now: Callable[[], tuple[Now, ...]] = tuple,
+    ) -> None:
         self._simulator = Simulator(bench.file, bench.renderer.context, refuse=False)
         self._noise, self._count = FrameNoise("full"), 0
         self._now = now
@@ -117,7 +134,9 @@ class TrackerPictures:
     def __call__(self, sample: AttitudeSample) -> bytes:
         """The picture of the tracker at an attitude."""
         rate = STILL if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
-        view = self._simulator.view(sample.q_icrs_to_cam, rate, sample.t_ns, sample.velocity_km_s, sample.place_km)
+        view = self._simulator.view(
+            sample.q_icrs_to_cam, rate, sample.t_ns, sample.velocity_km_s, sample.place_km
+        )
         exposure = self._simulator.expose(view, self._noise.rng(self._count), self._faults(view))
         self._count += 1
         bits = self._simulator.config.tracker.detector.bits
@@ -132,5 +151,7 @@ class TrackerPictures:
             self._stood = view
         elif self._stood is not None:
             stood = self._stood
-            view = replace(view, q_icrs_to_cam=stood.q_icrs_to_cam, rate_cam_rad_s=STILL, t_ns=stood.t_ns)
+            view = replace(
+                view, q_icrs_to_cam=stood.q_icrs_to_cam, rate_cam_rad_s=STILL, t_ns=stood.t_ns
+            )
         return FaultyExposure(self._view, (ExposurePiece(view, now),)) if now else None

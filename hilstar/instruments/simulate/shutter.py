@@ -31,7 +31,10 @@ def rolled(view: View, tracker: Tracker) -> View:
     if detector.shutter != "rolling":
         return view
     readout_s = tracker.resolution_px[1] * detector.row_time_us * S_PER_US
-    return replace(view, scan=Scan((0, 1 if detector.row_direction == "down" else -1), readout_s, view.scan.hold_s))
+    return replace(
+        view,
+        scan=Scan((0, 1 if detector.row_direction == "down" else -1), readout_s, view.scan.hold_s),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,9 @@ class RowBeat:
         `row_late_s` (n,) how long after its own the tracker exposes it.
         """
         begin, exposed = self.begin_s(frame) + screen_late_s, row_late_s - self.rows.hold_s / 2
-        lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(begin, exposed)
+        lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(
+            begin, exposed
+        )
         return np.asarray(np.maximum(lit, 0.0) * (self.period_s / (self.hold_s * self.rows.hold_s)))
 
 
@@ -87,12 +92,16 @@ def rolling_light(
     config, screen, moving, turn = bench.config, bench.scan, bench.moving, view.turn
     beat = RowBeat(view.scan, screen, 1 / config.monitor.refresh_hz, phase_s)
     sizes = config.monitor.resolution_px, config.tracker.resolution_px
-    changes = bool(turn.rate_cam_rad_s.any()) or len(bench.quantiser.exposure(0, len(beat.frames))) > 1
+    changes = (
+        bool(turn.rate_cam_rad_s.any()) or len(bench.quantiser.exposure(0, len(beat.frames))) > 1
+    )
     changes |= moving is not None and moving.satellites is not None
     compensated = config.render.motion == "on"
     total, shown = np.zeros((len(panel.primaries) or 1, *sizes[0][::-1])), None
     y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
-    glow_late_s = np.nan_to_num(screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0]))
+    glow_late_s = np.nan_to_num(
+        screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0])
+    )
     glow_rows_s, glow = view.scan.late_s(x, y, sizes[1]), np.zeros(x.shape)
     for number, frame in enumerate(beat.frames):
         if changes or shown is None:
@@ -105,6 +114,8 @@ def rolling_light(
             places = columns.astype(np.float64), rows.astype(np.float64)
             screen_late_s = screen.late_s(*places, sizes[0])
             row_late_s = np.nan_to_num(view.scan.late_s(*geometry.to_tracker(*places), sizes[1]))
-        total[:, rows, columns] += shown[:, rows, columns] * beat.shares(frame, screen_late_s, row_late_s)
+        total[:, rows, columns] += shown[:, rows, columns] * beat.shares(
+            frame, screen_late_s, row_late_s
+        )
         glow += beat.shares(frame, glow_late_s, glow_rows_s)
     return total, glow.reshape(sizes[1][::-1])

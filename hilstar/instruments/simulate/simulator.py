@@ -31,13 +31,26 @@ from hilstar.optics.layers.fault_kinds import CosmicRays, Now
 from hilstar.optics.layers.fault_light import FaultView
 from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.layers import light_of, seen_in, sky_layers
-from hilstar.optics.layers.truth import TRUTH_DTYPE, added_truth, truth_table, with_channels, with_errors
+from hilstar.optics.layers.truth import (
+    TRUTH_DTYPE,
+    added_truth,
+    truth_table,
+    with_channels,
+    with_errors,
+)
 from hilstar.optics.layers.view import STILL, Canvas, View
 from hilstar.optics.paths import Paths
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import Sprites, by_channel, join_sprites, shares_by_bv, without_stars
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import StarGlass, bench_channels, bench_optics, bench_sources, bench_stars, moved
+from hilstar.server.bench.build import (
+    StarGlass,
+    bench_channels,
+    bench_optics,
+    bench_sources,
+    bench_stars,
+    moved,
+)
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.config.bench_config import sky_jd
@@ -65,7 +78,12 @@ LATTICE = 17
 # A row of TRUTH_DTYPE, and the place of its light, px, and its illumination, as the tracker's
 # optics make them.
 EXPOSURE_DTYPE = np.dtype(
-    [*TRUTH_DTYPE.descr, ("x_centroid_px", "f8"), ("y_centroid_px", "f8"), ("relative_illumination", "f8")]
+    [
+        *TRUTH_DTYPE.descr,
+        ("x_centroid_px", "f8"),
+        ("y_centroid_px", "f8"),
+        ("relative_illumination", "f8"),
+    ]
 )
 CLIPPED_PX = 3  # a side of the square about a star with pixels of every colour beside its own
 NO_MOSAIC = 'quantum_efficiency_r, _g and _b without a mosaic: each pixel adds them up; write [tracker.detector] bayer = "rggb"'
@@ -82,7 +100,11 @@ class FrameNoise:
 
     def rng(self, *number: int) -> np.random.Generator | None:
         """The generator of a frame, or of frame `number` of several; None without noise."""
-        return np.random.default_rng((self.seed, *number) if number else self.seed) if self.kind == "full" else None
+        return (
+            np.random.default_rng((self.seed, *number) if number else self.seed)
+            if self.kind == "full"
+            else None
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +138,12 @@ class Simulator(Closing):
     """
 
     def __init__(
-        self, file: BenchFile, context: "Context | None" = None, *, refuse: bool = True, psf: Psf | None = None
+        self,
+        file: BenchFile,
+        context: "Context | None" = None,
+        *,
+        refuse: bool = True,
+        psf: Psf | None = None,
     ) -> None:
         self.file, self._refuse, self._psf = file, refuse, psf
         self.config = file.config
@@ -139,7 +166,10 @@ class Simulator(Closing):
         self._glasses = [self.glass]
         if (bayer := tracker.detector.bayer) is not None:
             channels = bench_channels(tracker, self.file.folder)
-            self._glasses = [StarGlass(self.file, psf, one) if isinstance(psf, GlassPsf) else None for one in channels]
+            self._glasses = [
+                StarGlass(self.file, psf, one) if isinstance(psf, GlassPsf) else None
+                for one in channels
+            ]
         elif len(tracker.quantum_efficiencies) > 1:
             say_once(NO_MOSAIC, "[tracker]")
         self._bayer = bayer
@@ -189,13 +219,26 @@ class Simulator(Closing):
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a
         constant rate (see `View`).
         """
-        return View.exposure(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns, velocity_km_s, place_km)
+        return View.exposure(
+            q_icrs_to_cam,
+            rate_cam_rad_s,
+            self.config.tracker.exposure_s,
+            t_ns,
+            velocity_km_s,
+            place_km,
+        )
 
-    def expose(self, view: View, rng: np.random.Generator | None, faults: "FaultyExposure | None" = None) -> Exposure:
+    def expose(
+        self, view: View, rng: np.random.Generator | None, faults: "FaultyExposure | None" = None
+    ) -> Exposure:
         """One frame; without a generator, without noise. Raises InputError for what a detector
         cannot take.
         """
-        exposure_s, canvas, view = self.config.tracker.exposure_s, self.canvas, rolled(view, self.config.tracker)
+        exposure_s, canvas, view = (
+            self.config.tracker.exposure_s,
+            self.canvas,
+            rolled(view, self.config.tracker),
+        )
         stars = seen_in(view, self.stars, self.moving)
         if self.moving is not None and self.moving.air is not None and rng is not None:
             stars = self.moving.air.twinkling(stars, self.moving.utc_ns(view.t_ns), exposure_s, rng)
@@ -206,17 +249,24 @@ class Simulator(Closing):
             mean_e += self._background.of_view_e(view)
         else:
             mean_e, open_s = faults.light_e(
-                lambda part, layer: light_of(canvas, (*layers, layer), stars, rolled(part, self.config.tracker)),
+                lambda part, layer: light_of(
+                    canvas, (*layers, layer), stars, rolled(part, self.config.tracker)
+                ),
                 lambda light, seconds: self._exposed_e(light, stars, seconds),
             )
-            mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
+            mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (
+                open_s / exposure_s
+            )
             light = faults.sprites()
         # the Sun has more than a detector can be asked for; its wells are full long before
         if self.moving is not None:
             mean_e = np.minimum(mean_e, BODY_MAX_E)
         if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
-        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
+        dn, truth = (
+            self._digitised(mean_e, rng),
+            exposure_truth(canvas, view, stars, light, mean_e, self.glass),
+        )
         truth = with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
@@ -225,7 +275,9 @@ class Simulator(Closing):
         truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 
-    def _digitised(self, mean_e: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint16]:
+    def _digitised(
+        self, mean_e: FloatArray, rng: np.random.Generator | None
+    ) -> npt.NDArray[np.uint16]:
         exposure_s = self.config.tracker.exposure_s
         if rng is None:
             return self.detector.expose_noiseless(mean_e, exposure_s)
@@ -234,7 +286,10 @@ class Simulator(Closing):
     def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
         channels = [sprites] if self._bayer is None else by_channel(sprites, stars)
-        images = (self._image(light, stars, glass) for light, glass in zip(channels, self._glasses, strict=True))
+        images = (
+            self._image(light, stars, glass)
+            for light, glass in zip(channels, self._glasses, strict=True)
+        )
         return np.multiply(in_pixels(images, self._bayer), seconds, dtype=np.float64)
 
     def _image(self, sprites: Sprites, stars: Stars, glass: StarGlass | None) -> Float32Array:
@@ -244,7 +299,9 @@ class Simulator(Closing):
         if glass is None:
             self.renderer.draw(sprites)
             return self.renderer.linear()
-        image = glass.psf.image(sprites, glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
+        image = glass.psf.image(
+            sprites, glass.shares(stars, sprites.star), self.config.tracker.resolution_px
+        )
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()
@@ -307,7 +364,9 @@ class FaultyExposure:
         self._rows: list[tuple[npt.NDArray[np.void], float]] = []
 
     def light_e(
-        self, light_of: Callable[[View, FaultLayer], Sprites], exposed_e: Callable[[Sprites, float], FloatArray]
+        self,
+        light_of: Callable[[View, FaultLayer], Sprites],
+        exposed_e: Callable[[Sprites, float], FloatArray],
     ) -> tuple[FloatArray, float]:
         """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not
         blank.
@@ -350,7 +409,12 @@ class FaultyExposure:
         """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole
         exposure, at the mean place.
         """
-        tracks = {one.fault.name for piece in self.pieces for one in piece.now if isinstance(one.fault, CosmicRays)}
+        tracks = {
+            one.fault.name
+            for piece in self.pieces
+            for one in piece.now
+            if isinstance(one.fault, CosmicRays)
+        }
         points: dict[str, npt.NDArray[np.void]] = {}
         found: list[npt.NDArray[np.void]] = []
         for rows, share in self._rows:
@@ -383,12 +447,16 @@ def _own(sprites: Sprites) -> Sprites:
         return sprites
     own = sprites.star >= 0
     x_px, y_px = sprites.x_px[own], sprites.y_px[own]
-    return replace(sprites, data=sprites.data[own], star=sprites.star[own], x_px=x_px, y_px=y_px, added=())
+    return replace(
+        sprites, data=sprites.data[own], star=sprites.star[own], x_px=x_px, y_px=y_px, added=()
+    )
 
 
 def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
     """The faults of a scenario as a simulator's tracker sees them."""
-    return tracker_view(simulator.file, simulator.canvas, simulator.stars, simulator.moving, scenario)
+    return tracker_view(
+        simulator.file, simulator.canvas, simulator.stars, simulator.moving, scenario
+    )
 
 
 def detector_canvas(file: BenchFile, camera: Camera, psf: Psf | None = None) -> Canvas:
@@ -400,7 +468,12 @@ def detector_canvas(file: BenchFile, camera: Camera, psf: Psf | None = None) -> 
 
 
 def exposure_truth(
-    canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray, glass: StarGlass | None = None
+    canvas: Canvas,
+    view: View,
+    stars: Stars,
+    light: Sprites,
+    mean_e: FloatArray,
+    glass: StarGlass | None = None,
 ) -> npt.NDArray[np.void]:
     """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its
     light, and for discs.
@@ -414,7 +487,9 @@ def exposure_truth(
     x_px, y_px = canvas.camera.project(seen)
     if view.scan.scanout_s and view.turns:
         paths = Paths(seen, canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s, canvas.camera)
-        x_px, y_px = paths.places_px(EVERY, own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)[0])
+        x_px, y_px = paths.places_px(
+            EVERY, own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)[0]
+        )
     truth = _exposed(truth_table(stars, star, x_px, y_px))
     height, width = mean_e.shape
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
@@ -427,8 +502,12 @@ def exposure_truth(
         mean_e = maximum_filter(mean_e, CLIPPED_PX)
     truth["clipped"][inside] = mean_e[place] > canvas.full_e
     if glass is not None:
-        found = glass.psf.centroids_px(x_px[inside], y_px[inside], glass.shares(stars, star[inside]))
-        for name, value in zip(("x_centroid_px", "y_centroid_px", "relative_illumination"), found, strict=True):
+        found = glass.psf.centroids_px(
+            x_px[inside], y_px[inside], glass.shares(stars, star[inside])
+        )
+        for name, value in zip(
+            ("x_centroid_px", "y_centroid_px", "relative_illumination"), found, strict=True
+        ):
             truth[name][inside] = value
     truth["clipped"] |= np.isin(truth["name"], light.over_white)
     truth = with_channels(truth, None if stars.colours is None else stars.colours[star])
@@ -440,7 +519,11 @@ def _exposed(truth: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     found = np.zeros(len(truth), dtype=EXPOSURE_DTYPE)
     for name in TRUTH_DTYPE.names or ():
         found[name] = truth[name]
-    found["x_centroid_px"], found["y_centroid_px"], found["relative_illumination"] = truth["x_px"], truth["y_px"], 1.0
+    found["x_centroid_px"], found["y_centroid_px"], found["relative_illumination"] = (
+        truth["x_px"],
+        truth["y_px"],
+        1.0,
+    )
     return found
 
 
@@ -453,7 +536,12 @@ def full_e(detector: DetectorSettings) -> float:
 def _sky_keys(config: BenchConfig) -> tuple[object, ...]:
     """All by which the rates and directions of stars are made, where no body moves among them."""
     tracker = config.tracker
-    gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.detector.fill_factor
+    gathers = (
+        tracker.aperture_mm,
+        tracker.quantum_efficiencies,
+        tracker.transmission,
+        tracker.detector.fill_factor,
+    )
     return config.sky, config.spacecraft, config.site, gathers
 
 
@@ -485,14 +573,24 @@ class TrackerBackground:
         moving: "MovingSky | None" = None,
     ) -> None:
         self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
-        channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)
+        channels = (
+            (bench_optics(tracker, folder),)
+            if self._bayer is None
+            else bench_channels(tracker, folder)
+        )
         places = camera.grid_px(LATTICE)
         self._sr = camera.pixel_sr(*places)
         self._across, self._down = (linear_shares(size, LATTICE) for size in camera.resolution_px)
         pixel_sr = self._over_pixels(self._sr)
-        self.steady_e = in_pixels((background_e(config, optics, pixel_sr) for optics in channels), self._bayer)
+        self.steady_e = in_pixels(
+            (background_e(config, optics, pixel_sr) for optics in channels), self._bayer
+        )
         self._config, self._refuse, self._beyond = config, refuse, False
-        self._moving = None if moving is None or moving.air is None or not moving.air.glow_e_per_s_sr.any() else moving
+        self._moving = (
+            None
+            if moving is None or moving.air is None or not moving.air.glow_e_per_s_sr.any()
+            else moving
+        )
         self._lights: list[ZodiacalLight] = []
         if config.background.zodiacal is not None:
             self._lights = [ZodiacalLight.through(optics) for optics in channels]
@@ -546,10 +644,15 @@ def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> F
     level_e = np.full((height, width), background.electrons_per_px or 0.0)
     if background.zodiacal_v_mag_arcsec2 is not None:
         photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
-        rate = zodiacal_electrons_per_s_arcsec2(background.zodiacal_v_mag_arcsec2, optics, photometry)
+        rate = zodiacal_electrons_per_s_arcsec2(
+            background.zodiacal_v_mag_arcsec2, optics, photometry
+        )
         level_e = rate * ARCSEC_PER_RAD**2 * tracker.exposure_s * pixel_sr
     across_e, down_e = background.gradient_electrons_across
-    ramp_e = across_e * np.linspace(-0.5, 0.5, width) + (down_e * np.linspace(-0.5, 0.5, height))[:, None]
+    ramp_e = (
+        across_e * np.linspace(-0.5, 0.5, width)
+        + (down_e * np.linspace(-0.5, 0.5, height))[:, None]
+    )
     total_e: FloatArray = level_e + ramp_e
     if total_e.min() < 0:
         raise InputError(

@@ -16,7 +16,13 @@ from hilstar.instruments.simulate.glass import told_psf
 from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.server.bench.frame import Bench
 from hilstar.tracker.centroiders import Centroider, psf_places, star_places
-from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars, squares
+from hilstar.tracker.centroids import (
+    Centroids,
+    CentroidSettings,
+    LocalBackground,
+    find_stars,
+    squares,
+)
 from hilstar.tracker.mosaic import software_psf_px
 
 USUAL: Centroider = "window"
@@ -105,13 +111,21 @@ class StarFinder:
         if kind == "window" or not len(stars):
             return matched
         index, reach = matched.index[stars], self.settings.radius_px
-        aside = (np.rint(seen[index] - true[stars]) for seen, true in zip((found.x_px, found.y_px), true_px, strict=True))
-        column, row = (np.rint(true[stars] + by).astype(np.intp) for true, by in zip(true_px, aside, strict=True))
+        aside = (
+            np.rint(seen[index] - true[stars])
+            for seen, true in zip((found.x_px, found.y_px), true_px, strict=True)
+        )
+        column, row = (
+            np.rint(true[stars] + by).astype(np.intp)
+            for true, by in zip(true_px, aside, strict=True)
+        )
         stamps = squares(image, level, column, row, reach)[0]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
         if kind == "psf" and self.told is not None:
-            dx_px, dy_px = psf_places(stamps, told_psf(self.told, (row, column), 2 * reach + 1), (dx_px, dy_px))
+            dx_px, dy_px = psf_places(
+                stamps, told_psf(self.told, (row, column), 2 * reach + 1), (dx_px, dy_px)
+            )
         x_px, y_px = found.x_px.copy(), found.y_px.copy()
         x_px[index], y_px[index] = column + dx_px, row + dy_px
         return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)
@@ -128,7 +142,9 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
     told = None
     if bench.config.verify.centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
-        told = bench.tracker_psf.blurred(float(np.sqrt(np.mean(_shown_px2(bench, monitor_px_per_px)))))
+        told = bench.tracker_psf.blurred(
+            float(np.sqrt(np.mean(_shown_px2(bench, monitor_px_per_px))))
+        )
     return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL, told)
 
 
@@ -137,7 +153,9 @@ def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
     the tracker's own PSF.
     """
     spread = _shown_px2(bench, monitor_px_per_px)
-    x, y = (math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True))
+    x, y = (
+        math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True)
+    )
     return GaussianPsf(software_psf_px((x, y), bench.config.tracker.detector))
 
 
@@ -157,14 +175,18 @@ def faintest_e_per_s(bench: Bench) -> float:
 
 def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
     """For each place (n,) the star found nearest within MATCH_PX, -1 for none."""
-    place, seen, distance = neighbours(np.stack([x_px, y_px], axis=1), np.stack([found.x_px, found.y_px], axis=1), MATCH_PX)
+    place, seen, distance = neighbours(
+        np.stack([x_px, y_px], axis=1), np.stack([found.x_px, found.y_px], axis=1), MATCH_PX
+    )
     index = np.full(len(x_px), -1, dtype=np.intp)
     order = np.argsort(-distance, kind="stable")
     index[place[order]] = seen[order]  # the nearest is written last
     return index
 
 
-def neighbours(places: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, IntArray, FloatArray]:
+def neighbours(
+    places: FloatArray, others: FloatArray, within: float
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Pairs (m,) of places (n, 2) and others (k, 2) within a distance of each other, and it, by a
     sweep along x; none of NaN.
 
@@ -188,14 +210,22 @@ def shared(match: IntArray) -> npt.NDArray[np.bool_]:
     return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] > 1))
 
 
-def crowded(x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf) -> npt.NDArray[np.bool_]:
+def crowded(
+    x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf
+) -> npt.NDArray[np.bool_]:
     """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their
     own light.
     """
-    places, half, result = np.stack([x_px, y_px], axis=1), radius_px + 0.5, np.zeros(len(flux), dtype=np.bool_)
+    places, half, result = (
+        np.stack([x_px, y_px], axis=1),
+        radius_px + 0.5,
+        np.zeros(len(flux), dtype=np.bool_),
+    )
     a, b, _ = neighbours(places, places, math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px))
     a, b = a[a != b], b[a != b]
     offset = places[b] - np.rint(places[a])
-    share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(axis=1)
+    share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(
+        axis=1
+    )
     result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
     return result

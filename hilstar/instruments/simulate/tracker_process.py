@@ -20,7 +20,14 @@ import numpy as np
 from hilstar.attitude.wire.shown_frames import FrameWatch
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
-from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_matrix,
+    to_rotation_vector,
+)
 from hilstar.basics.running_statistics import RunningStatistics
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 from hilstar.instruments.simulate.live_exposure import LOST, TRACKING, LiveTracker, Solved
@@ -76,7 +83,9 @@ class PlantedErrors:
         of_field = np.array([np.sin(x), np.sin(y + 0.3), np.sin((x + y) / 1.7)])
         x, y = 2 * np.pi * place_px
         of_pixel = np.array([np.sin(x), np.sin(y), np.cos(x + 1)])
-        waves = math.sqrt(2) * (self._planted.fov_arcsec * of_field + self._planted.pixel_arcsec * of_pixel)
+        waves = math.sqrt(2) * (
+            self._planted.fov_arcsec * of_field + self._planted.pixel_arcsec * of_pixel
+        )
         error = np.array(self._planted.bias_arcsec) + waves * [1.0, 1.0, ROLL]
         return multiply(from_rotation_vector(error / ARCSEC_PER_RAD), q_icrs_to_cam), False
 
@@ -122,10 +131,21 @@ class TrackerTally:
     def summary(self) -> dict[str, Any]:
         """The keys of `hilstar tracker --json`."""
         off = np.array(self.errors_arcsec).reshape(-1, 3)
-        bias, sigma = (None, None) if not len(off) else (off.mean(axis=0).tolist(), off.std(axis=0).tolist())
-        counts = {name: getattr(self, name) for name in ("answers", "valid", "wrong", "passed_over")}
-        spread = {name: getattr(self, name).percentiles() for name in ("cpu_ms", "latency_ms", "stars")}
-        return counts | {"modes": dict(self.modes)} | spread | {"own_bias_arcsec": bias, "own_sigma_arcsec": sigma}
+        bias, sigma = (
+            (None, None) if not len(off) else (off.mean(axis=0).tolist(), off.std(axis=0).tolist())
+        )
+        counts = {
+            name: getattr(self, name) for name in ("answers", "valid", "wrong", "passed_over")
+        }
+        spread = {
+            name: getattr(self, name).percentiles() for name in ("cpu_ms", "latency_ms", "stars")
+        }
+        return (
+            counts
+            | {"modes": dict(self.modes)}
+            | spread
+            | {"own_bias_arcsec": bias, "own_sigma_arcsec": sigma}
+        )
 
 
 MAX_ERRORS = 100_000
@@ -137,7 +157,12 @@ class TrackerProcess:
     """
 
     def __init__(
-        self, tracker: LiveTracker, watch: FrameWatch, planted: Planted, rate_hz: float, rng: np.random.Generator
+        self,
+        tracker: LiveTracker,
+        watch: FrameWatch,
+        planted: Planted,
+        rate_hz: float,
+        rng: np.random.Generator,
     ) -> None:
         self.tally = TrackerTally()
         self._tracker, self._watch, self._planted = tracker, watch, planted
@@ -184,7 +209,11 @@ class TrackerProcess:
 
     def _await(self, end_ns: int, send: Send, stop: threading.Event) -> None:
         """Take frames until one was lit after an exposure's end, or none comes any more."""
-        while not stop.is_set() and self._tracker.frames.newest_ns < end_ns and self._host.now_ns() < end_ns + GRACE_NS:
+        while (
+            not stop.is_set()
+            and self._tracker.frames.newest_ns < end_ns
+            and self._host.now_ns() < end_ns + GRACE_NS
+        ):
             due_ns = min([end_ns + GRACE_NS, *(each[0] for each in self._waiting[:1])])
             self._take(min(SLICE_MS, max(1, math.ceil((due_ns - self._host.now_ns()) / NS_PER_MS))))
             self._put(send)
@@ -216,14 +245,21 @@ class TrackerProcess:
             raw=b"",
             t_ns=clock.of_host(middle_ns),
             q_icrs_to_cam=q,
-            rate_cam_rad_s=self._tracker.rate_cam_rad_s() if q is not None and solved.mode == TRACKING else None,
+            rate_cam_rad_s=self._tracker.rate_cam_rad_s()
+            if q is not None and solved.mode == TRACKING
+            else None,
             valid=q is not None,
             mode=solved.mode,
             star_count=stars,
-            rms_arcsec=None if solved.identified is None else solved.identified.rms_rad * ARCSEC_PER_RAD,
+            rms_arcsec=None
+            if solved.identified is None
+            else solved.identified.rms_rad * ARCSEC_PER_RAD,
             centroids=self._tracker.reported_stars(solved),
         )
-        heapq.heappush(self._waiting, (middle_ns + round(self._planted.latency_s * NS_PER_S), tally.answers, answer))
+        heapq.heappush(
+            self._waiting,
+            (middle_ns + round(self._planted.latency_s * NS_PER_S), tally.answers, answer),
+        )
 
     def _put(self, send: Send) -> None:
         while self._waiting and self._waiting[0][0] <= self._host.now_ns():

@@ -23,7 +23,12 @@ from hilstar.display.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.quantise import LitLight, Panel, lit_light, primary_levels
 from hilstar.display.response import Response, table_response
-from hilstar.instruments.simulate.optics import BenchGeometry, DisplayColours, TwinOptics, seen_primaries
+from hilstar.instruments.simulate.optics import (
+    BenchGeometry,
+    DisplayColours,
+    TwinOptics,
+    seen_primaries,
+)
 from hilstar.instruments.simulate.shutter import rolled, rolling_light
 from hilstar.instruments.simulate.simulator import TrackerBackground
 from hilstar.optics.camera import Camera
@@ -43,7 +48,11 @@ PHASES = 4  # frames of a sequence with which an exposure may begin
 
 
 def exposure_lights(
-    bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FaultLayer | None = None
+    bench: Bench,
+    frame: Frame,
+    first_frame: int,
+    panels: Sequence[Panel],
+    faults: FaultLayer | None = None,
 ) -> list[list[LitLight]]:
     """The mean light of each primary, electrons per second, of each panel over an exposure from
     frame `first_frame` on.
@@ -56,7 +65,10 @@ def exposure_lights(
     count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
     size = frame.levels.shape[:2]
-    total = [[np.zeros(size if len(exposed) > 1 else 0) for _ in panel.primaries or (panel,)] for panel in panels]
+    total = [
+        [np.zeros(size if len(exposed) > 1 else 0) for _ in panel.primaries or (panel,)]
+        for panel in panels
+    ]
     for number in range(exposed.stop):
         levels = frame.levels
         if number:
@@ -79,12 +91,21 @@ def true_panel(bench: Bench) -> Panel:
     white = verify.true_flux_at_white_e_per_s or bench.flux_at_white_e_per_s
     if verify.true_calibration is None:
         scale = white / bench.flux_at_white_e_per_s
-        parts = tuple(replace(one, flux_at_white_e_per_s=scale * one.flux_at_white_e_per_s) for one in bench.panel.primaries)
+        parts = tuple(
+            replace(one, flux_at_white_e_per_s=scale * one.flux_at_white_e_per_s)
+            for one in bench.panel.primaries
+        )
         return Panel(bench.calibration.response, white, bench.uniformity, parts)
-    true = true_calibration(bench, verify.true_calibration, bit_stealing=bench.config.render.bit_stealing)
+    true = true_calibration(
+        bench, verify.true_calibration, bit_stealing=bench.config.render.bit_stealing
+    )
     response = levels_of(bench.calibration.response, true.response)
     uniformity, colours = true.uniformity_map(bench.config.monitor.resolution_px), bench.colours
-    parts = () if colours is None else primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
+    parts = (
+        ()
+        if colours is None
+        else primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
+    )
     return Panel(response, white, uniformity, parts)
 
 
@@ -100,12 +121,16 @@ def levels_of(assumed: Response, true: Response) -> Response:
     """
     if assumed.rgb is None or true.rgb is None:
         return true
-    light = {tuple(triple): value for triple, value in zip(true.rgb.tolist(), true.light, strict=True)}
+    light = {
+        tuple(triple): value for triple, value in zip(true.rgb.tolist(), true.light, strict=True)
+    }
     known = np.array([light.get(tuple(triple), np.nan) for triple in assumed.rgb.tolist()])
     # A triple that the true monitor cannot tell from its neighbour has that one's light.
     places = np.arange(len(known))
     known = np.interp(places, places[np.isfinite(known)], known[np.isfinite(known)])
-    return Response(assumed.bits, known, table_response(assumed.bits, known).threshold, true.black, assumed.rgb)
+    return Response(
+        assumed.bits, known, table_response(assumed.bits, known).threshold, true.black, assumed.rgb
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +166,9 @@ class TwinField:
         rays = camera.rays(self.x_px, self.y_px)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         for direction, radius_rad in self.discs:
-            near |= rays @ direction > math.cos(min(radius_rad + margin_px / camera.focal_length_px, math.pi))
+            near |= rays @ direction > math.cos(
+                min(radius_rad + margin_px / camera.focal_length_px, math.pi)
+            )
         return near
 
 
@@ -163,13 +190,17 @@ class Twin(Closing):
         self.true_camera = true.monitor
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.true_optics = TwinOptics(true, self.bench.tracker_psf)
-        self.glow_e_per_s = self.assumed_glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self.glow_e_per_s = self.assumed_glow_e_per_s = self.true_optics.glow_e_per_s(
+            self.true_panel
+        )
         self.sky_optics = self.true_optics
         if self.differs:
             self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
             self.assumed_glow_e_per_s = self.sky_optics.glow_e_per_s(self.bench.panel)
         self.primaries, self._mosaic = seen_primaries(self.bench), DisplayColours.of(self.bench)
-        self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving)
+        self._background = TrackerBackground(
+            self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving
+        )
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the
@@ -185,31 +216,44 @@ class Twin(Closing):
         if view.scan.scanout_s and exposure_s:
             phase_s = self._phase_s(first_frame)
             seen = zip((self.true_optics, self.sky_optics), panels, strict=False)
-            parts = [rolling_light(self.bench, optics.geometry, panel, view, phase_s) for optics, panel in seen]
+            parts = [
+                rolling_light(self.bench, optics.geometry, panel, view, phase_s)
+                for optics, panel in seen
+            ]
             lights, glow_e = [light for light, _ in parts], glow_e * parts[0][1]
         else:
             lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
         pixels_e, bayer = self._mosaic.shown(by_primary), self._mosaic.bayer
-        sky = self._found_in(sum(skies[1:], start=skies[0]) if bayer is None else in_pixels(skies, bayer))
+        sky = self._found_in(
+            sum(skies[1:], start=skies[0]) if bayer is None else in_pixels(skies, bayer)
+        )
         shown = assumed = self._found_in(pixels_e)
         if self.differs:
             as_assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries) * exposure_s
             assumed = self._found_in(self._mosaic.shown(as_assumed))
         by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
         if (colours := self.bench.colours) is not None and not colours.mono:
-            by_channel = tuple(zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True))
+            by_channel = tuple(
+                zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True)
+            )
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs, under_e = self.bench.discs(view), glow_e + self._background.of_view_e(view)
         points = ~np.isin(frame.rows["name"], [disc.name for disc in discs])
-        x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
+        x_px, y_px = self.camera.project(
+            self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T
+        )
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
         truth = frame.rows[points]
         if bayer is not None and self.bench.stars.colours is not None:
             of_channels = shares_at(self.bench.stars.colours, self.bench.stars, frame.star[points])
-            truth["electrons_per_s"] *= of_channels @ [bayer.count(channel) / len(bayer) for channel in CHANNELS]
-        return TwinField(shown, assumed, sky, truth, x_px, y_px, pixels_e, found, under_e, by_channel)
+            truth["electrons_per_s"] *= of_channels @ [
+                bayer.count(channel) / len(bayer) for channel in CHANNELS
+            ]
+        return TwinField(
+            shown, assumed, sky, truth, x_px, y_px, pixels_e, found, under_e, by_channel
+        )
 
     def _found_in(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return software_image(pixels, self.config.tracker.detector)
@@ -232,11 +276,16 @@ class Twin(Closing):
         A frame transfer's smear is in these alone: in images without noise, sky and display would
         have the same.
         """
-        exposure_s, under_e = self.config.tracker.exposure_s, np.broadcast_to(seen.under_e, seen.pixels_e.shape)
+        exposure_s, under_e = (
+            self.config.tracker.exposure_s,
+            np.broadcast_to(seen.under_e, seen.pixels_e.shape),
+        )
         dn = self.detector.expose(seen.pixels_e + under_e, exposure_s, rng)
         collected_e = self.detector.collected_e(under_e, exposure_s)
         alike = collected_e.min() == collected_e.max()
-        return self._found_in(dn if alike else dn - collected_e / self.config.tracker.detector.gain_e_per_dn)
+        return self._found_in(
+            dn if alike else dn - collected_e / self.config.tracker.detector.gain_e_per_dn
+        )
 
     @property
     def monitor_px_per_px(self) -> float:
@@ -253,7 +302,9 @@ class Twin(Closing):
 def changed_keys(verify: Verify) -> list[str]:
     """The names of the keys of [verify] that are not at their defaults."""
     default = Verify()
-    return [name for name in verify.__struct_fields__ if getattr(verify, name) != getattr(default, name)]
+    return [
+        name for name in verify.__struct_fields__ if getattr(verify, name) != getattr(default, name)
+    ]
 
 
 def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
@@ -268,7 +319,11 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
     if verify.true_geometry is not None:
         camera = real_monitor(config, bench.file.folder, verify.true_geometry)
         return BenchGeometry(camera, tracker, verify.true_mirror)
-    if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (None, None, None):
+    if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (
+        None,
+        None,
+        None,
+    ):
         return BenchGeometry(bench.camera, tracker, verify.true_mirror)
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
     if abs(norm - 1) > NORM_TOLERANCE:

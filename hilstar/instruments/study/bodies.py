@@ -16,7 +16,18 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
+from hilstar.basics.charts import (
+    BLUE,
+    INK,
+    MUTED,
+    SERIES,
+    capital,
+    chart,
+    label_ends,
+    plain_ticks,
+    value_bars,
+    write_records,
+)
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
 from hilstar.display.render.backend import Target
@@ -90,7 +101,11 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
         (Path(folder) / "low.tle").write_text(TLE)
         benches = {}
         for name in names:
-            own = {key: table for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True) if table}
+            own = {
+                key: table
+                for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True)
+                if table
+            }
             path = Path(folder) / f"{name.replace(' ', '_')}.toml"
             benches[name] = stack.enter_context(study_bench(path, {**common, **own}))
         yield benches
@@ -102,14 +117,20 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
     """
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
-    disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body)
+    disc = next(
+        d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body
+    )
     off_rad = np.radians(off_deg) + (disc.radius_rad if body == "Earth" else 0.0)
     # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
-    beside = disc.sun if body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
+    beside = (
+        disc.sun if body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
+    )
     beside = beside - (beside @ disc.direction) * disc.direction
     beside /= np.linalg.norm(beside)
     x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
-    return from_radec_roll_deg(float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arcsin(z))), 0.0)
+    return from_radec_roll_deg(
+        float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arcsin(z))), 0.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,15 +204,22 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     return BodyCost(scene.name, shown.wall_ms, without.wall_ms, *cost, discs, stars)
 
 
-def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int) -> tuple[Spent, Spent]:
+def fastest(
+    benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int
+) -> tuple[Spent, Spent]:
     """The fastest frame, from attitude to levels in memory, of a bench without bodies and of one
     with, timed in turn.
 
     The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
     """
     nothing, bench = benches
-    works = {"nothing": lambda _: nothing.draw(q).levels, "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels}
-    without, shown = (Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values())
+    works = {
+        "nothing": lambda _: nothing.draw(q).levels,
+        "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels,
+    }
+    without, shown = (
+        Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values()
+    )
     return without, shown
 
 
@@ -223,7 +251,18 @@ def moon(radius_px: float, phase_deg: float) -> Disc:
     phase = np.radians(phase_deg)
     sun = -np.cos(phase) * ahead + np.sin(phase) * side
     far = 1 / np.sin(radius_px / FOCAL_PX)
-    disc = Disc("Moon", ahead, far, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), sun, "lunar-lambert", 1.0, lunar_share(phase_deg))
+    disc = Disc(
+        "Moon",
+        ahead,
+        far,
+        1.0,
+        1.0,
+        np.array([0.0, 1.0, 0.0]),
+        sun,
+        "lunar-lambert",
+        1.0,
+        lunar_share(phase_deg),
+    )
     return disc.of_rate(1e6)
 
 
@@ -237,7 +276,9 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
     camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
     with Renderer(Target(size, psf)) as renderer:
         place = camera.project(disc.direction[None])
-        point = pack_sprites(*place, np.array([1e6]), np.zeros(1, dtype=np.intp), size, renderer.footprint_px)
+        point = pack_sprites(
+            *place, np.array([1e6]), np.zeros(1, dtype=np.intp), size, renderer.footprint_px
+        )
         lights = disc_lights(disc, DiscView(camera, psf, (Pose(np.eye(3)),)), covers=True)
         renderer.draw(replace(join_sprites([], renderer.footprint_px), extended=tuple(lights)))
         drawn = renderer.linear().astype(np.float64)
@@ -246,13 +287,19 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
     truth = traced(disc, camera)
     limb = np.nan
     if radius_px >= LIMB_PX and phase_deg <= 90:
-        limb = float(np.nanmax(np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))))
+        limb = float(
+            np.nanmax(
+                np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))
+            )
+        )
     return Exactness(
         body=disc.name,
         phase_deg=phase_deg,
         radius_px=radius_px,
         flux_off=float(drawn.sum() / truth.sum() - 1),
-        middle_off_px=float(np.abs(np.subtract(center_of_mass(drawn), center_of_mass(truth))).max()),
+        middle_off_px=float(
+            np.abs(np.subtract(center_of_mass(drawn), center_of_mass(truth))).max()
+        ),
         limb_off_px=limb,
         pixel_off=float(np.abs(drawn - truth).max() / truth.max()),
         point_pixel_off=float(np.abs(as_point - truth).max() / truth.max()),
@@ -276,8 +323,12 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
     # The solid angle of a square of the image plane: the cube of the ray's cosine to the axis
     light = disc.radiance(rays) * (step_px / camera.focal_length_px) ** 2 * rays[:, 2] ** 3
     width, height = camera.resolution_px
-    across = np.diff(ndtr((np.arange(width + 1) - 0.5 - (x_mid + along)[:, None]) / SIGMA_PX[0]), axis=1)
-    down = np.diff(ndtr((np.arange(height + 1) - 0.5 - (y_mid + along)[:, None]) / SIGMA_PX[1]), axis=1)
+    across = np.diff(
+        ndtr((np.arange(width + 1) - 0.5 - (x_mid + along)[:, None]) / SIGMA_PX[0]), axis=1
+    )
+    down = np.diff(
+        ndtr((np.arange(height + 1) - 0.5 - (y_mid + along)[:, None]) / SIGMA_PX[1]), axis=1
+    )
     return np.asarray(down.T @ light.reshape(count, count) @ across)
 
 
@@ -364,7 +415,11 @@ def run(directory: Path, quick: bool = False) -> Judged:
             for off_deg in angles
         ]
     load = others.load()
-    sizes = [exactness(radius, phase) for phase in PHASES_DEG for radius in (QUICK_RADII_PX if quick else RADII_PX)]
+    sizes = [
+        exactness(radius, phase)
+        for phase in PHASES_DEG
+        for radius in (QUICK_RADII_PX if quick else RADII_PX)
+    ]
     for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
         write_records(directory / f"{name}.csv", records)
     cost_line = draw_costs(directory / "bodies_cost", costs, load)
@@ -409,7 +464,12 @@ def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
     )
     title = load.title(finding, "Bodies of each kind on top of a frame")
     with chart(path, title, note=load.note(note), height_inch=4.4) as (axes,):
-        value_bars(axes, [capital(cost.scene) for cost in costs], [round(max(cost.cpu_ms, 0.0), 2) for cost in costs], BLUE)
+        value_bars(
+            axes,
+            [capital(cost.scene) for cost in costs],
+            [round(max(cost.cpu_ms, 0.0), 2) for cost in costs],
+            BLUE,
+        )
         axes.set_xlabel("processor time on top [ms]")
     return (
         f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time a frame, and all of them"
@@ -435,9 +495,13 @@ def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
                 values = [max(abs(getattr(size, name)), FLOOR) for size in rows]
                 axes.loglog(radius, values, style, color=colour, ms=4, label=shown)
         light.set(title="Light of the whole disc", ylabel="error [share]")
-        place.set(title="Place of its limb (squares, solid) and of its middle (dotted)", ylabel="error [px]")
+        place.set(
+            title="Place of its limb (squares, solid) and of its middle (dotted)",
+            ylabel="error [px]",
+        )
         pixel.set(
-            title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)", ylabel="error [of the brightest]"
+            title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
+            ylabel="error [of the brightest]",
         )
         pixel.axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label="_")
         for axes, limit in ((light, FLUX_LIMIT), (place, LIMB_LIMIT_PX)):
@@ -455,9 +519,20 @@ def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
         for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):
             rows = [near for near in nears if near.body == body]
             off_deg = [near.off_deg for near in rows]
-            times.plot(off_deg, [near.cpu_ms for near in rows], "o-", ms=4, color=colour, label=body)
-            light.plot(off_deg, [near.over_white_mag for near in rows], "o-", ms=4, color=colour, label=body)
-        times.axhline(1e3 / REFRESH_HZ, color=INK, linestyle="--", lw=1.2, label=f"{REFRESH_HZ:g} Hz")
+            times.plot(
+                off_deg, [near.cpu_ms for near in rows], "o-", ms=4, color=colour, label=body
+            )
+            light.plot(
+                off_deg,
+                [near.over_white_mag for near in rows],
+                "o-",
+                ms=4,
+                color=colour,
+                label=body,
+            )
+        times.axhline(
+            1e3 / REFRESH_HZ, color=INK, linestyle="--", lw=1.2, label=f"{REFRESH_HZ:g} Hz"
+        )
         light.axhline(0, color=INK, linestyle="--", lw=1.2, label="white")
         times.set_ylim(bottom=0)
         times.set_ylabel("processor time of a frame [ms]")

@@ -9,13 +9,38 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, TEAL, chart, label_ends, plain_ticks, write_records
+from hilstar.basics.charts import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    TEAL,
+    chart,
+    label_ends,
+    plain_ticks,
+    write_records,
+)
 from hilstar.basics.units import flux_ratio
 from hilstar.display.balance import AS_USUAL, Balance
-from hilstar.display.phases import USUAL_PSF, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.display.phases import (
+    USUAL_PSF,
+    WHITE,
+    fainter,
+    line_places,
+    phase_grid,
+    phase_image,
+    shown_by,
+)
 from hilstar.display.quantise import EXPOSURE_FRAMES, Panel, dither_levels, mask_turn, shown_light
 from hilstar.display.quantisers import Quantisation
-from hilstar.display.response import Response, Weights, bit_stealing_response, gamma_response, srgb_response, table_response
+from hilstar.display.response import (
+    Response,
+    Weights,
+    bit_stealing_response,
+    gamma_response,
+    srgb_response,
+    table_response,
+)
 from hilstar.display.temporal import TemporalQuantiser
 from hilstar.optics.sprites import Sprites, pack_sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
@@ -92,7 +117,9 @@ def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
     """
     sprites, tile = phase_grid(phases, USUAL_PSF)
     bright = phase_image(sprites, USUAL_PSF)
-    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    judge = Judge(
+        bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px
+    )
     return sprites, tile, bright, judge
 
 
@@ -105,7 +132,9 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
     errors = []
     for mag in mags:
         wanted, share = fainter(sprites, mag), flux_ratio(mag)
-        shown = shown_by(way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance)
+        shown = shown_by(
+            way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
+        )
         errors.append(judge.errors(shown, share))
     return errors
 
@@ -162,11 +191,15 @@ def study_frames(directory: Path, quick: bool) -> str:
     write_records(directory / "over_frames.csv", left)
     draw(directory / "over_frames", left)
     at = (row for row in left if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
-    each = "; ".join(f"{row.panel} {row.flux_rms_mag:.2g} mag, {row.axis_rms_px_fit:.2g} px" for row in at)
+    each = "; ".join(
+        f"{row.panel} {row.flux_rms_mag:.2g} mag, {row.axis_rms_px_fit:.2g} px" for row in at
+    )
     return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {each}"
 
 
-def _left_by(name: str, response: Response, mag: float, phases: int, counts: tuple[int, ...]) -> Iterator[OverFrames]:
+def _left_by(
+    name: str, response: Response, mag: float, phases: int, counts: tuple[int, ...]
+) -> Iterator[OverFrames]:
     panel, share = Panel(response, WHITE), flux_ratio(mag)
     sprites, tile, bright, judge = judged_phases(phases)
     stars, linear = fainter(sprites, mag), (share * bright).astype(np.float32)
@@ -177,7 +210,11 @@ def _left_by(name: str, response: Response, mag: float, phases: int, counts: tup
         # light up to the end of each frame
         whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))
         for frame in range(len(whole) - 1):
-            levels = quantiser.levels(stars) if method == "temporal" else dither_levels(linear, panel, mask_turn(frame))
+            levels = (
+                quantiser.levels(stars)
+                if method == "temporal"
+                else dither_levels(linear, panel, mask_turn(frame))
+            )
             whole[frame + 1] = whole[frame] + shown_light(levels, panel)
 
         def until(refreshes: float, whole: FloatArray = whole) -> FloatArray:
@@ -185,7 +222,10 @@ def _left_by(name: str, response: Response, mag: float, phases: int, counts: tup
             return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
 
         for count in counts:
-            errors = [judge.errors((until(begin + count) - until(begin)) / count, share, kinds) for begin in BEGINS]
+            errors = [
+                judge.errors((until(begin + count) - until(begin)) / count, share, kinds)
+                for begin in BEGINS
+            ]
             each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors]
             rms = np.sqrt(np.mean(np.square(each), axis=0)).tolist()
             yield OverFrames(name, mag, steps, method, count, *rms)
@@ -194,7 +234,11 @@ def _left_by(name: str, response: Response, mag: float, phases: int, counts: tup
 def draw(path: Path, left: list[OverFrames]) -> None:
     """What is left over the frames of an exposure, each panel in its colour."""
     names = list(dict.fromkeys(row.panel for row in left))
-    at = {row.panel: row.axis_rms_px_fit for row in left if row.frames == AIM_FRAMES and row.method == "temporal"}
+    at = {
+        row.panel: row.axis_rms_px_fit
+        for row in left
+        if row.frames == AIM_FRAMES and row.method == "temporal"
+    }
     finding = (
         f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on {names[0]},"
         f" and within {at[names[-1]]:.2g} px on {names[-1]}"
@@ -206,10 +250,20 @@ def draw(path: Path, left: list[OverFrames]) -> None:
                 rows = [row for row in left if (row.panel, row.method) == (name, method)]
                 frames = [row.frames for row in rows]
                 steps = f"{rows[0].steps:.{1 if rows[0].steps < 100 else 0}f}"
-                for axes, error, label in ((flux, "flux_rms_mag", f"{name}: {steps} steps"), (place, "axis_rms_px_fit", name)):
+                for axes, error, label in (
+                    (flux, "flux_rms_mag", f"{name}: {steps} steps"),
+                    (place, "axis_rms_px_fit", name),
+                ):
                     errors = np.array([getattr(row, error) for row in rows])
                     values = np.where(np.isfinite(errors), errors, np.nan)
-                    axes.loglog(frames, values, style, color=colour, ms=4, label=label if method == "temporal" else "_")
+                    axes.loglog(
+                        frames,
+                        values,
+                        style,
+                        color=colour,
+                        ms=4,
+                        label=label if method == "temporal" else "_",
+                    )
         flux.set_ylabel("flux error, rms [mag]")
         place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
         plain_ticks(place.xaxis, sorted({row.frames for row in left}))

@@ -27,7 +27,13 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import magnitude
 from hilstar.display.response import Levels, srgb_response
 from hilstar.instruments.simulate.budget import RED_NM, SOLAR_BV
-from hilstar.instruments.study.settings import GLASS, Isolation, bench_text, centroid_px, lone_windows
+from hilstar.instruments.study.settings import (
+    GLASS,
+    Isolation,
+    bench_text,
+    centroid_px,
+    lone_windows,
+)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, in_turn
 from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
 from hilstar.optics.psf import GaussianPsf
@@ -65,14 +71,26 @@ PANELS: dict[str, tuple[Lobes, ...]] = {
 SENSORS: dict[str, tuple[Lobes, ...]] = {
     "Bayer, infrared cut": (((600, 45, 0.75),), ((530, 45, 0.85),), ((460, 35, 0.7),)),
     "Bayer, wide dyes": (((620, 80, 0.6),), ((540, 80, 0.7),), ((460, 70, 0.6),)),
-    "Bayer, no cut": (((610, 50, 0.6), (850, 90, 0.3)), ((535, 50, 0.7), (850, 80, 0.3)), ((460, 40, 0.6), (850, 75, 0.3))),
+    "Bayer, no cut": (
+        ((610, 50, 0.6), (850, 90, 0.3)),
+        ((535, 50, 0.7), (850, 80, 0.3)),
+        ((460, 40, 0.6), (850, 75, 0.3)),
+    ),
 }
 # Mono sensors, the quantum efficiency of each: one that no light from CUT_NM on reaches is as any
 # panel has light for it.
 CUT_NM = 700.0
 MONO_SENSOR = "ccd47-20"
-MONO = {"ccd47-20": "ccd47-20", "kai-4021": "kai-4021", "ccd47-20 to 700 nm": "ccd47-20 to 700 nm.csv"}
-TRACKERS = {"mono": MONO_SENSOR, "Bayer": "Bayer, wide dyes", "mono to 700 nm": f"{MONO_SENSOR} to {CUT_NM:g} nm"}
+MONO = {
+    "ccd47-20": "ccd47-20",
+    "kai-4021": "kai-4021",
+    "ccd47-20 to 700 nm": "ccd47-20 to 700 nm.csv",
+}
+TRACKERS = {
+    "mono": MONO_SENSOR,
+    "Bayer": "Bayer, wide dyes",
+    "mono to 700 nm": f"{MONO_SENSOR} to {CUT_NM:g} nm",
+}
 MARKERS = {"mono": "o", "Bayer": "s", "mono to 700 nm": "^"}
 INKS = {"white": MUTED, "star": BLUE, "depth": ORANGE}
 FRAME_PX = (800, 600)
@@ -86,13 +104,35 @@ SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12
 Row = tuple[str | float, ...]
 # Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean
 # wavelength, and subtypes.
-GAMUT = ("panel", "sensor", "condition", "out_share", "off_median", "off_95", "off_percent_k", "subtypes", "subtypes_white")
+GAMUT = (
+    "panel",
+    "sensor",
+    "condition",
+    "out_share",
+    "off_median",
+    "off_95",
+    "off_percent_k",
+    "subtypes",
+    "subtypes_white",
+)
 # The same of a mono sensor by spectral class: stars to V = 7, their mean wavelength and how far it
 # is off, and subtypes.
 BY_CLASS = ("panel", "sensor", "class", "stars", "mean_nm", "off_nm", "subtypes", "subtypes_white")
 # Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's
 # light [%] and place; time.
-CHOICE = ("tracker", "colour", "method", "stars", "wall_ms", "cpu_ms", "subtypes", "off_percent_k", "mag", "channel", "px")
+CHOICE = (
+    "tracker",
+    "colour",
+    "method",
+    "stars",
+    "wall_ms",
+    "cpu_ms",
+    "subtypes",
+    "off_percent_k",
+    "mag",
+    "channel",
+    "px",
+)
 # Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1
 # px for 100 nm of the mean.
 LATERAL = ("lens", "panel", "colour", "sky_px", "off_px", "off_share")
@@ -102,24 +142,38 @@ PLACES = ("sigma_px", "temperature_k", "image", "rms_px", "max_px")
 
 def curve_of(lobes: Lobes) -> FloatArray:
     """A sum of Gaussians at NM."""
-    return np.asarray(sum(height * np.exp(-(((NM - peak) / wide) ** 2)) for peak, wide, height in lobes))
+    return np.asarray(
+        sum(height * np.exp(-(((NM - peak) / wide) ** 2)) for peak, wide, height in lobes)
+    )
 
 
 def write_spectra(folder: Path) -> None:
     """Primaries and quantum efficiencies as the files that benches name."""
     for name, three in PANELS.items():
-        rows = [",".join(f"{x:.6g}" for x in row) for row in zip(NM, *map(curve_of, three), strict=True)]
+        rows = [
+            ",".join(f"{x:.6g}" for x in row) for row in zip(NM, *map(curve_of, three), strict=True)
+        ]
         (folder / f"{name}.csv").write_text("\n".join(["wavelength_nm,r,g,b", *rows]))
     for name, three in SENSORS.items():
         for one, lobes in zip(CHANNELS, three, strict=True):
-            lines = ["wavelength_nm,value", *(f"{nm:g},{value:.6g}" for nm, value in zip(NM, curve_of(lobes), strict=True))]
+            lines = [
+                "wavelength_nm,value",
+                *(f"{nm:g},{value:.6g}" for nm, value in zip(NM, curve_of(lobes), strict=True)),
+            ]
             (folder / f"{name} {one}.csv").write_text("\n".join(lines))
     whole = load_curve(MONO_SENSOR, "quantum_efficiency")
-    cut = (f"{nm:g},{value:.6g}" for nm, value in zip(NM[CUT_NM > NM], whole(NM[CUT_NM > NM]), strict=True))
-    (folder / MONO[f"{MONO_SENSOR} to {CUT_NM:g} nm"]).write_text("\n".join(["wavelength_nm,value", *cut]))
+    cut = (
+        f"{nm:g},{value:.6g}"
+        for nm, value in zip(NM[CUT_NM > NM], whole(NM[CUT_NM > NM]), strict=True)
+    )
+    (folder / MONO[f"{MONO_SENSOR} to {CUT_NM:g} nm"]).write_text(
+        "\n".join(["wavelength_nm,value", *cut])
+    )
 
 
-def file_of(folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float) -> BenchFile:
+def file_of(
+    folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float
+) -> BenchFile:
     """The bench of a panel with vertical stripes and a sensor, in the folder of the spectra."""
     three = {f"quantum_efficiency_{one}": f"{sensor} {one}.csv" for one in CHANNELS}
     own = {"quantum_efficiency": MONO[sensor]} if sensor in MONO else three
@@ -135,7 +189,9 @@ def file_of(folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, 
         }
     )
     path = folder / "bench.toml"
-    path.write_text(text if sensor in MONO else text.replace('quantum_efficiency = "ccd47-20"\n', ""))
+    path.write_text(
+        text if sensor in MONO else text.replace('quantum_efficiency = "ccd47-20"\n', "")
+    )
     return read_bench_file(path)
 
 
@@ -149,7 +205,9 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
     kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
     order, nm = np.flatnonzero(kinds[:, 1] == CLASSES["V"]), library.wavelength_nm
     order = order[np.argsort(kinds[order, 0])]
-    seen = np.array([one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()])
+    seen = np.array(
+        [one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()]
+    )
     light = library.flux[order] @ seen.T
     colour = light if len(seen) > 1 else library.flux[order] @ (seen * nm).T / light
     index = np.maximum.accumulate(-warmth(colour))
@@ -169,18 +227,30 @@ def study_gamut(folder: Path, by_class: list[Row]) -> Iterator[Row]:
     for panel, sensor in product(PANELS, (*MONO, *SENSORS)):
         file = file_of(folder, panel, sensor)
         stars = bench_stars(file.config, folder)
-        colours, subtypes = colours_of(file, stars), subtypes_by(named_channels(file.config.tracker, folder))
+        colours, subtypes = (
+            colours_of(file, stars),
+            subtypes_by(named_channels(file.config.tracker, folder)),
+        )
         wanted = colours.wanted(stars)
         shares, own = colours.shares(wanted), subtypes(wanted[:, : 1 if colours.mono else 3])
-        off, warmer = colours.off(wanted, shares), np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
-        by_star, by_white = (np.abs(subtypes(colours.shown(one)) - own) for one in (shares, colours.of_white[None]))
+        off, warmer = (
+            colours.off(wanted, shares),
+            np.abs(colours.temperature_factor(wanted, shares) - 1).mean(),
+        )
+        by_star, by_white = (
+            np.abs(subtypes(colours.shown(one)) - own) for one in (shares, colours.of_white[None])
+        )
         out, condition = (~colours.in_gamut(off)).mean(), colours.matrix.condition or math.nan
         at_off, kinds = np.percentile(off, (50, 95)), np.floor(star_types(stars.catalog)[:, 0] / 10)
         for number, letter in enumerate(LETTERS if colours.mono else ""):
             some = np.flatnonzero(kinds[stars.row] == number)
             figures = (float(one[some].mean()) for one in (wanted[:, 0], off, by_star, by_white))
             by_class.append((panel, sensor, letter, len(some), *figures))
-        yield (panel, sensor, *map(float, (condition, out, *at_off, 100 * warmer, by_star.mean(), by_white.mean())))
+        yield (
+            panel,
+            sensor,
+            *map(float, (condition, out, *at_off, 100 * warmer, by_star.mean(), by_white.mean())),
+        )
 
 
 def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[FloatArray, ...]]:
@@ -188,22 +258,45 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[F
     wanted (1,), and place off (2,).
     """
     light, rgb = srgb_response(bench.config.monitor.bits).light, bench.calibration.response.rgb
-    white, stars, rng = colours.of_white * bench.flux_at_white_e_per_s, bench.shown_stars, np.random.default_rng(1)
+    white, stars, rng = (
+        colours.of_white * bench.flux_at_white_e_per_s,
+        bench.shown_stars,
+        np.random.default_rng(1),
+    )
     for _ in range(fields):
-        q = from_radec_roll_deg(rng.uniform(0, 360), math.degrees(math.asin(rng.uniform(-1, 1))), 0.0)
+        q = from_radec_roll_deg(
+            rng.uniform(0, 360), math.degrees(math.asin(rng.uniform(-1, 1))), 0.0
+        )
         levels, sprites = bench.draw(q).levels, bench.sprites(q, stars)
-        codes = levels if levels.ndim == 3 else np.repeat(levels[..., None], 3, axis=2) if rgb is None else rgb[levels]
+        codes = (
+            levels
+            if levels.ndim == 3
+            else np.repeat(levels[..., None], 3, axis=2)
+            if rgb is None
+            else rgb[levels]
+        )
         images = light[codes] * white
         for number, window in lone_windows(sprites, sprites.x_px, sprites.y_px, FRAME_PX, LONE):
             by_primary = images[window].sum(axis=(0, 1))
             if not (BRIGHTEST_V_MAG < stars.v_mag[number] < FAINTEST_V_MAG and by_primary.any()):
                 continue
-            row, rate = int(np.flatnonzero(sprites.star == number)[0]), float(stars.electrons_per_s[number])
-            middles = np.nan_to_num([centroid_px(images[..., k], window) for k in range(3)]) + colours.places_px
+            row, rate = (
+                int(np.flatnonzero(sprites.star == number)[0]),
+                float(stars.electrons_per_s[number]),
+            )
+            middles = (
+                np.nan_to_num([centroid_px(images[..., k], window) for k in range(3)])
+                + colours.places_px
+            )
             place = by_primary @ middles / by_primary.sum()
             share = by_primary / (by_primary.sum() if colours.mono else rate)
             place -= sprites.x_px[row], sprites.y_px[row]
-            yield colours.wanted(stars, np.array([number]))[0], share, by_primary.sum(keepdims=True) / rate, place
+            yield (
+                colours.wanted(stars, np.array([number]))[0],
+                share,
+                by_primary.sum(keepdims=True) / rate,
+                place,
+            )
 
 
 def frame_of(bench: Bench, number: int) -> Levels:
@@ -211,19 +304,30 @@ def frame_of(bench: Bench, number: int) -> Levels:
     return bench.draw(from_radec_roll_deg(84.0 + number, 0.0, 0.0)).levels
 
 
-def study_choices(folder: Path, trackers: Mapping[str, str], fields: int, rounds: int) -> Iterator[Row]:
+def study_choices(
+    folder: Path, trackers: Mapping[str, str], fields: int, rounds: int
+) -> Iterator[Row]:
     """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn:
     rows of CHOICE.
     """
     for tracker, sensor in trackers.items():
         with ExitStack() as stack:
             benches = {
-                key: stack.enter_context(open_bench(file_of(folder, "sRGB LCD", sensor, colour=key[0], quantisation=key[1])))
+                key: stack.enter_context(
+                    open_bench(
+                        file_of(folder, "sRGB LCD", sensor, colour=key[0], quantisation=key[1])
+                    )
+                )
                 for key in product(INKS, ("round", "exact"))
             }
             own = benches["star", "exact"]
-            colours, subtypes = colours_of(own.file, own.stars), subtypes_by(named_channels(own.config.tracker, folder))
-            times = in_turn({" ".join(key): partial(frame_of, bench) for key, bench in benches.items()}, rounds)
+            colours, subtypes = (
+                colours_of(own.file, own.stars),
+                subtypes_by(named_channels(own.config.tracker, folder)),
+            )
+            times = in_turn(
+                {" ".join(key): partial(frame_of, bench) for key, bench in benches.items()}, rounds
+            )
             for key, bench in benches.items():
                 stars = zip(*shown_stars(bench, colours, fields), strict=True)
                 wanted, shares, flux, off = (np.array(part) for part in stars)
@@ -245,7 +349,9 @@ def study_lateral(folder: Path) -> Iterator[Row]:
     A panel whose primaries its filter does not all pass has no row.
     """
     planar = read_bench_file(resource_path("configs", "planar-1897.toml")).config.tracker
-    tracker = replace_keys(planar, optics=TrackerOptics(psf=str(resource_path("configs", "planar-1897.fits"))))
+    tracker = replace_keys(
+        planar, optics=TrackerOptics(psf=str(resource_path("configs", "planar-1897.fits")))
+    )
     psf, (width, height) = tracker_psf(tracker, folder), tracker.resolution_px
     if not isinstance(psf, GlassPsf):
         raise AssertionError("the file has a glass")
@@ -258,22 +364,34 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         except InputError:
             continue
         by_primary = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
-        own, wanted = StarGlass(file, psf).shares(stars, np.arange(len(stars))), colours.wanted(stars)
+        own, wanted = (
+            StarGlass(file, psf).shares(stars, np.arange(len(stars))),
+            colours.wanted(stars),
+        )
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
-        places = np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
+        places = (
+            np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
+        )
         # as for a lens that is not known
         white, plain = colours.of_white + 0 * wanted[:, :1], replace(colours, lateral=None)
-        for colour, known, unknown in (("white", white, white), ("star", colours.shares(wanted), plain.shares(wanted))):
+        for colour, known, unknown in (
+            ("white", white, white),
+            ("star", colours.shares(wanted), plain.shares(wanted)),
+        ):
             glass = [moved_px(psf, places, one, solar) for one in (own, known @ by_primary)]
             means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], plain.shown(unknown))]
             for lens, (sky, shown) in (("planar-1897", glass), ("linear", means)):
-                sky_px, off_px = (float(np.sqrt((one**2).sum(axis=0).mean())) for one in (sky, shown - sky))
+                sky_px, off_px = (
+                    float(np.sqrt((one**2).sum(axis=0).mean())) for one in (sky, shown - sky)
+                )
                 yield lens, panel, colour, sky_px, off_px, off_px / sky_px
 
 
 def moved_px(psf: GlassPsf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
     """By how much spectra (n, L) move stars at places (2, n), px, against one of them there."""
-    found = [psf.centroids_px(places_px[0], places_px[1], one)[:2] for one in (spectra, spectra[against])]
+    found = [
+        psf.centroids_px(places_px[0], places_px[1], one)[:2] for one in (spectra, spectra[against])
+    ]
     return np.asarray(np.stack(found[0]) - np.stack(found[1]))
 
 
@@ -284,12 +402,25 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
     at = np.arange(TILE_PX)
     for sigma_px, kelvin in product(SIGMAS_PX, STARS_K):
         rates = [float(dgs_electrons_per_s(kelvin, one, Photometry())) for one in channels]
-        shares = GaussianPsf((sigma_px, sigma_px)).shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None])
-        stars = shares.reshape(PHASES, PHASES, TILE_PX, TILE_PX).swapaxes(1, 2).reshape((PHASES * TILE_PX,) * 2)
+        shares = GaussianPsf((sigma_px, sigma_px)).shares(
+            (at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]
+        )
+        stars = (
+            shares.reshape(PHASES, PHASES, TILE_PX, TILE_PX)
+            .swapaxes(1, 2)
+            .reshape((PHASES * TILE_PX,) * 2)
+        )
         raw = in_pixels([stars * rate / max(rates) for rate in rates], "rggb")
-        for name, image, spread_px in (("mosaic", raw, 0.0), ("superpixel", luminance(raw), SUPERPIXEL_VARIANCE_PX2)):
+        for name, image, spread_px in (
+            ("mosaic", raw, 0.0),
+            ("superpixel", luminance(raw), SUPERPIXEL_VARIANCE_PX2),
+        ):
             width_px = math.sqrt(sigma_px**2 + spread_px)
-            settings = CentroidSettings(window_sigma_px=max(1.0, width_px), psf_sigma_px=(width_px, width_px), minimum_pixels=2)
+            settings = CentroidSettings(
+                window_sigma_px=max(1.0, width_px),
+                psf_sigma_px=(width_px, width_px),
+                minimum_pixels=2,
+            )
             found = find_stars(image, settings, LocalBackground(0.0, 1e-3))
             tiles = np.stack([found.x_px // TILE_PX, found.y_px // TILE_PX]).astype(np.intp)
             # the brightest of a tile
@@ -303,14 +434,20 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
 def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
     """The chart of the choices; its finding."""
     choices = [dict(zip(CHOICE, row, strict=True)) for row in rows]
-    exact = {one["colour"]: one for one in choices if (one["tracker"], one["method"]) == ("Bayer", "exact")}
+    exact = {
+        one["colour"]: one
+        for one in choices
+        if (one["tracker"], one["method"]) == ("Bayer", "exact")
+    }
     star, white = exact["star"], exact["white"]
-    finding = (
-        f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker, white {white['subtypes']:.0f}"
-    )
+    finding = f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker, white {white['subtypes']:.0f}"
     note = "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone stars of"
     note += " V = 1 to 5.5 on an sRGB LCD of 8 bits."
-    labels = {"subtypes": "colour, mean\n[subtypes]", "mag": "flux, 95 %\n[mag]", "px": "place, 95 %\n[px]"}
+    labels = {
+        "subtypes": "colour, mean\n[subtypes]",
+        "mag": "flux, 95 %\n[mag]",
+        "px": "place, 95 %\n[px]",
+    }
     with chart(path, finding, 3, note=load.note(note)) as axes:
         for axis, (name, label) in zip(axes, labels.items(), strict=True):
             for one in choices:
@@ -320,7 +457,12 @@ def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
             axis.set_ylabel(label)
         for name, ink in INKS.items():
             axes[0].plot([], [], "o", color=ink, label=name)
-        axes[0].axhline(PUBLISHED_SUBTYPES, color=GREEN, linestyle=":", label=f"published, {PUBLISHED_SUBTYPES:g}")
+        axes[0].axhline(
+            PUBLISHED_SUBTYPES,
+            color=GREEN,
+            linestyle=":",
+            label=f"published, {PUBLISHED_SUBTYPES:g}",
+        )
         axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=4, frameon=False)
         axes[2].set_xlabel("frame, CPU time [ms]")
     return finding
@@ -337,15 +479,40 @@ def run(directory: Path, quick: bool = False) -> Judged:
         by_class: list[Row] = []
         gamut, lateral = list(study_gamut(folder, by_class)), list(study_lateral(folder))
         before = dict([*TRACKERS.items()][: 2 if quick else None])
-        choices = list(study_choices(folder, before, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))))
-        trackers = {sensor: file_of(folder, "OLED", sensor).config.tracker for sensor in (*MONO, *SENSORS)}
-        red = [(name, *class_shares(bench_optics(one, folder), RED_NM).values()) for name, one in trackers.items()]
+        choices = list(
+            study_choices(
+                folder, before, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))
+            )
+        )
+        trackers = {
+            sensor: file_of(folder, "OLED", sensor).config.tracker for sensor in (*MONO, *SENSORS)
+        }
+        red = [
+            (name, *class_shares(bench_optics(one, folder), RED_NM).values())
+            for name, one in trackers.items()
+        ]
         mosaic = list(study_mosaic(bench_channels(trackers["Bayer, wide dyes"], folder)))
-    three = (("", CHOICE, choices), ("_gamut", GAMUT, gamut), ("_class", BY_CLASS, by_class), ("_lateral", LATERAL, lateral))
-    for table, columns, rows in (*three, ("_red", ("sensor", *LETTERS), red), ("_mosaic", PLACES, mosaic)):
+    three = (
+        ("", CHOICE, choices),
+        ("_gamut", GAMUT, gamut),
+        ("_class", BY_CLASS, by_class),
+        ("_lateral", LATERAL, lateral),
+    )
+    for table, columns, rows in (
+        *three,
+        ("_red", ("sensor", *LETTERS), red),
+        ("_mosaic", PLACES, mosaic),
+    ):
         write_csv(directory / f"colour{table}.csv", columns, rows)
     load = others.load()
     lines = [draw(directory / "colour", choices, load)]
-    lines += [f"lateral colour of {lens} by {by} on {on}: off by {off:.0%} of the sky's" for lens, on, by, *_, off in lateral]
-    lines += [f"a star of {px:g} px, {k:g} K, is {rms:.3f} px off rms in a {name}" for px, k, name, rms, _ in mosaic if px == 1]
+    lines += [
+        f"lateral colour of {lens} by {by} on {on}: off by {off:.0%} of the sky's"
+        for lens, on, by, *_, off in lateral
+    ]
+    lines += [
+        f"a star of {px:g} px, {k:g} K, is {rms:.3f} px off rms in a {name}"
+        for px, k, name, rms, _ in mosaic
+        if px == 1
+    ]
     return load.judged(lines)

@@ -48,10 +48,14 @@ def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
 
     With `quick` no image is held out. Raises InputError where `images` has no cameras.
     """
-    cameras = sorted(folder.parent for folder in {*images.glob("guess.toml"), *images.glob("*/guess.toml")})
+    cameras = sorted(
+        folder.parent for folder in {*images.glob("guess.toml"), *images.glob("*/guess.toml")}
+    )
     if not cameras:
         raise InputError(f"{images}: has no guess.toml; give {FORM}")
-    found = [row for folder in cameras for row in confront_camera(folder, directory / folder.name, quick)]
+    found = [
+        row for folder in cameras for row in confront_camera(folder, directory / folder.name, quick)
+    ]
     write_records(directory / "confront.csv", found)
     draw(directory / "confront", found)
     return [line_of(row) for row in found]
@@ -68,9 +72,19 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
         try:
             fitted = confront(folder / "guess.toml", paths, output)
         except InputError as error:
-            wrong = next((path for path in paths if str(path) in str(error) or str(error).startswith(path.name)), None)
+            wrong = next(
+                (
+                    path
+                    for path in paths
+                    if str(path) in str(error) or str(error).startswith(path.name)
+                ),
+                None,
+            )
             why = re.sub(r"\S*/", "", str(error)).split(": ", 1)[-1]
-            refused += [PhotographFound(folder.name, one.name, refused=why) for one in ([wrong] if wrong else paths)]
+            refused += [
+                PhotographFound(folder.name, one.name, refused=why)
+                for one in ([wrong] if wrong else paths)
+            ]
             paths = [path for path in paths if wrong is not None and path != wrong]
     if fitted is None:
         return refused
@@ -98,7 +112,9 @@ def row_of(camera: str, found: Confronted, number: int) -> PhotographFound:
     )
 
 
-def held_out(row: PhotographFound, folder: Path, output: Path, paths: Sequence[Path]) -> PhotographFound:
+def held_out(
+    row: PhotographFound, folder: Path, output: Path, paths: Sequence[Path]
+) -> PhotographFound:
     """The row with what a camera of the other images leaves of this one."""
     own = next(path for path in paths if path.name == row.image)
     others, test = output / "held_out" / own.stem / "fit", output / "held_out" / own.stem / "test"
@@ -122,7 +138,11 @@ def line_of(row: PhotographFound) -> str:
         f" {row.background_chi2:.2f}, {row.unexplained} of {row.sources} sources unexplained, DN go as light to the power"
         f" {row.linearity:.2f}"
     )
-    return line if math.isnan(row.held_out_px) else f"{line}; held out {row.held_out_px:.3f} px, {row.held_out_mag:.3f} mag"
+    return (
+        line
+        if math.isnan(row.held_out_px)
+        else f"{line}; held out {row.held_out_px:.3f} px, {row.held_out_mag:.3f} mag"
+    )
 
 
 def draw(path: Path, found: Sequence[PhotographFound]) -> None:
@@ -135,12 +155,18 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     best, worst = min(row.rms_px for row in rows), max(row.rms_px for row in rows)
     of = f"{len(rows)} photograph{'s' * (len(rows) > 1)}"
     finding = f"{of}: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
-    note = "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
+    note = (
+        "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
+    )
     places = np.arange(len(rows))
-    with chart(path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)) as panels:
+    with chart(
+        path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)
+    ) as panels:
         for axes, kind, unit in zip(panels, ("px", "mag"), ("px an axis", "mag"), strict=True):
             axes.barh(places, [getattr(row, f"rms_{kind}") for row in rows], color=BLUE, height=0.6)
-            axes.plot([getattr(row, f"held_out_{kind}") for row in rows], places, "o", color=ORANGE, ms=5)
+            axes.plot(
+                [getattr(row, f"held_out_{kind}") for row in rows], places, "o", color=ORANGE, ms=5
+            )
             axes.set(xlabel=f"rms [{unit}]", xlim=(0, None))
             axes.set_yticks(places, [])
             axes.invert_yaxis()

@@ -180,9 +180,13 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
         benches = {}
         for name, keys in efforts.items():
             path = Path(folder) / f"{name}.toml"
-            benches[name] = stack.enter_context(study_bench(path, {**tables, "render": {**wanted, **keys}}))
+            benches[name] = stack.enter_context(
+                study_bench(path, {**tables, "render": {**wanted, **keys}})
+            )
         works = {
-            name: lambda k, bench=bench: bench.draw(turn.q_icrs_to_cam, k, turn.rate_cam_rad_s).levels
+            name: lambda k, bench=bench: (
+                bench.draw(turn.q_icrs_to_cam, k, turn.rate_cam_rad_s).levels
+            )
             for name, bench in benches.items()
         }
         times = in_turn(works, rounds)
@@ -207,7 +211,9 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, times: list[Spent]) ->
     seen = bench.renderer.target.seen
     lit, wanted = (squares(image, windows) for image in (shown, true))
     width_px = bench.psf.width_px
-    off_px = stamp_errors(lit, wanted, width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD)
+    off_px = stamp_errors(
+        lit, wanted, width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD
+    )
     return EffortOutcome(
         scene=scene.name,
         bits=bench.config.monitor.bits,
@@ -248,7 +254,11 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
     """
     found = []
     for bits in sorted({one.auto.bits for one in comparisons}):
-        mine = [one.speed_up for one in comparisons if (one.auto.bits, one.auto.tolerance) == (bits, DEFAULT.name)]
+        mine = [
+            one.speed_up
+            for one in comparisons
+            if (one.auto.bits, one.auto.tolerance) == (bits, DEFAULT.name)
+        ]
         if mine:
             found.append(f"{np.median(mine):.1f} at {bits}")
     slowest, quickest = (extreme(one.speed_up for one in comparisons) for extreme in (min, max))
@@ -268,9 +278,7 @@ def within_words(comparisons: list[EffortComparison]) -> str:
 
 def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
     """How much faster each scene is at what it needs, and its errors there, in tolerances."""
-    note = (
-        "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have no threshold. Tolerances: "
-    )
+    note = "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have no threshold. Tolerances: "
     note += "; ".join(f"{one.name}, {one.mag:g} mag and {one.px:g} px" for one in TOLERANCES) + "."
     title = load.title(economy_finding(comparisons), f"Auto effort is {within_words(comparisons)}")
     kinds = [(bits, tolerance) for bits in BITS for tolerance in TOLERANCES]
@@ -279,7 +287,11 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
         scenes = list(dict.fromkeys(one.auto.scene for one in comparisons))
         at = np.arange(len(scenes))
         for place, (bits, tolerance) in enumerate(kinds):
-            mine = [one for one in comparisons if (one.auto.bits, one.auto.tolerance) == (bits, tolerance.name)]
+            mine = [
+                one
+                for one in comparisons
+                if (one.auto.bits, one.auto.tolerance) == (bits, tolerance.name)
+            ]
             colour, alpha = COLOURS[bits], 1.0 if tolerance is DEFAULT else 0.5
             label = f"{bits} bits, {tolerance.name}"
             shift = (place - (len(kinds) - 1) / 2) * width
@@ -291,7 +303,9 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
                 color=colour,
                 alpha=alpha,
             )
-            error.bar(at + shift, [one.auto.share for one in mine], width, color=colour, alpha=alpha)
+            error.bar(
+                at + shift, [one.auto.share for one in mine], width, color=colour, alpha=alpha
+            )
         for axes, name in ((speed, "as fast as full effort"), (error, "tolerance")):
             axes.axhline(1.0, color=RED, linewidth=1, label=name)
             axes.grid(visible=False, axis="x")

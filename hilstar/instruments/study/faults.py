@@ -40,15 +40,28 @@ NOWHERE = "a scenario, nothing on"
 CASES: dict[str, list[dict[str, Any]]] = {
     NOWHERE: [],
     "false star, on the sky": [{"kind": "false-star", "radec_deg": [84.2, -1.0], "v_mag": 2.0}],
-    "false star, moving": [{"kind": "false-star", "tracker_px": [400, 500], "rate_px_s": [60, 10], "v_mag": 2.0}],
-    "64 false stars": [{"kind": "false-star", "radec_deg": [82 + k / 16, -3 + k / 16], "v_mag": 4.0} for k in range(64)],
+    "false star, moving": [
+        {"kind": "false-star", "tracker_px": [400, 500], "rate_px_s": [60, 10], "v_mag": 2.0}
+    ],
+    "64 false stars": [
+        {"kind": "false-star", "radec_deg": [82 + k / 16, -3 + k / 16], "v_mag": 4.0}
+        for k in range(64)
+    ],
     "star gone": [{"kind": "star-gone", "hip": 26311}],
     "flash at a star": [{"kind": "flash", "hip": 26727, "for_s": 10, "electrons": 1e5}],
-    "40 tracks of 12 px": [{"kind": "cosmic-rays", "number": 40, "electrons": 8000, "length_px": 12, "for_s": 10}],
-    "400 tracks of 25 px": [{"kind": "cosmic-rays", "number": 400, "electrons": 8000, "length_px": 25, "for_s": 10}],
+    "40 tracks of 12 px": [
+        {"kind": "cosmic-rays", "number": 40, "electrons": 8000, "length_px": 12, "for_s": 10}
+    ],
+    "400 tracks of 25 px": [
+        {"kind": "cosmic-rays", "number": 400, "electrons": 8000, "length_px": 25, "for_s": 10}
+    ],
     "gradient": [{"kind": "gradient", "electrons_per_s": 400}],
-    "glow, on the detector": [{"kind": "glow", "tracker_px": [-600, 200], "electrons_per_s": 3000, "scale_deg": 2}],
-    "glow, on the sky": [{"kind": "glow", "radec_deg": [84, 12], "electrons_per_s": 3000, "scale_deg": 2}],
+    "glow, on the detector": [
+        {"kind": "glow", "tracker_px": [-600, 200], "electrons_per_s": 3000, "scale_deg": 2}
+    ],
+    "glow, on the sky": [
+        {"kind": "glow", "radec_deg": [84, 12], "electrons_per_s": 3000, "scale_deg": 2}
+    ],
     "measured map": [{"kind": "light-map", "file": "stray.npy"}],
     "blank": [{"kind": "blank"}],
     "frozen": [{"kind": "freeze"}],
@@ -110,7 +123,9 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     def faulty(k: int) -> object:
         t_ns = round(k / REFRESH_HZ * NS_PER_S)
         schedule.at(t_ns)
-        effects = FaultLayer(view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1)))
+        effects = FaultLayer(
+            view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1))
+        )
         if any(isinstance(fault, Freeze) for fault in ready):
             return bench.renderer.levels()
         if effects.blank:
@@ -119,7 +134,13 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
         return bench.draw_sprites(bench.light(seen, effects if effects.now else None)).levels
 
     ms = medians_ms({"without": plain, "with": faulty}, rounds)
-    return FaultCost(bench.config.render.quantisation, case, ms["with"], ms["without"], ms["with"] - ms["without"])
+    return FaultCost(
+        bench.config.render.quantisation,
+        case,
+        ms["with"],
+        ms["without"],
+        ms["with"] - ms["without"],
+    )
 
 
 def stray_light(bench: Bench, share: float) -> Stray:
@@ -136,14 +157,23 @@ def stray_light(bench: Bench, share: float) -> Stray:
         for each in (sprites, join_sprites([], sprites.footprint_px))
     )
     off_mag = []
-    for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION):
+    for star, window in lone_windows(
+        sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION
+    ):
         wanted = float(sprites.data["electrons_per_s"][sprites.star == star].sum())
         got = float((both[window] - alone[window]).sum())
         off_mag.append(magnitude(got / wanted) if got > 0 else np.inf)
     errors = np.abs(np.array(off_mag))
     kept = np.where(np.isfinite(errors), errors, 99.0)
     median, p95 = np.percentile(kept, (50, 95)).tolist()
-    return Stray(bench.config.render.quantisation, share, len(kept), median, p95, float((kept > LOST_MAG).mean()))
+    return Stray(
+        bench.config.render.quantisation,
+        share,
+        len(kept),
+        median,
+        p95,
+        float((kept > LOST_MAG).mean()),
+    )
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
@@ -168,7 +198,11 @@ def run(directory: Path, quick: bool = False) -> Judged:
     found = []
     for quantisation in QUANTISATIONS:
         mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
-        off, star, dearest = mine[NOWHERE], mine["false star, on the sky"], max(mine.values(), key=lambda cost: cost.cost_ms)
+        off, star, dearest = (
+            mine[NOWHERE],
+            mine["false star, on the sky"],
+            max(mine.values(), key=lambda cost: cost.cost_ms),
+        )
         found.append(
             f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on takes {off.cost_ms:+.2f} ms, a"
             f" false star {star.cost_ms:+.2f} ms; the dearest, {dearest.case}, {dearest.cost_ms:+.1f} ms"
@@ -176,7 +210,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
     for quantisation in QUANTISATIONS:
         share = spoilt_from(strays, quantisation)
         limit = "no stray light here" if share is None else f"stray light of {share:g} of white"
-        found.append(f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on")
+        found.append(
+            f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on"
+        )
     return load.judged(found)
 
 
@@ -184,14 +220,22 @@ def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
     """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None
     where none spoils them.
     """
-    worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG]
+    worst = [
+        stray
+        for stray in strays
+        if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG
+    ]
     return min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
 
 
 def draw_stray(path: Path, strays: list[Stray]) -> None:
     """The error of stars under even stray light."""
     shares = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
-    said = [f"from {share:g} of white on with {name}" for name, share in shares.items() if share is not None]
+    said = [
+        f"from {share:g} of white on with {name}"
+        for name, share in shares.items()
+        if share is not None
+    ]
     finding = (
         f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(said)}"
         if said
@@ -201,30 +245,54 @@ def draw_stray(path: Path, strays: list[Stray]) -> None:
     with chart(path, finding, note=note) as (axes,):
         for name, colour in COLOURS.items():
             light = [one for one in strays if one.quantisation == name and one.share_of_white]
-            for error, style, label in (("p95_mag", "o-", f"{name}, 95 %"), ("median_mag", "o:", f"{name}, half")):
-                values = [getattr(one, error) if getattr(one, error) < DARK_MAG else np.nan for one in light]
-                axes.loglog([one.share_of_white for one in light], values, style, color=colour, label=label)
+            for error, style, label in (
+                ("p95_mag", "o-", f"{name}, 95 %"),
+                ("median_mag", "o:", f"{name}, half"),
+            ):
+                values = [
+                    getattr(one, error) if getattr(one, error) < DARK_MAG else np.nan
+                    for one in light
+                ]
+                axes.loglog(
+                    [one.share_of_white for one in light], values, style, color=colour, label=label
+                )
         axes.axhline(SPOILT_MAG, color=INK, ls="--", lw=1.2, label=f"{SPOILT_MAG:g} mag")
-        axes.set(xlabel="even stray light [share of white in a monitor pixel]", ylabel="error of stars' light [mag]")
+        axes.set(
+            xlabel="even stray light [share of white in a monitor pixel]",
+            ylabel="error of stars' light [mag]",
+        )
         label_ends(axes)
 
 
 def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
     """The time of a frame with each fault and without it."""
     dearest = max(costs, key=lambda cost: cost.frame_ms)
-    star = max((cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms)
+    star = max(
+        (cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms
+    )
     points = f"With false stars a frame takes at most {star.frame_ms:.1f} ms"
     finding = f"{points}, with the dearest fault, {dearest.case}, {dearest.frame_ms:.0f} ms"
     note = "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run. Medians; 1920 x 1080."
     title, note = load.title(finding, "Times of frames with each fault"), load.note(note)
-    with chart(path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2) as panels:
+    with chart(
+        path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2
+    ) as panels:
         for (name, colour), axes in zip(COLOURS.items(), panels, strict=True):
             mine = [cost for cost in costs if cost.quantisation == name]
             for place, cost in enumerate(mine):
                 axes.plot([cost.without_ms, cost.frame_ms], [place, place], color=MUTED, lw=1)
             places = range(len(mine))
-            axes.plot([cost.without_ms for cost in mine], places, "o", color=colour, mfc="none", label="without")
-            axes.plot([cost.frame_ms for cost in mine], places, "o", color=colour, label="with the fault")
+            axes.plot(
+                [cost.without_ms for cost in mine],
+                places,
+                "o",
+                color=colour,
+                mfc="none",
+                label="without",
+            )
+            axes.plot(
+                [cost.frame_ms for cost in mine], places, "o", color=colour, label="with the fault"
+            )
             axes.set(xscale="log", xlabel="time of a frame [ms]")
             axes.set_title(name, color=colour)
             axes.grid(visible=False, axis="y")

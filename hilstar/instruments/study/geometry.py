@@ -20,7 +20,16 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.calibration import matched
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots
-from hilstar.instruments.calibrate.geometric.fit import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal, fit, held_out
+from hilstar.instruments.calibrate.geometric.fit import (
+    BROWN_CONRADY,
+    PINHOLE,
+    RADIAL,
+    Geometry,
+    Model,
+    Nominal,
+    fit,
+    held_out,
+)
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.optics.camera import Camera
@@ -62,7 +71,12 @@ def observed_dots(
         dots = dots[rng.uniform(size=len(dots)) >= faults.lost]
         false = rng.poisson(faults.false * len(dots))
         x, y = (
-            np.concatenate([places[dots] + rng.normal(0, faults.noise_px, len(dots)), rng.uniform(0, size, false)])
+            np.concatenate(
+                [
+                    places[dots] + rng.normal(0, faults.noise_px, len(dots)),
+                    rng.uniform(0, size, false),
+                ]
+            )
             for places, size in ((x_px, width), (y_px, height))
         )
         found.append(np.stack([np.full(len(x), float(frame)), x, y]))
@@ -100,12 +114,19 @@ class TracedBench:
         vertex = np.array([*self.lens_shift_mm, self.to_lens_mm])
         ray = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ axes
         at = np.broadcast_to((-vertex) @ axes, ray.shape)
-        for radius, before, after, step in zip(RADII_MM, INDEX[:-1], INDEX[1:], (*THICKNESS_MM, 0.0), strict=True):
+        for radius, before, after, step in zip(
+            RADII_MM, INDEX[:-1], INDEX[1:], (*THICKNESS_MM, 0.0), strict=True
+        ):
             at, ray = _refracted(at, ray, radius * scale, before / after)
             at = at - np.array([0.0, 0.0, step * scale])
-        at, ray = (at + np.array([0.0, 0.0, sum(THICKNESS_MM) * scale])) @ axes.T + vertex, ray @ axes.T
+        at, ray = (
+            (at + np.array([0.0, 0.0, sum(THICKNESS_MM) * scale])) @ axes.T + vertex,
+            ray @ axes.T,
+        )
         screen = turned(*self.screen_tilt_deg)
-        middle = np.array([*self.screen_shift_mm, self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale])
+        middle = np.array(
+            [*self.screen_shift_mm, self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale]
+        )
         normal = screen[:, 2]
         hit = at + ray * (((middle - at) @ normal) / (ray @ normal))[:, None]
         x, y = ((hit - middle) @ screen[:, :2] / self.pitch_mm).T
@@ -128,7 +149,9 @@ class TracedBench:
         return np.column_stack([u, v, ones]) / np.sqrt(u**2 + v**2 + 1)[:, None]
 
 
-def _refracted(at: FloatArray, ray: FloatArray, radius: float, ratio: float) -> tuple[FloatArray, FloatArray]:
+def _refracted(
+    at: FloatArray, ray: FloatArray, radius: float, ratio: float
+) -> tuple[FloatArray, FloatArray]:
     """Points on, and directions behind, a sphere whose vertex is at the origin; `ratio` is n
     before over n after.
     """
@@ -179,7 +202,10 @@ STARS = 4000
 FAIL_ARCSEC = 1.0
 SEED = 7
 MARKERS = "osd^"
-SHORT = {"the same with a field of degree 4": "with a field, degree 4", "Brown-Conrady with tilt": "Brown-Conrady, tilt"}
+SHORT = {
+    "the same with a field of degree 4": "with a field, degree 4",
+    "Brown-Conrady with tilt": "Brown-Conrady, tilt",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +228,16 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `geometry.csv` and its chart; a line for each model. Raises InputError."""
     sizes = SIZES[1:4:2] if quick else SIZES
     noises = (USUAL_NOISE_PX, NOISES_PX[-1]) if quick else NOISES_PX
-    shown = {Frames(*size, USUAL_NOISE_PX) for size in sizes} | {Frames(*USUAL_SIZE, noise) for noise in noises}
+    shown = {Frames(*size, USUAL_NOISE_PX) for size in sizes} | {
+        Frames(*USUAL_SIZE, noise) for noise in noises
+    }
     outcomes = [outcome for frames in sorted(shown) for outcome in _outcomes(frames)]
     write_records(directory / "geometry.csv", outcomes)
-    usual = [o for o in outcomes if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX]
+    usual = [
+        o
+        for o in outcomes
+        if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX
+    ]
     best = min(usual, key=lambda o: o.held_out_arcsec)
     uncalibrated = ideal_arcsec()
     finding = (
@@ -224,12 +256,25 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 def ideal_arcsec() -> float:
     """How far stars are off with no calibration at all, rms over the screen."""
     nominal = _nominal()
-    return float(np.sqrt((_star_errors(Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])) ** 2).mean()))
+    return float(
+        np.sqrt(
+            (
+                _star_errors(
+                    Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
+                )
+                ** 2
+            ).mean()
+        )
+    )
 
 
 def _nominal() -> Nominal:
     aligned = np.array([1.0, 0.0, 0.0, 0.0])
-    return Nominal(monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned), aligned, TRACKER)
+    return Nominal(
+        monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned),
+        aligned,
+        TRACKER,
+    )
 
 
 def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
@@ -244,7 +289,15 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
         held_out_arcsec = held_out(problem, model.name, free, model.field_degree, data).rms_arcsec
         errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
         stars = float(np.sqrt((errors**2).mean())), float(errors.max())
-        yield CalibrationOutcome(frames.count, frames.dots, frames.noise_px, model.name, len(data), held_out_arcsec, *stars)
+        yield CalibrationOutcome(
+            frames.count,
+            frames.dots,
+            frames.noise_px,
+            model.name,
+            len(data),
+            held_out_arcsec,
+            *stars,
+        )
 
 
 def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -257,19 +310,33 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
 
 
-def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome], uncalibrated_arcsec: float) -> None:
+def _draw(
+    path: Path, finding: str, outcomes: list[CalibrationOutcome], uncalibrated_arcsec: float
+) -> None:
     note = f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots"
     note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
     with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):
         for model, marker, colour in zip(MODELS, MARKERS, SERIES, strict=False):
             mine = [o for o in outcomes if o.model == model.name]
-            by_dots = sorted((o.centroids, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if o.noise_px == USUAL_NOISE_PX)
+            by_dots = sorted(
+                (o.centroids, o.stars_rms_arcsec, o.held_out_arcsec)
+                for o in mine
+                if o.noise_px == USUAL_NOISE_PX
+            )
             by_noise = sorted(
-                (o.noise_px, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if (o.frames, o.dots_per_frame) == USUAL_SIZE
+                (o.noise_px, o.stars_rms_arcsec, o.held_out_arcsec)
+                for o in mine
+                if (o.frames, o.dots_per_frame) == USUAL_SIZE
             )
             for axes, rows in ((dots, by_dots), (noise, by_noise)):
                 places, stars, held = zip(*rows, strict=True)
-                axes.loglog(places, stars, marker=marker, color=colour, label=SHORT.get(model.name, model.name))
+                axes.loglog(
+                    places,
+                    stars,
+                    marker=marker,
+                    color=colour,
+                    label=SHORT.get(model.name, model.name),
+                )
                 axes.loglog(places, held, ":", color=colour, lw=1.2, label="_held out")
         for axes in (dots, noise):
             axes.axhline(uncalibrated_arcsec, color=INK, ls=":", lw=1.2, label="uncalibrated")

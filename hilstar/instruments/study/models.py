@@ -36,7 +36,13 @@ from hilstar.basics.charts import (
 )
 from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
 from hilstar.instruments.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
-from hilstar.instruments.study.settings import APERTURE_MM, MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
+from hilstar.instruments.study.settings import (
+    APERTURE_MM,
+    MAX_RELIABLE_VI_MAG,
+    held_out_by_type,
+    held_out_errors,
+    study_optics,
+)
 from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import (
@@ -81,7 +87,14 @@ TABLE_2_3 = {
     "sigma_pm_ra_mas_yr": ("mas/yr", 0.88),
     "sigma_pm_dec_mas_yr": ("mas/yr", 0.74),
 }
-NAMES_2_3 = ("B-V, mean", "right ascension", "declination", "parallax", "motion in RA", "motion in Dec")
+NAMES_2_3 = (
+    "B-V, mean",
+    "right ascension",
+    "declination",
+    "parallax",
+    "motion in RA",
+    "motion in Dec",
+)
 TABLE_2_3_V_MAG = 9.0
 CLIPPED_TIMES = 4  # errors over so many times the thesis's are drawn at the edge
 # Table 2.2: V and B-V from the ground, from Hipparcos, from Tycho; of all 118 218 rows.
@@ -218,21 +231,46 @@ def passbands(directory: Path) -> ChartFinding:
     takes for it.
     """
     light = vega()
-    curves = {b: read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv") for b in TABLE_2_5}
+    curves = {
+        b: read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv")
+        for b in TABLE_2_5
+    }
     in_v = curve_mean(light, curves["v"])
     scale = ZERO_W_M2_M["v"] / in_v  # a star with Vega's spectrum and V = 0
     rows = []
     for band, (johnson, bessell, printed_nm) in TABLE_2_5.items():
-        weighted = Curve(light.wavelength_nm, light.value * light.wavelength_nm / light.wavelength_nm.max())
-        effective = curve_mean(weighted, curves[band]) / curve_mean(light, curves[band]) * light.wavelength_nm.max()
-        rows.append(
-            (band.upper(), effective, printed_nm, scale * curve_mean(light, curves[band]) / ERG_S_CM2_A, bessell, johnson)
+        weighted = Curve(
+            light.wavelength_nm, light.value * light.wavelength_nm / light.wavelength_nm.max()
         )
-    columns = ("band", "effective_nm", "thesis_effective_nm", "vega_v0", "thesis_bessell", "thesis_johnson")
+        effective = (
+            curve_mean(weighted, curves[band])
+            / curve_mean(light, curves[band])
+            * light.wavelength_nm.max()
+        )
+        rows.append(
+            (
+                band.upper(),
+                effective,
+                printed_nm,
+                scale * curve_mean(light, curves[band]) / ERG_S_CM2_A,
+                bessell,
+                johnson,
+            )
+        )
+    columns = (
+        "band",
+        "effective_nm",
+        "thesis_effective_nm",
+        "vega_v0",
+        "thesis_bessell",
+        "thesis_johnson",
+    )
     write_csv(directory / "passbands.csv", columns, rows)
     off = max(abs(row[3] / row[4] - 1) for row in rows)
     nm = np.arange(300.0, 1101.0)
-    body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K) / v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, "energy")
+    body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K) / v_band_mean_w_m2_m(
+        REFERENCE_TEMPERATURE_K, "energy"
+    )
     shown = {"Vega": light(nm) / in_v, "black body, 9602 K": body}
     blue = float(shown["Vega"][50] / body[50])
     text = (
@@ -241,16 +279,28 @@ def passbands(directory: Path) -> ChartFinding:
     )
     note = f"Vega: CALSPEC, V = {VEGA_V_MAG:g}; both scaled to one mean through V. Passbands: Bessell 1990."
     with chart(directory / "passbands", text, panels=2, note=note) as (upper, lower):
-        for (band, curve), colour in zip(curves.items(), (PURPLE, BLUE, GREEN, ORANGE, INK), strict=True):
+        for (band, curve), colour in zip(
+            curves.items(), (PURPLE, BLUE, GREEN, ORANGE, INK), strict=True
+        ):
             upper.plot(curve.wavelength_nm, curve.value, color=colour, label="_")
             peak = curve.value.argmax()
-            upper.annotate(band.upper(), (curve.wavelength_nm[peak], curve.value[peak]), va="bottom", ha="center", color=colour)
+            upper.annotate(
+                band.upper(),
+                (curve.wavelength_nm[peak], curve.value[peak]),
+                va="bottom",
+                ha="center",
+                color=colour,
+            )
         for (name, values), colour in zip(shown.items(), (INK, ORANGE), strict=True):
             lower.plot(nm, values, color=colour, label=name)
         upper.set(ylabel="response [1]", ylim=(0, 1.15))
         lower.set(xlabel="wavelength [nm]", ylabel="relative F_lambda [1]")
         lower.legend()
-    write_csv(directory / "vega.csv", ("wavelength_nm", "vega", "blackbody_9602_k"), np.column_stack((nm, *shown.values())))
+    write_csv(
+        directory / "vega.csv",
+        ("wavelength_nm", "vega", "blackbody_9602_k"),
+        np.column_stack((nm, *shown.values())),
+    )
     return ChartFinding("passbands", text)
 
 
@@ -280,7 +330,11 @@ def curves(directory: Path) -> ChartFinding:
         lower.set(xlabel="wavelength [nm]", ylabel="exitance over its largest [1]")
         label_ends(upper, lower)
     table = np.column_stack((nm, *(curve(nm) for curve in loaded.values()), *bodies))
-    write_csv(directory / "curves.csv", ("wavelength_nm", *names, *(f"blackbody_{each:.0f}_k" for each in kelvin)), table)
+    write_csv(
+        directory / "curves.csv",
+        ("wavelength_nm", *names, *(f"blackbody_{each:.0f}_k" for each in kelvin)),
+        table,
+    )
     return ChartFinding("curves", text)
 
 
@@ -290,12 +344,22 @@ def detector_laws(directory: Path) -> ChartFinding:
     """
     kelvin, hz = np.arange(230.0, 300.5, 1.0), np.geomspace(1e4, 1e7, 61)
     dark = {
-        name: np.array([203 * structs.replace(TABLE_4_2_DARK, temperature_k=t, **law).dark_factor for t in kelvin.tolist()])
+        name: np.array(
+            [
+                203 * structs.replace(TABLE_4_2_DARK, temperature_k=t, **law).dark_factor
+                for t in kelvin.tolist()
+            ]
+        )
         for name, law in DARK_LAWS.items()
     }
     read = {
         corner: np.array(
-            [structs.replace(TABLE_4_2_DARK, readout_hz=f, read_noise_corner_hz=corner).read_noise_now_e for f in hz.tolist()]
+            [
+                structs.replace(
+                    TABLE_4_2_DARK, readout_hz=f, read_noise_corner_hz=corner
+                ).read_noise_now_e
+                for f in hz.tolist()
+            ]
         )
         for corner in CORNERS_HZ
     }
@@ -305,7 +369,10 @@ def detector_laws(directory: Path) -> ChartFinding:
         f" {at['e2v NIMO']:.0f} by its NIMO law, {at['Arrhenius, 0.56 eV']:.0f} by Arrhenius with half of silicon's gap"
     )
     note = "e2v's constants were seen in public code, not on a data sheet. Read noise: 2 e- at 1 MHz, white and 1/f noise."
-    with chart(directory / "detector_laws", text, panels=2, note=note, share_x=False) as (upper, lower):
+    with chart(directory / "detector_laws", text, panels=2, note=note, share_x=False) as (
+        upper,
+        lower,
+    ):
         for (name, values), colour in zip(dark.items(), SERIES, strict=False):
             upper.semilogy(kelvin, values, color=colour, label=name)
         for (corner, values), colour in zip(read.items(), SERIES, strict=False):
@@ -313,7 +380,11 @@ def detector_laws(directory: Path) -> ChartFinding:
         upper.set(xlabel="temperature [K]", ylabel="dark current [e-/s]")
         lower.set(xlabel="readout frequency [Hz]", ylabel="read noise [e-]")
         label_ends(upper, lower)
-    write_csv(directory / "detector_laws.csv", ("temperature_k", *dark), np.column_stack((kelvin, *dark.values())))
+    write_csv(
+        directory / "detector_laws.csv",
+        ("temperature_k", *dark),
+        np.column_stack((kelvin, *dark.values())),
+    )
     return ChartFinding("detector_laws", text)
 
 
@@ -348,7 +419,11 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
             axes.plot(nm, values, color=colour, label=f"{name}: {total[name]:.1f} in all")
         axes.set(xlabel="wavelength [nm]", ylabel="photons/s/m2/arcsec2/nm")
         axes.legend()
-    write_csv(directory / "zodiacal.csv", ("wavelength_nm", *spectra), np.column_stack((nm, *spectra.values())))
+    write_csv(
+        directory / "zodiacal.csv",
+        ("wavelength_nm", *spectra),
+        np.column_stack((nm, *spectra.values())),
+    )
     return ChartFinding("zodiacal", text)
 
 
@@ -359,7 +434,9 @@ BRIGHT_V_MAG = 7.5
 HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
 
-SETTINGS = [Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS]
+SETTINGS = [
+    Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS
+]
 # where Torres 2010 holds; exact at 0, where wang2021 steps
 SCALE_BV_MAG = np.arange(-35, 181) / 100
 
@@ -378,19 +455,30 @@ def spectra(directory: Path) -> ChartFinding:
         optics = study_optics(sensor)
         rates = library_electrons_per_s(library, optics, photometry)
         errors[sensor, HELD_OUT] = held_out_errors(rates)
-        errors[sensor, BY_TYPE] = held_out_by_type(library_electrons_per_s(bare_and_dusty(), optics, photometry))[: len(rates)]
+        errors[sensor, BY_TYPE] = held_out_by_type(
+            library_electrons_per_s(bare_and_dusty(), optics, photometry)
+        )[: len(rates)]
         for scale in TEMPERATURE_SCALES:
-            body = dgs_electrons_per_s(star_temperatures_k(library.bv_mag, scale), optics, photometry)
+            body = dgs_electrons_per_s(
+                star_temperatures_k(library.bv_mag, scale), optics, photometry
+            )
             errors[sensor, f"black body, {scale}"] = body / rates - 1
     sure = library.vi_mag < MAX_RELIABLE_VI_MAG
-    figures = {key: np.percentile(100 * np.abs(error[sure]), (50, 95)) for key, error in errors.items()}
+    figures = {
+        key: np.percentile(100 * np.abs(error[sure]), (50, 95)) for key, error in errors.items()
+    }
     text = "Median error of the electron rate (95 %), V-I < 2.5: " + "; ".join(
         f"{SENSORS[sensor].split()[0]} {real[0]:.1f} % ({real[1]:.1f} %) by real spectra and V-I,"
         f" {body[0]:.1f} % ({body[1]:.1f} %) by black bodies and B-V"
         for sensor in SENSORS
-        for real, body in [(figures[sensor, HELD_OUT], figures[sensor, "black body, ballesteros2012"])]
+        for real, body in [
+            (figures[sensor, HELD_OUT], figures[sensor, "black body, ballesteros2012"])
+        ]
     )
-    real, body = (max(figures[s, name][1] for s in SENSORS) for name in (HELD_OUT, "black body, ballesteros2012"))
+    real, body = (
+        max(figures[s, name][1] for s in SENSORS)
+        for name in (HELD_OUT, "black body, ballesteros2012")
+    )
     late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
     of_late = {key: np.percentile(100 * np.abs(error[late]), 95) for key, error in errors.items()}
     text += "; late M giants (95 %), " + "; ".join(
@@ -406,7 +494,9 @@ def spectra(directory: Path) -> ChartFinding:
     with chart(directory / "spectra", finding, panels=2, note=note) as panels:
         for axes, sensor in zip(panels, SENSORS, strict=True):
             named = [(name, error) for (owner, name), error in errors.items() if owner == sensor]
-            for (name, error), mark, colour in zip(reversed(named), "+x^o", (GREEN, ORANGE, INK, BLUE), strict=True):
+            for (name, error), mark, colour in zip(
+                reversed(named), "+x^o", (GREEN, ORANGE, INK, BLUE), strict=True
+            ):
                 axes.plot(library.vi_mag, 100 * error, mark, color=colour, ms=4, label=name)
             axes.axvline(MAX_RELIABLE_VI_MAG, color=MUTED, lw=1, ls="--")
             axes.axhline(0, color=INK, lw=1)
@@ -417,7 +507,13 @@ def spectra(directory: Path) -> ChartFinding:
         panels[-1].set(xlabel="V-I [mag]")
         panels[0].legend(loc="upper right")
     columns = ("spectral_type", "bv_mag", "vi_mag", *(f"{s}: {n} [%]" for s, n in errors))
-    table = zip(library.spectral_type, library.bv_mag, library.vi_mag, *(100 * e for e in errors.values()), strict=True)
+    table = zip(
+        library.spectral_type,
+        library.bv_mag,
+        library.vi_mag,
+        *(100 * e for e in errors.values()),
+        strict=True,
+    )
     write_csv(directory / "spectra.csv", columns, table)
     return ChartFinding("spectra", text)
 
@@ -425,7 +521,12 @@ def spectra(directory: Path) -> ChartFinding:
 def zero_points(directory: Path) -> ChartFinding:
     """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
     rates = {
-        sensor: np.array([dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, study_optics(sensor), p) for p in SETTINGS])
+        sensor: np.array(
+            [
+                dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, study_optics(sensor), p)
+                for p in SETTINGS
+            ]
+        )
         for sensor in SENSORS
     }
     mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
@@ -437,8 +538,13 @@ def zero_points(directory: Path) -> ChartFinding:
     note = f"A black body of {REFERENCE_TEMPERATURE_K:.0f} K, V = 0, behind {APERTURE_MM:g} mm."
     with chart(directory / "zero_points", text, panels=2, note=note) as (upper, lower):
         place = np.arange(len(SETTINGS))
-        for k, ((sensor, name), colour) in enumerate(zip(SENSORS.items(), (BLUE, ORANGE), strict=True)):
-            for axes, height, figure in ((upper, rates[sensor] / 1e6, "%.2f"), (lower, mag[sensor], "%+.3f")):
+        for k, ((sensor, name), colour) in enumerate(
+            zip(SENSORS.items(), (BLUE, ORANGE), strict=True)
+        ):
+            for axes, height, figure in (
+                (upper, rates[sensor] / 1e6, "%.2f"),
+                (lower, mag[sensor], "%+.3f"),
+            ):
                 bars = axes.bar(place + 0.4 * k - 0.2, height, 0.38, color=colour, label=name)
                 axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
         upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * base.max() / 1e6))
@@ -446,7 +552,11 @@ def zero_points(directory: Path) -> ChartFinding:
         # with room for figures and names
         limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))
         lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
-        lower.set(ylabel="fainter than vega, energy [mag]", xlabel="zero point, weighting of the passband", ylim=limits)
+        lower.set(
+            ylabel="fainter than vega, energy [mag]",
+            xlabel="zero point, weighting of the passband",
+            ylim=limits,
+        )
         for axes in (upper, lower):
             axes.grid(visible=False, axis="x")
             axes.legend(loc="upper left", ncols=2)
@@ -468,27 +578,40 @@ def temperature_scales(directory: Path) -> ChartFinding:
     kelvin = {"torres2010_supergiant": torres2010_k(bv, supergiant=True)}
     kelvin |= {name: scale(bv) for name, scale in TEMPERATURE_SCALES.items()}
     percent = {name: 100 * (t / torres - 1) for name, t in kelvin.items()}
-    mag = {name: magnitude(dgs_electrons_per_s(t, optics, photometry) / base) for name, t in kelvin.items()}
+    mag = {
+        name: magnitude(dgs_electrons_per_s(t, optics, photometry) / base)
+        for name, t in kelvin.items()
+    }
     stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
     stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
-    within = {n: np.percentile(np.abs(np.interp(stars_bv, bv, mag[n])), (50, 95)) for n in TEMPERATURE_SCALES}
+    within = {
+        n: np.percentile(np.abs(np.interp(stars_bv, bv, mag[n])), (50, 95))
+        for n in TEMPERATURE_SCALES
+    }
     zero, wang = int(np.searchsorted(bv, 0.0)), kelvin["wang2021"]
     step_k = wang[zero - 1] - wang[zero]
     text = (
         f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / wang[zero - 1]:.1f} %) at B-V = 0; half of"
         " Hipparcos to V = 7.5 (95 %) is within "
-        + ", ".join(f"{half:.3f} ({most:.2f}) mag by {name}" for name, (half, most) in within.items())
+        + ", ".join(
+            f"{half:.3f} ({most:.2f}) mag by {name}" for name, (half, most) in within.items()
+        )
         + " of Torres 2010"
     )
-    finding = f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within " + ", ".join(
-        f"{half:.3f} mag by {name}" for name, (half, _) in within.items()
+    finding = (
+        f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within "
+        + ", ".join(f"{half:.3f} mag by {name}" for name, (half, _) in within.items())
     )
     note = "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, + is fainter."
     groups = {"k": kelvin, "percent": percent, "mag": mag}
-    with chart(directory / "temperature_scales", f"{finding} of Torres 2010", panels=3, note=note) as panels:
+    with chart(
+        directory / "temperature_scales", f"{finding} of Torres 2010", panels=3, note=note
+    ) as panels:
         panels[0].plot(bv, torres, color=INK, label="Torres 2010")
         for axes, values in zip(panels, groups.values(), strict=True):
-            for (name, value), style, colour in zip(values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True):
+            for (name, value), style, colour in zip(
+                values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True
+            ):
                 words = name.replace("torres2010_supergiant", "Torres, supergiants")
                 if axes is panels[2] and name in within:
                     words = f"{name}: half within {within[name][0]:.3f}"
@@ -499,8 +622,14 @@ def temperature_scales(directory: Path) -> ChartFinding:
         panels[1].set(ylabel="difference [%]")
         panels[2].set(xlabel="B-V [mag]", ylabel="difference in electrons [mag]")
         label_ends(*panels)
-    columns = ("bv_mag", "torres2010_k", *(f"{name}_{unit}" for unit, values in groups.items() for name in values))
-    table = np.column_stack((bv, torres, *(value for values in groups.values() for value in values.values())))
+    columns = (
+        "bv_mag",
+        "torres2010_k",
+        *(f"{name}_{unit}" for unit, values in groups.items() for name in values),
+    )
+    table = np.column_stack(
+        (bv, torres, *(value for values in groups.values() for value in values.values()))
+    )
     write_csv(directory / "temperature_scales.csv", columns, table.tolist())
     return ChartFinding("temperature_scales", text)
 
@@ -509,16 +638,25 @@ def choices(directory: Path) -> ChartFinding:
     """The cost of each choice in magnitudes, over B-V and for the stars of Hipparcos."""
     optics, stars = study_optics("ccd47-20"), load_catalog().brighter_than(BRIGHT_V_MAG)
     cost = choice_costs_mag(BV_MAG, optics)
-    real = tabulate_pickles(optics, Photometry()).electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
+    real = tabulate_pickles(optics, Photometry()).electrons_per_s(
+        np.zeros(len(stars)), stars.bv_mag, stars.vi_mag
+    )
     # a spectrum for each colour, of which there are few
     bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)
-    body = dgs_electrons_per_s(star_temperatures_k(bv_mag, "ballesteros2012"), optics, Photometry())[star]
+    body = dgs_electrons_per_s(
+        star_temperatures_k(bv_mag, "ballesteros2012"), optics, Photometry()
+    )[star]
     on_stars = {name: mag[star] for name, mag in choice_costs_mag(bv_mag, optics).items()}
     on_stars["spectrum pickles"] = magnitude(real / body)
-    low, middle, high, _ = percentiles = running_percentiles(stars.bv_mag, on_stars["spectrum pickles"], BV_MAG)
+    low, middle, high, _ = percentiles = running_percentiles(
+        stars.bv_mag, on_stars["spectrum pickles"], BV_MAG
+    )
     paid = {name: np.percentile(np.abs(mag), (50, 95)) for name, mag in on_stars.items()}
-    text = "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: " + ", ".join(
-        f"{name.split()[-1]} {half:.2f} ({most:.2f})" for name, (half, most) in paid.items()
+    text = (
+        "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: "
+        + ", ".join(
+            f"{name.split()[-1]} {half:.2f} ({most:.2f})" for name, (half, most) in paid.items()
+        )
     )
     finding = choices_finding(paid)
     note = (
@@ -529,7 +667,9 @@ def choices(directory: Path) -> ChartFinding:
     with chart(directory / "choices", finding, panels=2, note=note) as (upper, lower):
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
             half, most = paid[name]
-            upper.plot(BV_MAG, mag, color=colour, label=f"{name.split()[-1]}: {half:.2f} ({most:.2f})")
+            upper.plot(
+                BV_MAG, mag, color=colour, label=f"{name.split()[-1]}: {half:.2f} ({most:.2f})"
+            )
         half, most = paid["spectrum pickles"]
         names = {upper: f"pickles: {half:.2f} ({most:.2f})", lower: "pickles, median"}
         for axes, name in names.items():
@@ -541,7 +681,11 @@ def choices(directory: Path) -> ChartFinding:
         label_ends(upper, lower)
     columns = ("bv_mag", *(f"{n.replace(' ', '_')}_mag" for n in cost))
     columns += ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
-    write_csv(directory / "choices.csv", columns, np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist())
+    write_csv(
+        directory / "choices.csv",
+        columns,
+        np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist(),
+    )
     return ChartFinding("choices", text)
 
 
@@ -567,9 +711,13 @@ def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray
     default = Photometry()
     kelvin = star_temperatures_k(bv_mag, "ballesteros2012")
     rates = {
-        "temperature wang2021": dgs_electrons_per_s(star_temperatures_k(bv_mag, "wang2021"), optics, default),
+        "temperature wang2021": dgs_electrons_per_s(
+            star_temperatures_k(bv_mag, "wang2021"), optics, default
+        ),
         "weighting photon": dgs_electrons_per_s(kelvin, optics, Photometry("vega", "photon")),
-        "zero point iau-bolometric": dgs_electrons_per_s(kelvin, optics, Photometry("iau-bolometric")),
+        "zero point iau-bolometric": dgs_electrons_per_s(
+            kelvin, optics, Photometry("iau-bolometric")
+        ),
         "brightness ags": np.full_like(bv_mag, ags_electrons_per_s(optics, default)),
     }
     base = dgs_electrons_per_s(kelvin, optics, default)
@@ -596,7 +744,10 @@ def run(directory: Path) -> list[ChartFinding]:
     """
     findings = [rapp(directory, sensor) for sensor in SENSORS]
     findings += [
-        chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)
+        chart_of(directory)
+        for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)
     ]
-    write_csv(directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings])
+    write_csv(
+        directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings]
+    )
     return findings

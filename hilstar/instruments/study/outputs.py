@@ -80,7 +80,10 @@ def run(
     """
     if file is not None:
         chosen = fields_of(radec_roll_deg)
-        return [_output(directory, file, Scene(field.stem, f"{field.name}, {file.path.name}", field)) for field in chosen]
+        return [
+            _output(directory, file, Scene(field.stem, f"{field.name}, {file.path.name}", field))
+            for field in chosen
+        ]
     lines = []
     for field in FIELDS:
         published = Scene(
@@ -89,7 +92,9 @@ def run(
             field,
             field.zoom_hip,
         )
-        mended = Scene(field.stem, f"{field.name} with the thesis's errors mended", field, field.zoom_hip)
+        mended = Scene(
+            field.stem, f"{field.name} with the thesis's errors mended", field, field.zoom_hip
+        )
         for scene, suffix in ((published, "-as-published"), (mended, "")):
             bench = read_bench_file(resource_path("configs", f"thesis-{field.stem}{suffix}.toml"))
             lines.append(_output(directory, bench, scene))
@@ -106,7 +111,11 @@ def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float
     """The n_TOT of table 4.1 and eq. 4.14 as printed, whose PRNU and DSNU have no dimension."""
     fixed_e2 = light_e * detector.prnu + detector.dsnu_e_per_s * exposure_s
     return math.sqrt(
-        light_e + detector.dark_e_per_s * exposure_s + fixed_e2 + detector.adc_noise_e**2 + detector.read_noise_e**2
+        light_e
+        + detector.dark_e_per_s * exposure_s
+        + fixed_e2
+        + detector.adc_noise_e**2
+        + detector.read_noise_e**2
     )
 
 
@@ -126,7 +135,9 @@ def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
         outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, camera_text)
         write_exposure_fits(directory / f"{scene.stem}.fits", simulator, noisy, noise)
         without = FrameNoise("none", SEED)
-        write_exposure_fits(directory / f"{scene.stem}{WITHOUT_NOISE}.fits", simulator, clean, without)
+        write_exposure_fits(
+            directory / f"{scene.stem}{WITHOUT_NOISE}.fits", simulator, clean, without
+        )
     truth = outputs.truth
     write_csv(directory / f"{scene.stem}.csv", truth.dtype.names or (), truth.tolist())
     _figure(directory / scene.stem, scene, outputs)
@@ -243,7 +254,9 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
     facts.text(0, 1, outputs.camera_words, va="top", transform=facts.transAxes, fontsize=SMALL_PT)
     for axes in (facts, scale):
         axes.axis("off")
-    scale.figure.colorbar(image, ax=scale, label="Signal [DN]", orientation="horizontal", location="top", fraction=0.5)
+    scale.figure.colorbar(
+        image, ax=scale, label="Signal [DN]", orientation="horizontal", location="top", fraction=0.5
+    )
 
 
 def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:

@@ -21,8 +21,24 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Policy, Prediction, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, SERIES, chart, label_ends, plain_ticks, write_records
-from hilstar.basics.rotation import angle_between_rad, conjugate, multiply, propagate, to_rotation_vector
+from hilstar.basics.charts import (
+    BLUE,
+    GREEN,
+    MUTED,
+    ORANGE,
+    SERIES,
+    chart,
+    label_ends,
+    plain_ticks,
+    write_records,
+)
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    conjugate,
+    multiply,
+    propagate,
+    to_rotation_vector,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 from hilstar.instruments.study.predictors import (
     JITTER,
@@ -79,28 +95,43 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """
     span_s, outcomes, others = QUICK_SPAN_S if quick else SPAN_S, [], OtherWork()
     # Over latency at the usual rate, and over rate at the usual latency.
-    for hz, ms in sorted({(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}):
+    for hz, ms in sorted(
+        {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
+    ):
         samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
-        outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
+        outcomes += [
+            _outcome(predictor, samples, hz, ms)
+            for predictor in predictors()
+            if not predictor.waits
+        ]
     load = others.load()
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
-    default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
+    default = next(
+        o for o in usual if o.method == next(g.name for g in predictors() if g.is_default)
+    )
     hold = next(o for o in usual if o.method == "hold")
     finding = (
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
     _draw(directory / "prediction", finding, outcomes, load)
-    cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
+    cells, frequencies = (
+        (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
+    )
     shaken_by = []
-    for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
+    for rates, (packet_hz, age_ms), way, jitter_hz in product(
+        (True, False), cells, WAYS, frequencies
+    ):
         if jitter_hz < packet_hz / 2:  # a faster one looks like a slow one
             residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, rates)
             packets = "with rates" if rates else "without rates"
             shaken_by.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
     write_records(directory / "prediction_jitter.csv", shaken_by)
-    given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in ("with rates", "without rates"))
+    given, derived = (
+        crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS)
+        for packets in ("with rates", "without rates")
+    )
     told = (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
         f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
@@ -128,7 +159,9 @@ class Shaken:
     residual: float
 
 
-def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool) -> tuple[float, float]:
+def shaken_error(
+    way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool
+) -> tuple[float, float]:
     """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of
     the vibration's own.
 
@@ -143,20 +176,34 @@ def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rate
     def angle(t_s: float) -> float:
         return turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
 
-    taken, errors, times_s = 0, [], np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s
+    taken, errors, times_s = (
+        0,
+        [],
+        np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s,
+    )
     for t_s in times_s:
         while taken / packet_hz <= t_s - latency_s:
             at_s = taken / packet_hz
-            rate = Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3)) if rates else None
-            timeline.add(AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate))
+            rate = (
+                Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3)) if rates else None
+            )
+            timeline.add(
+                AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate)
+            )
             taken += 1
         shown = attitude_at(timeline, round(t_s * NS_PER_S))
-        errors.append(-to_rotation_vector(multiply(shown.q_icrs_to_cam, conjugate(propagate(ORION, Z, angle(t_s)))))[2])
+        errors.append(
+            -to_rotation_vector(
+                multiply(shown.q_icrs_to_cam, conjugate(propagate(ORION, Z, angle(t_s))))
+            )[2]
+        )
     late = times_s >= SETTLED_S
     phase, error = turning * times_s[late] + 0.3, np.array(errors)[late]
     waves = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(phase))))
     fitted = np.linalg.lstsq(waves, error + amplitude * np.sin(phase), rcond=None)[0]
-    return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(np.hypot(fitted[0], fitted[1]) / amplitude)
+    return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(
+        np.hypot(fitted[0], fitted[1]) / amplitude
+    )
 
 
 def auto_times(found: list[Shaken]) -> float:
@@ -184,10 +231,14 @@ def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) 
     return math.inf
 
 
-def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> PredictionOutcome:
+def _outcome(
+    predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int
+) -> PredictionOutcome:
     taken_ns = [sample.t_ns for sample in samples]
     latency_ns, errors = latency_ms * NS_PER_MS, []
-    first, last = (t_ns * FRAME_HZ / NS_PER_S for t_ns in (taken_ns[NEAR] + latency_ns, taken_ns[-1]))
+    first, last = (
+        t_ns * FRAME_HZ / NS_PER_S for t_ns in (taken_ns[NEAR] + latency_ns, taken_ns[-1])
+    )
     for frame in range(math.ceil(first), math.floor(last)):
         t_ns = round(frame * NS_PER_S / FRAME_HZ)
         count = bisect_right(taken_ns, t_ns - latency_ns)
@@ -199,19 +250,28 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
         predict(taken_ns[-1] + latency_ns)
         times_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
     rms = float(np.sqrt(np.mean(np.square(errors))))
-    return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us)))
+    return PredictionOutcome(
+        predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us))
+    )
 
 
 def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
     with chart(path, finding, panels=2, share_x=False, note=load.note(note)) as (latency, rate):
-        for name, marker, colour in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False):
+        for name, marker, colour in zip(
+            dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False
+        ):
             mine = [o for o in outcomes if o.method == name]
             took_us = np.median([o.attitude_us for o in mine])
             by_latency = sorted((o.latency_ms, o.rms_arcsec) for o in mine if o.rate_hz == USUAL_HZ)
             by_rate = sorted((o.rate_hz, o.rms_arcsec) for o in mine if o.latency_ms == USUAL_MS)
-            latency.loglog(*zip(*by_latency, strict=True), marker=marker, color=colour, label=f"{name} ({took_us:.0f} us)")
+            latency.loglog(
+                *zip(*by_latency, strict=True),
+                marker=marker,
+                color=colour,
+                label=f"{name} ({took_us:.0f} us)",
+            )
             rate.loglog(*zip(*by_rate, strict=True), marker=marker, color=colour, label=name)
         latency.set_xlabel(f"latency [ms], packets at {USUAL_HZ} Hz")
         rate.set_xlabel(f"rate of packets [Hz], latency {USUAL_MS} ms")
@@ -231,10 +291,24 @@ def _draw_shaken(path: Path, finding: str, found: list[Shaken]) -> None:
         for column, packets in enumerate(("with rates", "without rates")):
             error, gain = axes[column], axes[2 + column]
             for way, colour in WAYS.items():
-                mine = [s for s in found if (s.way, s.packets, s.packet_hz, s.age_ms) == (way, packets, USUAL_HZ, USUAL_MS)]
+                mine = [
+                    s
+                    for s in found
+                    if (s.way, s.packets, s.packet_hz, s.age_ms)
+                    == (way, packets, USUAL_HZ, USUAL_MS)
+                ]
                 hz = [s.jitter_hz for s in mine]
-                error.semilogx(hz, [s.residual for s in mine], marker="o", markersize=3.5, color=colour, label=way)
-                gain.semilogx(hz, [s.gain for s in mine], marker="o", markersize=3.5, color=colour, label=way)
+                error.semilogx(
+                    hz,
+                    [s.residual for s in mine],
+                    marker="o",
+                    markersize=3.5,
+                    color=colour,
+                    label=way,
+                )
+                gain.semilogx(
+                    hz, [s.gain for s in mine], marker="o", markersize=3.5, color=colour, label=way
+                )
             error.set_title(f"packets {packets}")
             gain.axhline(1.0, color=MUTED, linewidth=0.8)
             gain.set_xlabel("frequency of the vibration [Hz]")

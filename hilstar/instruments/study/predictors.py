@@ -47,11 +47,17 @@ def predictors() -> tuple[Predictor, ...]:
     fed with rates.
     """
     settings = AttitudeSettings()
-    own = Policy(round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS))
+    own = Policy(
+        round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS)
+    )
     hold = Policy(0, own.stale_after_ns)
     return (
         Predictor("hold", partial(_timeline, hold)),
-        Predictor("linear, by the sample's rate", partial(_timeline, own), is_default=own.max_extrapolation_ns > 0),
+        Predictor(
+            "linear, by the sample's rate",
+            partial(_timeline, own),
+            is_default=own.max_extrapolation_ns > 0,
+        ),
         Predictor("linear, by the last two samples", partial(_timeline, own, without_rates=True)),
         Predictor("rate and acceleration", _accelerated),
         Predictor(f"cubic spline through {NEAR} samples", _spline),
@@ -64,15 +70,23 @@ def slew_attitude(t_ns: int) -> FloatArray:
     and a fast jitter.
     """
     t_s = t_ns / NS_PER_S
-    return shaken(ORION, t_s, [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)])
+    return shaken(
+        ORION,
+        t_s,
+        [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)],
+    )
 
 
-def shaken(q_icrs_to_cam: FloatArray, t_s: float, angles_rad: Sequence[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+def shaken(
+    q_icrs_to_cam: FloatArray, t_s: float, angles_rad: Sequence[float] = (0.0, 0.0, 0.0)
+) -> FloatArray:
     """An attitude turned about the camera's x, y and z by these angles and JITTER."""
     q = q_icrs_to_cam
     for axis, angle in enumerate(angles_rad):
         for size_arcsec, hz in JITTER:
-            angle += math.radians(size_arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz)
+            angle += math.radians(size_arcsec / 3600) * math.sin(
+                2 * math.pi * hz * t_s + 2 * axis * hz
+            )
         turn = np.zeros(4)
         turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
         q = multiply(turn, q)
@@ -142,7 +156,9 @@ def slew_sample(t_ns: int) -> AttitudeSample:
     return AttitudeSample(t_ns, slew_attitude(t_ns), rate_of(slew_attitude, t_ns))
 
 
-def _timeline(policy: Policy, near: Sequence[AttitudeSample], without_rates: bool = False) -> AttitudeAt:
+def _timeline(
+    policy: Policy, near: Sequence[AttitudeSample], without_rates: bool = False
+) -> AttitudeAt:
     timeline = Timeline(policy)
     for sample in near:
         timeline.add(replace(sample, rate_cam_rad_s=None) if without_rates else sample)
@@ -151,7 +167,9 @@ def _timeline(policy: Policy, near: Sequence[AttitudeSample], without_rates: boo
 
 def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
     """The newest sample's rate, and the change since the one before it carried on."""
-    (before_ns, before), (newest_ns, newest) = ((s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:])
+    (before_ns, before), (newest_ns, newest) = (
+        (s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:]
+    )
 
     def predicted(t_ns: int) -> FloatArray:
         ahead_s, gap_s = (t_ns - newest_ns) / NS_PER_S, (newest_ns - before_ns) / NS_PER_S

@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, INK, MUTED, ORANGE, SMALL_PT, chart, label_ends, name_at_side, write_csv
+from hilstar.basics.charts import (
+    BLUE,
+    INK,
+    MUTED,
+    ORANGE,
+    SMALL_PT,
+    chart,
+    label_ends,
+    name_at_side,
+    write_csv,
+)
 from hilstar.basics.units import flux_ratio
 from hilstar.display.phases import USUAL_PSF, WHITE
 from hilstar.display.quantise import EXPOSURE_FRAMES
@@ -30,14 +40,25 @@ MARKERS = dict(zip(codes.BITS, "os^", strict=True))
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
-    found: Found = {(bits, way.name): codes.code_errors(bits, way, phases, mags) for bits in codes.BITS for way in codes.WAYS}
+    found: Found = {
+        (bits, way.name): codes.code_errors(bits, way, phases, mags)
+        for bits in codes.BITS
+        for way in codes.WAYS
+    }
     rows = [
         (bits, name, float(mag), *codes.error_cells(e))
         for (bits, name), errors in found.items()
         for mag, e in zip(mags, errors, strict=True)
     ]
-    write_csv(directory / "quantisation.csv", ("bits", "method", "mag_under_white", *codes.ERROR_COLUMNS), rows)
-    faintest = {key: errors[int(np.searchsorted(mags, codes.AIMS[key[0]][1]))] for key, errors in found.items()}
+    write_csv(
+        directory / "quantisation.csv",
+        ("bits", "method", "mag_under_white", *codes.ERROR_COLUMNS),
+        rows,
+    )
+    faintest = {
+        key: errors[int(np.searchsorted(mags, codes.AIMS[key[0]][1]))]
+        for key, errors in found.items()
+    }
     others = OtherWork()
     times = _frame_times_ms(3 if quick else 31)
     load = others.load()
@@ -47,7 +68,10 @@ def run(directory: Path, quick: bool = False) -> Judged:
     write_csv(
         directory / "quantisation_time.csv",
         ("bits", "method", "frame_ms", "mag_under_white", *codes.ERROR_COLUMNS),
-        [(*key, times[key], codes.AIMS[key[0]][1], *codes.error_cells(e)) for key, e in faintest.items()],
+        [
+            (*key, times[key], codes.AIMS[key[0]][1], *codes.error_cells(e))
+            for key, e in faintest.items()
+        ],
     )
     coarsest = codes.BITS[0]
     rounded, exact = (faintest[coarsest, name] for name in ("round", "exact"))
@@ -80,10 +104,15 @@ def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
     for bits in codes.BITS:
         with ExitStack() as stack:
             targets = {
-                way.name: Target(codes.FRAME_PX, USUAL_PSF, codes.response_of(bits, way), WHITE, way.method)
+                way.name: Target(
+                    codes.FRAME_PX, USUAL_PSF, codes.response_of(bits, way), WHITE, way.method
+                )
                 for way in codes.WAYS
             }
-            works = {name: partial(draw, stack.enter_context(Renderer(on))) for name, on in targets.items()}
+            works = {
+                name: partial(draw, stack.enter_context(Renderer(on)))
+                for name, on in targets.items()
+            }
             times |= {(bits, name): ms for name, ms in medians_ms(works, rounds).items()}
     return times
 
@@ -108,9 +137,7 @@ def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
 def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
     bits, limit = codes.BITS[1], codes.AIMS[codes.BITS[1]][1]
     exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
-    finding = (
-        f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with exact, {rounded} with round"
-    )
+    finding = f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with exact, {rounded} with round"
     note = "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit stealing."
     with chart(path, finding, len(codes.BITS), 2, note=note, share_y="col") as grid:
         for bits, flux, place in zip(codes.BITS, grid[::2], grid[1::2], strict=True):
@@ -125,8 +152,12 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
                     label, style = way.name.replace("mean of ", ""), ":" if way.stealing else "-"
                     axes.semilogy(mags, shown, style, color=way.colour, lw=1.5, label=label)
             for axes, aim in ((flux, aim_mag), (place, codes.AIM_PX)):
-                axes.plot([0, limit, limit], [aim, aim, MIN_ERROR], "--", color=INK, lw=1.1, label="_aim")
-                axes.annotate("aim", (0, aim), (2, 3), textcoords="offset points", fontsize=SMALL_PT)
+                axes.plot(
+                    [0, limit, limit], [aim, aim, MIN_ERROR], "--", color=INK, lw=1.1, label="_aim"
+                )
+                axes.annotate(
+                    "aim", (0, aim), (2, 3), textcoords="offset points", fontsize=SMALL_PT
+                )
             flux.set(title=f"{bits} bits", ylabel="flux error [mag]")
             place.set_ylabel("place error [monitor px]")
             label_ends(place)
@@ -136,7 +167,8 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
 
 def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
     left = {
-        (bits, kind): faintest[bits, "exact"].axis_rms_px(kind) / faintest[bits, "round"].axis_rms_px(kind)
+        (bits, kind): faintest[bits, "exact"].axis_rms_px(kind)
+        / faintest[bits, "round"].axis_rms_px(kind)
         for bits in codes.BITS
         for kind in FAMILY
     }
@@ -145,25 +177,38 @@ def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
         " of the error that round makes at the faint end"
     )
     note = "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of the error of round."
-    with chart(path, finding, 1, len(codes.BITS), note=note, share_x=True, share_y=True, height_inch=3.6) as grid:
+    with chart(
+        path, finding, 1, len(codes.BITS), note=note, share_x=True, share_y=True, height_inch=3.6
+    ) as grid:
         for bits, axes in zip(codes.BITS, grid, strict=True):
             for place, kind in enumerate(FAMILY):
-                rounded, exact = (faintest[bits, name].axis_rms_px(kind) for name in ("round", "exact"))
+                rounded, exact = (
+                    faintest[bits, name].axis_rms_px(kind) for name in ("round", "exact")
+                )
                 axes.plot([exact, rounded], [place, place], color=MUTED, lw=1)
                 axes.plot(rounded, place, "o", color=ORANGE, label="_" if place else "round")
                 axes.plot(exact, place, "o", color=BLUE, label="_" if place else "exact")
                 beside: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALL_PT}
                 axes.annotate(f"{left[bits, kind]:.2f}", (rounded, place), (6, 0), **beside)
-            axes.set(xscale="log", title=f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white", xlabel="error [monitor px]")
+            axes.set(
+                xscale="log",
+                title=f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white",
+                xlabel="error [monitor px]",
+            )
             axes.margins(x=0.2, y=0.12)
             axes.grid(visible=False, axis="y")
         grid[0].set_yticks(range(len(FAMILY)), FAMILY)
         grid[0].invert_yaxis()
-        grid[0].figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+        grid[0].figure.legend(
+            *grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=2
+        )
 
 
 def _draw_times(
-    path: Path, faintest: dict[tuple[int, str], StarErrors], times: dict[tuple[int, str], float], load: Load
+    path: Path,
+    faintest: dict[tuple[int, str], StarErrors],
+    times: dict[tuple[int, str], float],
+    load: Load,
 ) -> None:
     width, height = codes.FRAME_PX
     note = f"{codes.STARS} stars, {width} x {height}. Circles, squares, triangles: 8, 10 and 12 bits, at the faint end."
@@ -175,12 +220,20 @@ def _draw_times(
             for bits, marker in MARKERS.items():
                 for axes, error in zip(panels, _rms(faintest[bits, way.name]), strict=True):
                     face = "none" if way.stealing else way.colour
-                    axes.loglog(times[bits, way.name], error, marker, color=way.colour, mfc=face, ms=8)
-        for axes, number, what in zip(panels, (0, 1), ("flux error, rms [mag]", "place error, rms [monitor px]"), strict=True):
+                    axes.loglog(
+                        times[bits, way.name], error, marker, color=way.colour, mfc=face, ms=8
+                    )
+        for axes, number, what in zip(
+            panels, (0, 1), ("flux error, rms [mag]", "place error, rms [monitor px]"), strict=True
+        ):
             axes.set_ylabel(what)
             axes.margins(0.1)
             places = {
-                way: (times[codes.BITS[0], way.name], _rms(faintest[codes.BITS[0], way.name])[number]) for way in codes.WAYS
+                way: (
+                    times[codes.BITS[0], way.name],
+                    _rms(faintest[codes.BITS[0], way.name])[number],
+                )
+                for way in codes.WAYS
             }
             name_at_side(axes, [(way.name, place, way.colour) for way, place in places.items()])
         panels[-1].set_xlabel("time of a frame [ms]")

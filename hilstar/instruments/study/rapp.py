@@ -94,13 +94,17 @@ def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting)
 
     def in_range(kelvin: FloatArray, response: FloatArray) -> FloatArray:
         spectrum = blackbody_exitance_w_m2_m(wavelength_nm, kelvin[:, None])
-        return np.asarray(reference / v_band_mean_w_m2_m(kelvin, weighting) * (spectrum @ (response * weight_m)))
+        return np.asarray(
+            reference / v_band_mean_w_m2_m(kelvin, weighting) * (spectrum @ (response * weight_m))
+        )
 
     ones = np.ones_like(wavelength_nm)
     average = in_range(np.array([REFERENCE_TEMPERATURE_K]), ones)[0]
     irradiance = in_range(temperature_k, ones) / average
     photons = in_range(temperature_k, photons_per_j) / (average * mean_photons_per_j)
-    electrons = dgs_electrons_per_s(temperature_k, optics, photometry) / ags_electrons_per_s(optics, photometry)
+    electrons = dgs_electrons_per_s(temperature_k, optics, photometry) / ags_electrons_per_s(
+        optics, photometry
+    )
     return np.stack((irradiance, photons, electrons))
 
 
@@ -116,7 +120,8 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the"
         f" average one at 3000 K,"
         f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by"
-        f" {100 * (hottest - 1):+.1f} %" + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
+        f" {100 * (hottest - 1):+.1f} %"
+        + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
     )
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the"
@@ -154,7 +159,9 @@ def bench_rapp(
     rows = [row for field in fields for row in _star_rows(field, stars)]
     write_csv(directory / "rapp_stars.csv", STAR_COLUMNS, rows)
     findings = [ChartFinding("rapp_bench", text)]
-    findings += [ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}") for field in fields]
+    findings += [
+        ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}") for field in fields
+    ]
     table = [(finding.figure, finding.text) for finding in findings]
     write_csv(directory / "findings.csv", ("figure", "finding"), table)
     return findings
@@ -174,11 +181,15 @@ def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
     """The stars of a bench, and the electrons of each (n,) over those by the average model."""
     config = file.config
     spectral, average = (
-        bench_stars(structs.replace(config, sky=structs.replace(config.sky, brightness=model)), file.folder)
+        bench_stars(
+            structs.replace(config, sky=structs.replace(config.sky, brightness=model)), file.folder
+        )
         for model in ("dgs", "ags")
     )
     if not len(spectral):
-        raise InputError(f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude")
+        raise InputError(
+            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude"
+        )
     return spectral, spectral.electrons_per_s / average.electrons_per_s
 
 

@@ -22,7 +22,12 @@ from hilstar.sky.spectrum import load_curve
 Value = str | float | tuple[int, int]
 Table = Mapping[str, Value]
 
-TRACKER: Table = {"aperture_mm": 30, "focal_length_mm": 70, "pixel_pitch_um": 13, "quantum_efficiency": "ccd47-20"}
+TRACKER: Table = {
+    "aperture_mm": 30,
+    "focal_length_mm": 70,
+    "pixel_pitch_um": 13,
+    "quantum_efficiency": "ccd47-20",
+}
 FULL_HD: Table = {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65}
 APERTURE_MM = 30.0
 GLASS = "n-bk7-10mm"
@@ -62,7 +67,9 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
     for k in range(len(rates)):
         rest = np.arange(len(rates)) != k
         table = fit_table(library.bv_mag[rest], library.vi_mag[rest], rates[rest])
-        one = table.electrons_per_s(np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1])
+        one = table.electrons_per_s(
+            np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1]
+        )
         errors[k] = one[0] / rates[k] - 1
     return errors
 
@@ -79,7 +86,9 @@ def held_out_by_type(rates: FloatArray) -> FloatArray:
         rest = np.delete(np.arange(len(rates)), own)
         part = replace(library, bv_mag=library.bv_mag[rest], vi_mag=library.vi_mag[rest])
         table = fit_spectra(kind[rest], part, rates[rest])
-        found = table.electrons_per_s(np.zeros(2), library.bv_mag[own], library.vi_mag[own], kind[own])
+        found = table.electrons_per_s(
+            np.zeros(2), library.bv_mag[own], library.vi_mag[own], kind[own]
+        )
         errors[own] = found / rates[own] - 1
     return errors
 
@@ -95,7 +104,11 @@ class Isolation:
 
 
 def lone_windows(
-    sprites: Sprites, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], isolation: Isolation
+    sprites: Sprites,
+    x_px: FloatArray,
+    y_px: FloatArray,
+    size_px: tuple[int, int],
+    isolation: Isolation,
 ) -> Iterator[tuple[int, Window]]:
     """Each isolated star whose window lies on an image of `size_px` (width, height), with that
     window.
@@ -110,7 +123,13 @@ def lone_windows(
         top, bottom = y_px[own].min() - margin, y_px[own].max() + margin
         if left < 0 or top < 0 or right > width - 1 or bottom > height - 1:
             continue
-        near = (x_px > left - margin) & (x_px < right + margin) & (y_px > top - margin) & (y_px < bottom + margin) & ~own
+        near = (
+            (x_px > left - margin)
+            & (x_px < right + margin)
+            & (y_px > top - margin)
+            & (y_px < bottom + margin)
+            & ~own
+        )
         if light[near].sum() <= isolation.max_share * light[own].sum():
             yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
 

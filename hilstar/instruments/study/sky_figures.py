@@ -122,7 +122,9 @@ def frames(directory: Path) -> ChartFinding:
         image.plot(cam[inside, 0], cam[inside, 1], ".", ms=3, color=BLUE)
         image.plot(0, 0, "+", ms=14, mew=2, color=ORANGE)
         for axes, name, colour in ((sky, "stars", BLUE), (image, "boresight", ORANGE)):
-            axes.text(1, 1.03, name, color=colour, ha="right", transform=axes.transAxes, fontsize=SMALL_PT)
+            axes.text(
+                1, 1.03, name, color=colour, ha="right", transform=axes.transAxes, fontsize=SMALL_PT
+            )
         image.invert_yaxis()
         image.set(xlabel="x [1]", ylabel="y [1]", title="Camera frame (cam)", aspect="equal")
     _write_frames(directory / "frames.csv", catalog.hip[inside], vectors[inside], cam[inside])
@@ -166,12 +168,18 @@ def sun(directory: Path) -> ChartFinding:
     )
     at_nm = np.array(QUOTED_NM)
     share = spectrum(at_nm) / body(at_nm)
-    quoted = ", ".join(f"{ratio:.2f} at {nm:.0f} nm" for ratio, nm in zip(share.tolist(), QUOTED_NM, strict=True))
+    quoted = ", ".join(
+        f"{ratio:.2f} at {nm:.0f} nm" for ratio, nm in zip(share.tolist(), QUOTED_NM, strict=True)
+    )
     text = f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K, scaled in V: {quoted}"
-    note = "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
+    note = (
+        "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
+    )
     with chart(directory / "sun", text, note=note) as (axes,):
         axes.plot(SHOWN_NM, spectrum(SHOWN_NM), color=INK, label=f"{SUN_TYPE}, observed")
-        axes.plot(SHOWN_NM, body(SHOWN_NM), color=ORANGE, label=f"black body, {SUN_TEMPERATURE_K:.0f} K")
+        axes.plot(
+            SHOWN_NM, body(SHOWN_NM), color=ORANGE, label=f"black body, {SUN_TEMPERATURE_K:.0f} K"
+        )
         axes.set(xlabel="wavelength [nm]", ylabel="F_lambda over its mean in V [1]")
         axes.legend()
     table = np.column_stack((SHOWN_NM, spectrum(SHOWN_NM), body(SHOWN_NM)))
@@ -203,7 +211,9 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
         plain_ticks(axes.xaxis, VEGA_TICKS_NM)
         axes.legend()
     table = np.column_stack((nm, flux, body))
-    write_csv(directory / "vega_logarithmic.csv", ("wavelength_nm", "vega", "blackbody"), table.tolist())
+    write_csv(
+        directory / "vega_logarithmic.csv", ("wavelength_nm", "vega", "blackbody"), table.tolist()
+    )
     return ChartFinding("vega_logarithmic", text)
 
 
@@ -214,7 +224,9 @@ def backgrounds(directory: Path) -> ChartFinding:
     lights |= {name: times * _photons(earthshine) for name, times in EARTHSHINES.items()}
     lights["from the ground"] = _glow_photons()
     total = {name: float(np.nansum(values)) for name, values in lights.items()}
-    high, twice, low = (total[name] for name in ("earthshine, 38°", "earthshine, 24°", "earthshine, 50°"))
+    high, twice, low = (
+        total[name] for name in ("earthshine, 38°", "earthshine, 24°", "earthshine, 50°")
+    )
     sky = total["zodiacal, V = 22.1"]
     text = (
         f"Zodiacal light of V = 22.1 has {sky:.0f} photons/s/m2/arcsec2 (300 to 1100 nm);"

@@ -88,7 +88,9 @@ def spent(work: Callable[[], object]) -> Spent:
     return Spent(1e3 * wall_s, 1e3 * (time.process_time() - begin_cpu))
 
 
-def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf) -> dict[str, list[Spent]]:
+def in_turn(
+    works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf
+) -> dict[str, list[Spent]]:
     """The times of at most `rounds` calls of each work, which is given the number of its round.
 
     Each round has an order of its own, so that no work always follows the same one. A work that has
@@ -107,7 +109,10 @@ def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: 
 
 def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
     """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
-    return {name: float(np.median([one.wall_ms for one in took])) for name, took in in_turn(works, rounds).items()}
+    return {
+        name: float(np.median([one.wall_ms for one in took]))
+        for name, took in in_turn(works, rounds).items()
+    }
 
 
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
@@ -192,20 +197,31 @@ def measured(step: Trials, budget_s: float) -> Trials:
     others = OtherWork()
     works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
     times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
-    low, middle, high = np.array([np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]).T
+    low, middle, high = np.array(
+        [np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]
+    ).T
     load = others.load()
     errors = [max(trial.error, step.error.floor) for trial in step.trials]
     # On a busy machine every method counts as beaten: none is on the front.
     beaten = beaten_by(errors, middle) | load.busy
     found = [
-        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any())
+        replace(
+            trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any()
+        )
         for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
     ]
     own = next(k for k, trial in enumerate(found) if trial.is_default)
     if not found[own].on_front and not load.busy:
-        best = min((trial for trial, beats in zip(found, beaten[own], strict=True) if beats), key=lambda trial: trial.time_ms)
+        best = min(
+            (trial for trial, beats in zip(found, beaten[own], strict=True) if beats),
+            key=lambda trial: trial.time_ms,
+        )
         saved = 100 * (1 - best.time_ms / found[own].time_ms)
-        noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= found[own].quartiles_ms[0] else ""
+        noise = (
+            ", and the quartiles of both overlap"
+            if best.quartiles_ms[1] >= found[own].quartiles_ms[0]
+            else ""
+        )
         why = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {step.why_default}"
         found[own] = replace(found[own], beaten=why)
     return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms), load=load)
@@ -223,7 +239,9 @@ class OtherWork:
         """How many cores the others took on average since creation; 0 where the system does not
         say.
         """
-        all_s, others_s = (now - before for now, before in zip(self._times_s(), self._before, strict=True))
+        all_s, others_s = (
+            now - before for now, before in zip(self._times_s(), self._before, strict=True)
+        )
         return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
 
     def load(self) -> Load:
@@ -236,11 +254,16 @@ class OtherWork:
         other processes.
         """
         try:
-            ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
+            ticks = [
+                int(word)
+                for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]
+            ]
         except (OSError, ValueError):
             return 0.0, 0.0
         each_s = 1 / os.sysconf("SC_CLK_TCK")
         user, nice, system, idle, waiting, *interrupts = ticks
         busy = user + nice + system + sum(interrupts)
         own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        return (busy + idle + waiting) * each_s, busy * each_s - sum(used.ru_utime + used.ru_stime for used in own)
+        return (busy + idle + waiting) * each_s, busy * each_s - sum(
+            used.ru_utime + used.ru_stime for used in own
+        )

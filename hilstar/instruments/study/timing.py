@@ -65,7 +65,12 @@ class StripeCase:
         return f"{self.refreshes:g} refreshes, rows lit {self.lit_ms:.3g} ms"
 
 
-STRIPE_CASES = (StripeCase(0.6, 4.0), StripeCase(2.4, 4.0), StripeCase(2.0, 4.0), StripeCase(2.4, 1e3 / REFRESH_HZ))
+STRIPE_CASES = (
+    StripeCase(0.6, 4.0),
+    StripeCase(2.4, 4.0),
+    StripeCase(2.0, 4.0),
+    StripeCase(2.4, 1e3 / REFRESH_HZ),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +88,11 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
     """The rows of one case, every so many."""
     exposure_s = case.refreshes / REFRESH_HZ
     tables: dict[str, settings.Table] = {
-        "tracker": {"resolution_px": STRIPE_SIZE_PX, "exposure_s": exposure_s, "transmission": settings.GLASS},
+        "tracker": {
+            "resolution_px": STRIPE_SIZE_PX,
+            "exposure_s": exposure_s,
+            "transmission": settings.GLASS,
+        },
         "sky": {"faintest_v_mag": 3.0},
         "monitor": {**settings.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
         "collimator": {"focal_length_mm": 350},
@@ -100,14 +109,28 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
                 tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
             )  # the left edge: the boresight's stars are elsewhere
             tracker.close()
-    config, x, y = file.config, np.zeros(STRIPE_ROWS)[::EVERY_ROWS], np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
-    geometry = BenchGeometry(bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent))
-    screen_late_s = scan_of(config.monitor).late_s(*geometry.to_monitor(x, y), config.monitor.resolution_px)
+    config, x, y = (
+        file.config,
+        np.zeros(STRIPE_ROWS)[::EVERY_ROWS],
+        np.arange(float(STRIPE_ROWS))[::EVERY_ROWS],
+    )
+    geometry = BenchGeometry(
+        bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent)
+    )
+    screen_late_s = scan_of(config.monitor).late_s(
+        *geometry.to_monitor(x, y), config.monitor.resolution_px
+    )
     # middle rows begin together
     late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)
     foretold = seen_at(Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3), late).light
     return [
-        StripePoint(case.refreshes, case.lit_ms, int(y[row]), float(light[0][row] / light[1][row]), float(foretold[row]))
+        StripePoint(
+            case.refreshes,
+            case.lit_ms,
+            int(y[row]),
+            float(light[0][row] / light[1][row]),
+            float(foretold[row]),
+        )
         for row in np.flatnonzero(light[1])  # the first and last see past the screen
     ]
 
@@ -145,7 +168,11 @@ def draw_stripes(path: Path, points: list[StripePoint]) -> str:
     )
     with chart(path, finding, note=note) as (axes,):
         for case, colour in zip(STRIPE_CASES, SERIES, strict=False):
-            mine = [point for point in points if (point.refreshes, point.lit_ms) == (case.refreshes, case.lit_ms)]
+            mine = [
+                point
+                for point in points
+                if (point.refreshes, point.lit_ms) == (case.refreshes, case.lit_ms)
+            ]
             rows = [point.row for point in mine]
             axes.plot(rows, [point.foretold for point in mine], color=colour, label=case.words)
             axes.plot(rows, [point.light for point in mine], "o", ms=3, color=colour, label="_seen")
@@ -195,7 +222,9 @@ FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
 COST_ROUNDS = 9
 
 
-def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]) -> FloatArray:
+def frame_weights(
+    rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]
+) -> FloatArray:
     """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r);
     `rows` from 0 to 1.
 
@@ -215,10 +244,16 @@ class ScanningPanel(Closing):
     Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
     """
 
-    def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
+    def __init__(
+        self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0
+    ) -> None:
         held: settings.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
         tables: dict[str, settings.Table] = {
-            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": settings.GLASS},
+            "tracker": {
+                "resolution_px": (800, 640),
+                "exposure_s": exposure_s,
+                "transmission": settings.GLASS,
+            },
             "sky": {"faintest_v_mag": 6.0},
             "monitor": {**settings.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
             "collimator": {"focal_length_mm": 350},
@@ -229,11 +264,15 @@ class ScanningPanel(Closing):
         self.bench = settings.study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
-        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
+        self.panel_scan = replace(
+            self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s
+        )
         tracker = config.tracker
         self.exposure_s = tracker.exposure_s
         self.camera = tracker_camera(tracker, self.bench.file.folder)
-        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf)
+        self.optics = TwinOptics(
+            BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf
+        )
         self.panel = self.bench.panel
 
     def attitude(self, movement: Movement, swap_s: float) -> Attitude:
@@ -260,17 +299,23 @@ class ScanningPanel(Closing):
         first = math.floor((span_s[0] - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
         numbers = range(first, math.ceil(span_s[1] / self.period_s) + 1)
         swaps_s = [number * self.period_s for number in numbers]
-        weights = frame_weights((np.arange(height) + 0.5) / height, swaps_s, self.panel_scan, span_s)
+        weights = frame_weights(
+            (np.arange(height) + 0.5) / height, swaps_s, self.panel_scan, span_s
+        )
         light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
         for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
             if weight.any():
-                light += weight[:, None] * shown_light(self.levels(self.attitude(movement, swap_s), number), self.panel)
+                light += weight[:, None] * shown_light(
+                    self.levels(self.attitude(movement, swap_s), number), self.panel
+                )
         return self.optics.image_e_per_s(light)
 
     def cost_ms(self, movement: Movement) -> float:
         """Median time of drawing a frame, from its attitude to its codes, ms."""
         attitude = self.attitude(movement, 0.0)
-        return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[self.way]
+        return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[
+            self.way
+        ]
 
     def close(self) -> None:
         """Free the GL contexts."""
@@ -290,7 +335,9 @@ class TimingSky(Closing):
     def paths(self, movement: Movement) -> Sprites:
         """Each star's path over the exposure, in monitor pixels."""
         middle_s = self._shown.start_s + self._shown.exposure_s / 2
-        motion = Motion(movement.at(round(middle_s * NS_PER_S)), movement.turn_rad_s, self._shown.exposure_s)
+        motion = Motion(
+            movement.at(round(middle_s * NS_PER_S)), movement.turn_rad_s, self._shown.exposure_s
+        )
         bench = self._shown.bench
         return smeared_sprites(bench.stars, motion, bench.camera, bench.psf)
 
@@ -319,10 +366,18 @@ class TimingCase:
     @property
     def words(self) -> str:
         """For a legend."""
-        return f"{self.refreshes:g} refreshes" + ("" if self.lit == 1 else f", lit {self.lit:g} of each")
+        return f"{self.refreshes:g} refreshes" + (
+            "" if self.lit == 1 else f", lit {self.lit:g} of each"
+        )
 
 
-CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4), TimingCase(6.0, 0.25), TimingCase(2.4, 0.25))
+CASES = (
+    TimingCase(6.0),
+    TimingCase(6.3),
+    TimingCase(2.4),
+    TimingCase(6.0, 0.25),
+    TimingCase(2.4, 0.25),
+)
 QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
 
 
@@ -350,7 +405,9 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
     for case in QUICK_CASES if quick else CASES:
         with TemporaryDirectory() as folder, ExitStack() as stack:
             path = Path(folder) / "beat.toml"
-            panel = stack.enter_context(ScanningPanel("+ smear", path, case.refreshes / 60.0, case.lit))
+            panel = stack.enter_context(
+                ScanningPanel("+ smear", path, case.refreshes / 60.0, case.lit)
+            )
             sky = stack.enter_context(TimingSky(panel))
             for number in range(STARTS):
                 panel.start_s = (number + 0.2) / STARTS * panel.period_s
@@ -358,22 +415,38 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
     return points
 
 
-def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement) -> Iterator[BeatPoint]:
+def _exposure_points(
+    case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement
+) -> Iterator[BeatPoint]:
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
-    paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
-    windows = list(settings.lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
+    paths, to_tracker, camera = (
+        sky.paths(movement),
+        panel.optics.geometry.to_tracker,
+        panel.bench.camera,
+    )
+    windows = list(
+        settings.lone_windows(
+            paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION
+        )
+    )
     # Where each star is on the monitor in the middle of the exposure, and just before and after:
     # its row, and its speed.
     middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
     middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
     vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
-    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
+    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(
+        0, 2, 1
+    )
     before, now, after = (camera.project(image) for image in images)
     speed_px_s = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
     phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
-    foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase)
+    foretold = seen_at(
+        Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase
+    )
     for index, (_, window) in enumerate(windows):
-        off_px = np.subtract(settings.centroid_px(shown, window), settings.centroid_px(true, window))
+        off_px = np.subtract(
+            settings.centroid_px(shown, window), settings.centroid_px(true, window)
+        )
         speed = speed_px_s[:, index]
         yield BeatPoint(
             case.refreshes,
@@ -420,13 +493,30 @@ def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) ->
     with chart(path, finding, panels=2, note=note) as (place, light):
         for (case, mine), colour in zip(cases.items(), SERIES, strict=False):
             foretold = seen_at(case.exposures, phases)
-            place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
-            light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
+            place.plot(
+                phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words
+            )
+            light.plot(
+                phases,
+                [magnitude(float(part)) for part in foretold.light],
+                color=colour,
+                label=case.words,
+            )
             for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
-                axes.plot([p.phase for p in mine], [getattr(p, seen) for p in mine], "o", ms=3.5, color=colour, label="_seen")
+                axes.plot(
+                    [p.phase for p in mine],
+                    [getattr(p, seen) for p in mine],
+                    "o",
+                    ms=3.5,
+                    color=colour,
+                    label="_seen",
+                )
         place.set_ylabel("shift of its place [arcsec]")
         place.set_yscale("symlog", linthresh=1.0)
-        plain_ticks(place.yaxis, [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))])
+        plain_ticks(
+            place.yaxis,
+            [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))],
+        )
         light.set_ylabel("change of its light [mag]")
         light.set_xlabel("start of the exposure after a row lights [refreshes]")
         label_ends(place, light)
@@ -455,19 +545,36 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
     errors = [settings.star_error(shown, true, window) for _, window in windows]
     flux_mag = np.array([error.flux_mag for error in errors])
-    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
+    off_arcsec = (
+        np.array([error.centroid_px for error in errors])
+        * ARCSEC_PER_RAD
+        / panel.camera.focal_length_px
+    )
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
     return TimingOutcome(
-        panel.way, movement.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(movement)
+        panel.way,
+        movement.rate_deg_s,
+        len(errors),
+        rms_arcsec,
+        float(off_arcsec.max()),
+        rms_mag,
+        panel.cost_ms(movement),
     )
 
 
 def measure(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        panels = [stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml")) for k, way in enumerate(WAYS)]
+        panels = [
+            stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml"))
+            for k, way in enumerate(WAYS)
+        ]
         sky = stack.enter_context(TimingSky(panels[0]))
-        return [compare(panel, sky, slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
+        return [
+            compare(panel, sky, slew(rate))
+            for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S)
+            for panel in panels
+        ]
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
@@ -485,7 +592,14 @@ def run(directory: Path, quick: bool = False) -> Judged:
         for o in outcomes
         if o.rate_deg_s == QUICK_RATES_DEG_S[0]
     ]
-    return load.judged([finding, *lines, *beat_findings(measure_beat(quick), directory), *stripe_findings(directory)])
+    return load.judged(
+        [
+            finding,
+            *lines,
+            *beat_findings(measure_beat(quick), directory),
+            *stripe_findings(directory),
+        ]
+    )
 
 
 def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:

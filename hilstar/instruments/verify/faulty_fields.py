@@ -85,7 +85,11 @@ class FaultyFields:
 
     def _one(self, fault: Fault) -> FaultSeen:
         if isinstance(fault, Freeze | Drop):
-            return FaultSeen(fault.name, fault.KIND, note="of the run's frames: a field that stands still has none")
+            return FaultSeen(
+                fault.name,
+                fault.KIND,
+                note="of the run's frames: a field that stands still has none",
+            )
         q, first_frame = self._attitude(fault), int(self._rng.integers(0, MASK_TURNS))
         since_ns = (lasts_ns(fault) or 0) // 2
         effects = FaultLayer(self._view, (Now(1, fault, since_ns),))
@@ -93,7 +97,9 @@ class FaultyFields:
         if isinstance(fault, AttitudeStep):
             return FaultSeen(fault.name, fault.KIND, off_px=self._stars_off_px(faulty))
         if isinstance(fault, Blank):
-            return FaultSeen(fault.name, fault.KIND, asked_e=0.0, seen_e=float(faulty.shown_e.sum()))
+            return FaultSeen(
+                fault.name, fault.KIND, asked_e=0.0, seen_e=float(faulty.shown_e.sum())
+            )
         return self._compared(fault, plain, faulty)
 
     def _compared(self, fault: Fault, plain: _Shot, faulty: _Shot) -> FaultSeen:
@@ -107,7 +113,13 @@ class FaultyFields:
             asked, shown = asked[window], shown[window]
         asked_e, seen_e = float(asked.sum()), float(shown.sum())
         if not abs(asked_e) > 0:
-            return FaultSeen(fault.name, fault.KIND, asked_e=0.0, seen_e=seen_e, note="not on the tracker's image")
+            return FaultSeen(
+                fault.name,
+                fault.KIND,
+                asked_e=0.0,
+                seen_e=seen_e,
+                note="not on the tracker's image",
+            )
         share = seen_e / asked_e
         flux_mag = magnitude(share) if share > 0 else None
         off_px = None
@@ -129,14 +141,24 @@ class FaultyFields:
         if toward is None:
             q = rng.normal(size=4)
             return np.asarray(q / np.linalg.norm(q))
-        ra_deg, dec_deg = np.degrees(np.arctan2(toward[1], toward[0])), np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
+        ra_deg, dec_deg = (
+            np.degrees(np.arctan2(toward[1], toward[0])),
+            np.degrees(np.arcsin(np.clip(toward[2], -1, 1))),
+        )
         q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
-        angle, off = rng.uniform(0, 2 * np.pi), OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
-        return propagate(q, off * self._view_rad * np.array([math.cos(angle), math.sin(angle), 0.0]), 1.0)
+        angle, off = (
+            rng.uniform(0, 2 * np.pi),
+            OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random()),
+        )
+        return propagate(
+            q, off * self._view_rad * np.array([math.cos(angle), math.sin(angle), 0.0]), 1.0
+        )
 
     def _direction(self, fault: Fault) -> FloatArray | None:
         """A fault's place on the sky; None where it has none of its own."""
-        if isinstance(fault, PlacedFault) and (fault.radec_deg is not None or fault.icrs is not None):
+        if isinstance(fault, PlacedFault) and (
+            fault.radec_deg is not None or fault.icrs is not None
+        ):
             return icrs_direction(fault)
         if isinstance(fault, Flash | StarGone):
             return self._view.star_direction(fault)
@@ -148,13 +170,17 @@ class FaultyFields:
         """
         if isinstance(fault, StarGone):
             toward = self._view.star_direction(fault)
-            rows = np.flatnonzero((self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14)
+            rows = np.flatnonzero(
+                (self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14
+            )
         else:
             rows = np.flatnonzero(frame.rows["name"] == fault.name)
         if not len(rows):
             return None
         row = frame.rows[rows[0]]
-        x, y = self._twin.assumed_geometry.to_tracker(np.array([row["x_px"]]), np.array([row["y_px"]]))
+        x, y = self._twin.assumed_geometry.to_tracker(
+            np.array([row["x_px"]]), np.array([row["y_px"]])
+        )
         return np.array([x[0], y[0]])
 
     def _whole(self, place: FloatArray) -> bool:
@@ -178,7 +204,11 @@ class FaultyFields:
         if not found.any():
             return None
         its = match.index[found]
-        return float(np.median(np.hypot(match.found.x_px[its] - x_px[found], match.found.y_px[its] - y_px[found])))
+        return float(
+            np.median(
+                np.hypot(match.found.x_px[its] - x_px[found], match.found.y_px[its] - y_px[found])
+            )
+        )
 
 
 def _middle(light: FloatArray) -> FloatArray:

@@ -41,7 +41,12 @@ from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.moving import wide_bodies
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.tracker.centroiders import FAMILY, Centroider
-from hilstar.tracker.centroids import Centroids, estimate_background, find_stars, noisiest_background
+from hilstar.tracker.centroids import (
+    Centroids,
+    estimate_background,
+    find_stars,
+    noisiest_background,
+)
 
 MIN_RESIDUALS = 3  # to an unknown
 MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
@@ -132,7 +137,10 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
         HIGHER: [(x * r2**2, y * r2**2)],
         DECENTRED: [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)],
     }
-    return {name: np.column_stack([np.concatenate(pair) for pair in columns]) for name, columns in pairs.items()}
+    return {
+        name: np.column_stack([np.concatenate(pair) for pair in columns])
+        for name, columns in pairs.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +170,14 @@ class _MotionFit:
 
     def largest(self, *names: str) -> float:
         """The largest displacement by some parts together."""
-        return float(_lengths(sum((self.moved[name] for name in names if name in self.moved), np.zeros_like(self.rest))).max())
+        return float(
+            _lengths(
+                sum(
+                    (self.moved[name] for name in names if name in self.moved),
+                    np.zeros_like(self.rest),
+                )
+            ).max()
+        )
 
 
 def _lengths(residuals: FloatArray) -> FloatArray:
@@ -240,7 +255,9 @@ class MatchTally:
     noisy_px: list[float] = field(default_factory=list)
     channels_mag: list[list[float]] = field(default_factory=list)
     out_of_gamut: int = 0
-    off_px: dict[Centroider, list[float]] = field(default_factory=lambda: {kind: [] for kind in FAMILY})
+    off_px: dict[Centroider, list[float]] = field(
+        default_factory=lambda: {kind: [] for kind in FAMILY}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +313,12 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
     to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
     fainter = [abs(magnitude(float(one))) for one in light if one > 0]
-    return GlassEffect(*(float(np.percentile(part, 95)) for part in (np.hypot(to_x - x, to_y - y), fainter or [0.0])))
+    return GlassEffect(
+        *(
+            float(np.percentile(part, 95))
+            for part in (np.hypot(to_x - x, to_y - y), fainter or [0.0])
+        )
+    )
 
 
 def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
@@ -305,7 +327,9 @@ def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
 
     The brighter one keeps its name; its light, magnitude and places become those of the sum.
     """
-    owner = _owners(np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"])
+    owner = _owners(
+        np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"]
+    )
     own = np.arange(len(owner))
     if np.array_equal(owner, own):
         return seen
@@ -356,14 +380,24 @@ class Comparison:
         tally, stars_listed = self.tally, len(seen.truth)
         seen = with_blends_as_one(seen, self.finder.psf)
         tally.summed += stars_listed - len(seen.truth)
-        windowed = [self.finder.find(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e)]
+        windowed = [
+            self.finder.find(image_e, seen.x_px, seen.y_px)
+            for image_e in (seen.sky_e, seen.shown_e)
+        ]
         images_e, true_px = (seen.sky_e, seen.shown_e), (seen.x_px, seen.y_px)
         each = {
-            kind: [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
+            kind: [
+                self.finder.placed(of, image_e, true_px, kind)
+                for of, image_e in zip(windowed, images_e, strict=True)
+            ]
             for kind in dict.fromkeys([*FAMILY, self.finder.centroider])
         }
         sky, shown = each[self.finder.centroider]
-        assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
+        assumed = (
+            shown
+            if seen.assumed_e is seen.shown_e
+            else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
+        )
         inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
         tally.at_edge += int((self._on_detector(seen, 0.0) & ~inside).sum())
         tally.not_shown += int((inside & ~drawn).sum())
@@ -376,7 +410,9 @@ class Comparison:
         for k, star in zip(listed, self._stars(seen, listed, (sky, shown, assumed)), strict=True):
             (tally.stars if found[k] else tally.lost).append(star)
         for kind, (there, here) in each.items():
-            tally.off_px.setdefault(kind, []).extend(np.hypot(*here.against(there, both)[1:]).tolist())
+            tally.off_px.setdefault(kind, []).extend(
+                np.hypot(*here.against(there, both)[1:]).tolist()
+            )
         if seen.by_channel:
             tally.out_of_gamut += int((found & ~seen.truth["in_gamut"]).sum())
             self._compare_channels(seen, np.flatnonzero(found & seen.truth["in_gamut"]))
@@ -428,10 +464,14 @@ class Comparison:
         return GlowFit(
             assumed_e_per_s_px=on_screen_median(self.twin.assumed_glow_e_per_s),
             seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
-            limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px if given is None else given,
+            limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px
+            if given is None
+            else given,
         )
 
-    def _stars(self, seen: TwinField, k: IntArray, images: tuple[Matched, Matched, Matched]) -> list[Star]:
+    def _stars(
+        self, seen: TwinField, k: IntArray, images: tuple[Matched, Matched, Matched]
+    ) -> list[Star]:
         """Rows of the stars `k` (n,), from the images of the sky, of the display, and of one
         that is as assumed.
         """
@@ -441,18 +481,32 @@ class Comparison:
         floor_mag, *floor_px = sky.against(self._catalogue(seen), k)
         off = *shown.against(sky, k), codes_mag, np.hypot(*codes_px), floor_mag, np.hypot(*floor_px)
         columns = rows["hip"], rows["v_mag"], *places, *off, rows["name"]
-        return list(itertools.starmap(Star, zip(*(column.tolist() for column in columns), strict=True)))
+        return list(
+            itertools.starmap(Star, zip(*(column.tolist() for column in columns), strict=True))
+        )
 
     def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""
-        flux_e, count = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s, len(seen.truth)
+        flux_e, count = (
+            seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s,
+            len(seen.truth),
+        )
         ones = np.ones(count, dtype=np.intp)
-        return Matched(Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1), np.arange(count, dtype=np.intp))
+        return Matched(
+            Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1),
+            np.arange(count, dtype=np.intp),
+        )
 
     def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
         flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
-        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px))
-        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf) | by_disc)
+        by_disc = seen.near_disc(
+            self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px)
+        )
+        return np.asarray(
+            shared(sky.index)
+            | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf)
+            | by_disc
+        )
 
     def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Find each star where the true lens shows it, and note how far that is from where the
@@ -465,14 +519,18 @@ class Comparison:
         off_px = shown.x_px[match[k]] - x_px, shown.y_px[match[k]] - y_px
         self.tally.displaced.append(np.column_stack([x_px, y_px, *off_px]))
 
-    def _count_mirrored(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+    def _count_mirrored(
+        self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]
+    ) -> None:
         """Count the stars that are where a mirrored screen would have them."""
         for mirror in MIRRORS if self.twin.differs else ():
             geometry = BenchGeometry(self.twin.true_camera, self.twin.camera, mirror)
             places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
             self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
 
-    def _measure_noisy(self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]) -> None:
+    def _measure_noisy(
+        self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]
+    ) -> None:
         """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
         under = estimate_background(dn, 1.0)
         # rounding's: most of the image may be clipped at 0 DN, beside a glow
@@ -483,12 +541,16 @@ class Comparison:
         matched = Matched(windowed, match)
         found = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
         tracker = self.twin.config.tracker
-        expected_dn = seen.truth["electrons_per_s"] * (tracker.exposure_s / tracker.detector.gain_e_per_dn)
+        expected_dn = seen.truth["electrons_per_s"] * (
+            tracker.exposure_s / tracker.detector.gain_e_per_dn
+        )
         k = np.flatnonzero(wanted & (match >= 0))
         k = k[found.flux[match[k]] > 0]
         its = match[k]
         self.tally.noisy_mag += magnitude(found.flux[its] / expected_dn[k]).tolist()
-        self.tally.noisy_px += np.hypot(found.x_px[its] - seen.x_px[k], found.y_px[its] - seen.y_px[k]).tolist()
+        self.tally.noisy_px += np.hypot(
+            found.x_px[its] - seen.x_px[k], found.y_px[its] - seen.y_px[k]
+        ).tolist()
 
     def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
@@ -504,7 +566,9 @@ class Comparison:
         """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
         width, height = self.twin.camera.resolution_px
         inside = (seen.x_px >= margin_px - 0.5) & (seen.x_px < width - 0.5 - margin_px)
-        return np.asarray(inside & (seen.y_px >= margin_px - 0.5) & (seen.y_px < height - 0.5 - margin_px))
+        return np.asarray(
+            inside & (seen.y_px >= margin_px - 0.5) & (seen.y_px < height - 0.5 - margin_px)
+        )
 
 
 def on_screen_median(glow_e_per_s: FloatArray) -> float:

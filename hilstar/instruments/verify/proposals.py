@@ -91,7 +91,11 @@ class _Key:
 
 
 def propose(
-    file: BenchFile, verdict: Verdict, fields: int, seed: int, on_try: Callable[[int], None] = lambda tried: None
+    file: BenchFile,
+    verdict: Verdict,
+    fields: int,
+    seed: int,
+    on_try: Callable[[int], None] = lambda tried: None,
 ) -> BenchProposal:
     """The fewest changes with which the bench of `file`, judged as `verdict`, passes over the same
     fields.
@@ -103,7 +107,9 @@ def propose(
         return BenchProposal((), None, (), 0, cannot)
     rest = _not_the_codes(verdict)
     if rest is not None:
-        return BenchProposal((), None, (), 0, f"no key of the light mends what the codes do not cause: {rest}")
+        return BenchProposal(
+            (), None, (), 0, f"no key of the light mends what the codes do not cause: {rest}"
+        )
     trials = _Trials(file, fields, seed, on_try)
     keys = _keys(verdict)
     for count in range(1, len(keys) + 1):
@@ -118,10 +124,18 @@ def propose(
                     if trials.passes(milder):
                         changes = milder
                         break
-            return BenchProposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
+            return BenchProposal(
+                changes, _verified(trials.verdicts[changes]), (), trials.tried, None
+            )
     judged = [changes for changes, one in trials.verdicts.items() if one.errors.stars]
     if not judged:
-        return BenchProposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
+        return BenchProposal(
+            (),
+            None,
+            (),
+            trials.tried,
+            f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}",
+        )
     best = min(judged, key=lambda changes: _excess(trials.verdicts[changes]))
     cannot = f"none of {trials.tried} changes passes; {_what_fails(trials.verdicts[best])}"
     return BenchProposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
@@ -139,10 +153,17 @@ def codes_at_fault(verdict: Verdict) -> bool:
     limits, errors = verdict.measured.config.verify, verdict.errors
     if not errors.looked_for:
         return False
-    beyond = p95(np.abs(errors.of("codes_mag"))) > limits.flux_mag or p95(errors.of("codes_px")) > limits.centroid_px
+    beyond = (
+        p95(np.abs(errors.of("codes_mag"))) > limits.flux_mag
+        or p95(errors.of("codes_px")) > limits.centroid_px
+    )
     # A star that the codes lose even as assumed has no error of theirs.
     lost = sum(not math.isfinite(star.codes_mag) for star in errors.lost)
-    return beyond or abs(errors.codes_zero_point_mag) > limits.flux_mag or lost > limits.lost_share * errors.looked_for
+    return (
+        beyond
+        or abs(errors.codes_zero_point_mag) > limits.flux_mag
+        or lost > limits.lost_share * errors.looked_for
+    )
 
 
 def _not_the_codes(verdict: Verdict) -> str | None:
@@ -158,7 +179,13 @@ def _not_the_codes(verdict: Verdict) -> str | None:
         return f"{elsewhere} of {errors.looked_for} stars are lost that the codes alone would show"
     for what, unit, whole, codes, limit in (
         ("centroids are", "px", errors.centroid_px(), errors.of("codes_px"), limits.centroid_px),
-        ("flux is", "mag", np.abs(errors.of("flux_mag")), np.abs(errors.of("codes_mag")), limits.flux_mag),
+        (
+            "flux is",
+            "mag",
+            np.abs(errors.of("flux_mag")),
+            np.abs(errors.of("codes_mag")),
+            limits.flux_mag,
+        ),
     ):
         left = math.sqrt(max(p95(whole) ** 2 - p95(codes) ** 2, 0.0))
         if left > limit:
@@ -169,7 +196,9 @@ def _not_the_codes(verdict: Verdict) -> str | None:
 class _Trials:
     """The verdicts on a bench file with changes, each found once over the same fields."""
 
-    def __init__(self, file: BenchFile, fields: int, seed: int, on_try: Callable[[int], None]) -> None:
+    def __init__(
+        self, file: BenchFile, fields: int, seed: int, on_try: Callable[[int], None]
+    ) -> None:
         self.file, self.fields, self.seed, self.on_try = file, fields, seed, on_try
         self.tried = 0
         self.verdicts: dict[tuple[KeyProposal, ...], Verdict] = {}
@@ -181,7 +210,10 @@ class _Trials:
             try:
                 file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
                 # `with_key` cannot set a key of a table that is not in plain form.
-                if any(getattr(getattr(file.config, one.table), one.key) != one.value for one in changes):
+                if any(
+                    getattr(getattr(file.config, one.table), one.key) != one.value
+                    for one in changes
+                ):
                     return False
                 self.verdicts[changes] = verify(file, self.fields, np.random.default_rng(self.seed))
             except InputError:
@@ -197,18 +229,32 @@ def _keys(verdict: Verdict) -> list[_Key]:
     """
     measured = verdict.measured
     render = measured.config.render
-    calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
-    keys = [] if render.quantisation == BY_COST[-1] else [_Key("render", "quantisation", BY_COST[-1:])]
+    calibrations = [
+        one for one in (measured.calibration, measured.true_calibration) if one is not None
+    ]
+    keys = (
+        [] if render.quantisation == BY_COST[-1] else [_Key("render", "quantisation", BY_COST[-1:])]
+    )
     if not render.bit_stealing and all(one.can_steal_bits for one in calibrations):
         keys.append(_Key("render", "bit_stealing", (True,)))
     if render.flux_at_white_e_per_s is None:  # a measured scale is not changed
-        brightest = DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
-        keys.append(_Key("render", "brightest_v_mag", tuple(round(brightest + step, 3) for step in BRIGHTER_MAG)))
+        brightest = (
+            DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
+        )
+        keys.append(
+            _Key(
+                "render",
+                "brightest_v_mag",
+                tuple(round(brightest + step, 3) for step in BRIGHTER_MAG),
+            )
+        )
     # Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that
     # were looked for.
     v_mag = np.array([star.v_mag for star in verdict.errors.stars + verdict.errors.lost])
     seen = math.ceil(float(v_mag.max()) * STEPS_PER_MAG) / STEPS_PER_MAG
-    faintest = (round(min(measured.config.sky.faintest_v_mag, seen) + step, 3) for step in FAINTER_MAG)
+    faintest = (
+        round(min(measured.config.sky.faintest_v_mag, seen) + step, 3) for step in FAINTER_MAG
+    )
     limits = tuple(limit for limit in faintest if (v_mag <= limit).sum() >= MIN_STARS)
     return [*keys, _Key("sky", "faintest_v_mag", limits)] if limits else keys
 
@@ -222,8 +268,13 @@ def _excess(verdict: Verdict) -> float:
     """The largest of a verdict's errors as a multiple of its limit."""
     limits, errors = verdict.measured.config.verify, verdict.errors
     lost = len(errors.lost) / errors.looked_for
-    shares = p95(np.abs(errors.of("flux_mag"))) / limits.flux_mag, p95(errors.centroid_px()) / limits.centroid_px
-    return max(*shares, lost / limits.lost_share if limits.lost_share else math.inf * lost if lost else 0.0)
+    shares = (
+        p95(np.abs(errors.of("flux_mag"))) / limits.flux_mag,
+        p95(errors.centroid_px()) / limits.centroid_px,
+    )
+    return max(
+        *shares, lost / limits.lost_share if limits.lost_share else math.inf * lost if lost else 0.0
+    )
 
 
 def _what_fails(verdict: Verdict) -> str:
@@ -232,7 +283,8 @@ def _what_fails(verdict: Verdict) -> str:
     failing = [
         row
         for row in summarise(verdict)["by_magnitude"]
-        if (row["flux_error_mag"].p95 or 0.0) > limits.flux_mag or (row["centroid_error_px"].p95 or 0.0) > limits.centroid_px
+        if (row["flux_error_mag"].p95 or 0.0) > limits.flux_mag
+        or (row["centroid_error_px"].p95 or 0.0) > limits.centroid_px
     ]
     if not failing:
         return f"at best: {verdict.reasons[0]}"
@@ -254,7 +306,9 @@ def proposal_lines(file: BenchFile, proposal: BenchProposal) -> list[str]:
 def difference(file: BenchFile, proposal: BenchProposal) -> list[str]:
     """The lines that a proposal changes in the bench file, as a unified diff."""
     before, after = file.text.splitlines(), changed_text(file.text, proposal.changes).splitlines()
-    return list(difflib.unified_diff(before, after, str(file.path), str(file.path), n=1, lineterm=""))
+    return list(
+        difflib.unified_diff(before, after, str(file.path), str(file.path), n=1, lineterm="")
+    )
 
 
 def check_writable(file: BenchFile) -> None:
@@ -264,7 +318,9 @@ def check_writable(file: BenchFile) -> None:
     except OSError as error:
         raise cannot_write(file.path, error) from error
     if not stat.S_ISREG(status.st_mode):
-        raise cannot_write(file.path, "it is no regular file", "leave --write out, and change the file yourself")
+        raise cannot_write(
+            file.path, "it is no regular file", "leave --write out, and change the file yourself"
+        )
     # Root may write what nobody should: a file without any write permission was protected by
     # somebody.
     protected = not status.st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH)
@@ -283,10 +339,16 @@ def write_proposal(file: BenchFile, proposal: BenchProposal) -> None:
 
 
 def _words(changes: tuple[KeyProposal, ...]) -> str:
-    return ", ".join(f"[{change.table}] {change.key} = {json.dumps(change.value)}" for change in changes)
+    return ", ".join(
+        f"[{change.table}] {change.key} = {json.dumps(change.value)}" for change in changes
+    )
 
 
 def _figures(verified: Verified) -> str:
     flux, centroid = verified.flux_error_mag.p95, verified.centroid_error_px.p95
-    at_95 = f"{flux:.3f} mag and {centroid:.3f} px at 95 %, " if flux is not None and centroid is not None else ""
+    at_95 = (
+        f"{flux:.3f} mag and {centroid:.3f} px at 95 %, "
+        if flux is not None and centroid is not None
+        else ""
+    )
     return f"{at_95}{verified.stars} stars, {verified.lost} lost, {verified.clipped} clipped, {verified.not_shown} not shown"

@@ -77,16 +77,25 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
         "stars": len(errors.stars),
         "flux_error_mag": spread("flux_mag"),
         "centroid_error_px": error_spread(centroid_px),
-        "centroid_error_arcsec": error_spread(centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px),
+        "centroid_error_arcsec": error_spread(
+            centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px
+        ),
         "centroider": measured.config.verify.centroider or USUAL,
-        "centroid_error_px_by": {kind: error_spread(np.array(off_px)) for kind, off_px in tally.off_px.items()},
+        "centroid_error_px_by": {
+            kind: error_spread(np.array(off_px)) for kind, off_px in tally.off_px.items()
+        },
         "lost": len(errors.lost),
         "passed": verdict.passed,
         "reasons": verdict.reasons,
-        **{name: getattr(tally, name) for name in ("blended", "clipped", "not_shown", "at_edge", "summed")},
+        **{
+            name: getattr(tally, name)
+            for name in ("blended", "clipped", "not_shown", "at_edge", "summed")
+        },
         "channels_mag": {
             key: error_spread(np.array(off))
-            for key, off in zip(measured.config.tracker.quantum_efficiencies, tally.channels_mag, strict=False)
+            for key, off in zip(
+                measured.config.tracker.quantum_efficiencies, tally.channels_mag, strict=False
+            )
         },
         "out_of_gamut": tally.out_of_gamut,
         "zero_point_mag": _finite(errors.zero_point_mag),
@@ -103,7 +112,11 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
             "centroid_px": spread("codes_px"),
             "zero_point_mag": _finite(errors.codes_zero_point_mag),
         },
-        "noisy": {"stars": len(noisy_px), "flux_mag": error_spread(noisy_mag), "centroid_px": error_spread(noisy_px)},
+        "noisy": {
+            "stars": len(noisy_px),
+            "flux_mag": error_spread(noisy_mag),
+            "centroid_px": error_spread(noisy_px),
+        },
         "by_magnitude": _by_magnitude(errors),
         "calibration": {"name": calibration.name, "sha256": calibration.sha256},
         "gl_renderer": measured.gl_renderer,
@@ -125,7 +138,10 @@ def _by_magnitude(errors: DisplayErrors) -> list[dict[str, Any]]:
     for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
         there = (v_mag >= low) & (v_mag < low + 1)
         if there.any():
-            spreads = {"flux_error_mag": error_spread(flux[there]), "centroid_error_px": error_spread(centroid[there])}
+            spreads = {
+                "flux_error_mag": error_spread(flux[there]),
+                "centroid_error_px": error_spread(centroid[there]),
+            }
             rows.append({"v_from": low, "v_to": low + 1, "stars": int(there.sum()), **spreads})
     return rows
 
@@ -141,14 +157,20 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     rest += f", {summary['not_shown']} not shown, {summary['at_edge']} at edge"
     rest += f", {summary['summed']} part of a blend" if summary["summed"] else ""
     centroid = f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])} arcsec"
-    each = ", ".join(f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items())
+    each = ", ".join(
+        f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items()
+    )
     return [
         f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}",
         f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
         f"{'centroid error':20}{centroid}, by {summary['centroider']}",
         f"{'by each centroider':20}{each} px rms",
         *(f"{key:21}{three(errors)} mag" for key, errors in summary["channels_mag"].items()),
-        *([f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"] if summary["channels_mag"] else []),
+        *(
+            [f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"]
+            if summary["channels_mag"]
+            else []
+        ),
         f"{'with detector noise':20}{three(noisy['flux_mag'])} mag, {three(noisy['centroid_px'])} px",
         *(
             f"{'V {v_from} to {v_to}'.format(**row):>17}   {row['flux_error_mag'].rms:.4f} mag rms,"
@@ -176,7 +198,11 @@ def write_report(directory: Path, verdict: Verdict) -> None:
     one cannot be written.
     """
     errors = verdict.errors
-    write_csv(directory / "stars.csv", [entry.name for entry in fields(Star)], map(astuple, errors.stars + errors.lost))
+    write_csv(
+        directory / "stars.csv",
+        [entry.name for entry in fields(Star)],
+        map(astuple, errors.stars + errors.lost),
+    )
     _draw_field(directory / "field", errors, verdict.measured.camera.resolution_px)
     if errors.stars:
         _draw_errors(directory / "errors", verdict)
@@ -186,18 +212,29 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
     errors, limits = verdict.errors, verdict.measured.config.verify
     v_mag, flux, centroid = errors.of("v_mag"), errors.of("flux_mag"), errors.centroid_px()
     word = "passes" if verdict.passed else "does not pass"
-    finding = (
-        f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within {p95(centroid):.3f} px, for 95 % of stars"
-    )
+    finding = f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within {p95(centroid):.3f} px, for 95 % of stars"
     note = f"Each point is one of {len(v_mag)} stars. The limit is for 95 % of them."
     with chart(path, finding, 2, note=note) as axes:
         for axis, values, limit, label in (
             (axes[0], np.abs(flux), limits.flux_mag, "flux error [mag]"),
             (axes[1], centroid, limits.centroid_px, "place error [tracker px]"),
         ):
-            axis.semilogy(v_mag, np.maximum(values, MIN_SHARE * limit), ".", color=MUTED, ms=5, alpha=0.7, label="_star")
+            axis.semilogy(
+                v_mag,
+                np.maximum(values, MIN_SHARE * limit),
+                ".",
+                color=MUTED,
+                ms=5,
+                alpha=0.7,
+                label="_star",
+            )
             axis.axhline(limit, color=RED, linestyle="--", linewidth=1.4, label="limit")
-            axis.axhline(max(p95(values), MIN_SHARE * limit), color=BLUE, linewidth=1.4, label="95 % of stars")
+            axis.axhline(
+                max(p95(values), MIN_SHARE * limit),
+                color=BLUE,
+                linewidth=1.4,
+                label="95 % of stars",
+            )
             axis.set_ylabel(label)
             label_ends(axis)
         axes[1].set_xlabel("V [mag]")
@@ -207,10 +244,22 @@ def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int
     x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
     longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
     finding = f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are lost"
-    note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (" Red crosses: lost stars." if errors.lost else "")
+    note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (
+        " Red crosses: lost stars." if errors.lost else ""
+    )
     with chart(path, finding, note=note, height_inch=7.4) as (axis,):
         axis.plot(x, y, ".", color=MUTED, markersize=3)
-        arrows = axis.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=longest / arrow_px, width=0.002, color=BLUE)
+        arrows = axis.quiver(
+            x,
+            y,
+            dx,
+            dy,
+            angles="xy",
+            scale_units="xy",
+            scale=longest / arrow_px,
+            width=0.002,
+            color=BLUE,
+        )
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
         axis.quiverkey(arrows, 0.86, 1.03, longest, f"{longest:.2g} px", **key)
         axis.plot([s.x_px for s in errors.lost], [s.y_px for s in errors.lost], "x", color=RED)
@@ -220,4 +269,6 @@ def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int
         axis.set_xlabel("x [tracker px]")
         axis.set_ylabel("y [tracker px]")
         if errors.lost:
-            axis.annotate("lost", (0.6, 1.015), xycoords="axes fraction", color=RED, fontsize=SMALL_PT)
+            axis.annotate(
+                "lost", (0.6, 1.015), xycoords="axes fraction", color=RED, fontsize=SMALL_PT
+            )

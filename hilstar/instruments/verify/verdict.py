@@ -57,8 +57,14 @@ class DisplayErrors:
 def display_errors(measured: Measured) -> DisplayErrors:
     """The errors of all fields' stars."""
     stars = measured.tally.stars
-    zero_point, codes_zero_point = median([s.flux_mag for s in stars]), median([s.codes_mag for s in stars])
-    stars = [replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point) for s in stars]
+    zero_point, codes_zero_point = (
+        median([s.flux_mag for s in stars]),
+        median([s.codes_mag for s in stars]),
+    )
+    stars = [
+        replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point)
+        for s in stars
+    ]
     displaced = np.concatenate([np.empty((0, 4)), *measured.tally.displaced])
     geometry = fit_geometry(displaced, measured.camera, measured.config.verify.centroid_px)
     return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
@@ -86,7 +92,15 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
     # A few stars found by chance, or far from the middle of their windows, say nothing about light.
     mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
     light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
-    return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors), *too_wide]
+    return [
+        *lost,
+        *centroid,
+        *geometry,
+        *light,
+        *_black(measured),
+        *_floor(measured, errors),
+        *too_wide,
+    ]
 
 
 def _none(measured: Measured) -> str:
@@ -118,10 +132,10 @@ def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
         cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
     for mirror, count in tally.mirrored.items():
         if count > MIN_SHARE * looked_for:
-            cause = (
-                f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
-            )
-    return [f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
+            cause = f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
+    return [
+        f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"
+    ]
 
 
 def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
@@ -136,7 +150,11 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
     fit, limit = errors.geometry, measured.config.verify.centroid_px
     if fit is None or fit.left > MAX_LEFT:
         return []
-    reach_px, found, measured_lens = math.hypot(*measured.camera.resolution_px) / 2, [], measured.config.collimator.geometry
+    reach_px, found, measured_lens = (
+        math.hypot(*measured.camera.resolution_px) / 2,
+        [],
+        measured.config.collimator.geometry,
+    )
     again = "its geometry file does not say so; run hilstar calibrate geometric again"
     if abs(fit.scale_error) * reach_px > limit:
         cure = again if measured_lens else "look at focal_length_mm and pixel_pitch_um"
@@ -148,7 +166,10 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
         right, down = fit.offset_px
         cure = again if measured_lens else "look at q_cam_to_mon and principal_point_px"
         found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
-    return [*found, *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it")]
+    return [
+        *found,
+        *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it"),
+    ]
 
 
 def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
@@ -156,11 +177,15 @@ def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
     found = []
     if fit.tilt_px > limit_px:
         a, b = (math.degrees(angle) for angle in fit.tilt_rad)
-        found.append(f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}")
+        found.append(
+            f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}"
+        )
     if fit.distortion_px > limit_px:
         found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
     if fit.left_px > limit_px:
-        found.append(f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion")
+        found.append(
+            f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion"
+        )
     return found
 
 
@@ -174,10 +199,16 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     if seen > limit:
         response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
         cause = ": light does not follow the codes as assumed, look at the monitor's response and uniformity"
-        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}")
+        found.append(
+            f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
+        )
     offset, of_codes = errors.zero_point_mag, errors.codes_zero_point_mag
     if abs(offset) > limit:
-        cause = f"the codes alone make {of_codes:+.3f}" if abs(of_codes) > limit else "look at flux_at_white_e_per_s"
+        cause = (
+            f"the codes alone make {of_codes:+.3f}"
+            if abs(of_codes) > limit
+            else "look at flux_at_white_e_per_s"
+        )
         # A wrong response moves the median star too: then white may well be right.
         if not (found and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
             found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
@@ -225,12 +256,24 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     # What is proposed has to suit the monitor as it is, too.
-    calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
+    calibrations = [
+        one for one in (measured.calibration, measured.true_calibration) if one is not None
+    ]
     ways = [f'quantisation = "{BY_COST[-1]}"'] if render.quantisation != BY_COST[-1] else []
-    ways += ["bit_stealing = true"] if not render.bit_stealing and all(c.can_steal_bits for c in calibrations) else []
-    ways += ["more bits" if all(c.is_formula for c in calibrations) else "a monitor calibrated on more bits"]
+    ways += (
+        ["bit_stealing = true"]
+        if not render.bit_stealing and all(c.can_steal_bits for c in calibrations)
+        else []
+    )
+    ways += [
+        "more bits"
+        if all(c.is_formula for c in calibrations)
+        else "a monitor calibrated on more bits"
+    ]
     ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
-    return [f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"]
+    return [
+        f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"
+    ]
 
 
 @dataclass(frozen=True, slots=True)

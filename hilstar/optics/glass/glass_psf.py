@@ -69,14 +69,18 @@ class NodeSpline:
         if len(nodes) > max_degree + 1:
             self._of = make_interp_spline(nodes, np.eye(len(nodes)), max_degree)
         else:  # one polynomial, which is quicker
-            self._terms = np.linalg.inv(polyvander((nodes - self._middle) / self._half, len(nodes) - 1)).T
+            self._terms = np.linalg.inv(
+                polyvander((nodes - self._middle) / self._half, len(nodes) - 1)
+            ).T
 
     def __call__(self, at: FloatArray) -> FloatArray:
         """The functions (n, k) at places (n,)."""
         at = np.clip(at, self._nodes[0], self._nodes[-1])
         if self._of is not None:
             return np.asarray(self._of(at))
-        return np.asarray((self._terms @ polyvander((at - self._middle) / self._half, len(self._nodes) - 1).T).T)
+        return np.asarray(
+            (self._terms @ polyvander((at - self._middle) / self._half, len(self._nodes) - 1).T).T
+        )
 
 
 class Field:
@@ -104,7 +108,9 @@ class Field:
     def _holds(self, degree: int) -> bool:
         """Whether the points determine a polynomial of that degree with some to spare."""
         x, y = self._scaled(self.places_px).T
-        terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+        terms = np.stack(
+            [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
+        )
         enough = terms.shape[1] * 1.4 <= len(x) if degree > 1 else terms.shape[1] <= len(x)
         return bool(enough and np.linalg.matrix_rank(terms, tol=1e-6 * len(x)) == terms.shape[1])
 
@@ -127,7 +133,9 @@ class Field:
         off = places[:, None] - begin
         left = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
         outside = np.flatnonzero(
-            (left < -ON_EDGE_PX * self._scale).any(axis=1) if len(begin) > 2 else np.ones(len(places), bool)
+            (left < -ON_EDGE_PX * self._scale).any(axis=1)
+            if len(begin) > 2
+            else np.ones(len(places), bool)
         )
         if len(outside):
             length2 = np.maximum((along * along).sum(axis=1), 1e-300)
@@ -146,7 +154,10 @@ class Field:
         kernels: tuple[Kernel, ...] = "linear", "thin_plate_spline", "quintic", "quintic"
         kernel = kernels[self._degree]
         found: Callable[[FloatArray], FloatArray] = RBFInterpolator(
-            self._scaled(self.places_px), np.eye(len(self.places_px)), kernel=kernel, degree=self._degree
+            self._scaled(self.places_px),
+            np.eye(len(self.places_px)),
+            kernel=kernel,
+            degree=self._degree,
         )
         return found
 
@@ -156,7 +167,9 @@ class Field:
         if len(self.places_px) == 1 or not len(places):
             return np.ones((len(places), len(self.places_px)))
         if self._grid is not None:
-            across, down = (spline(place) for spline, place in zip(self._grid, places.T, strict=True))
+            across, down = (
+                spline(place) for spline, place in zip(self._grid, places.T, strict=True)
+            )
             return np.asarray((across.T[:, None] * down.T).reshape(-1, len(places)).T)
         return np.asarray(self._scattered(self._scaled(places)))
 
@@ -232,7 +245,10 @@ class GlassPsf(SampledPsf):
         flat = self.optics.weights.reshape(-1, len(self.optics.basis))
         peak = (flat @ self.optics.basis.reshape(len(self.optics.basis), -1)).max(axis=1)
         sharpest = np.tensordot(flat[peak.argmax()], self.optics.basis, axes=1).clip(min=0)
-        widths = [_Measured(samples, self.per_px, self.pixel_integrated).width_px for samples in (self.samples, sharpest)]
+        widths = [
+            _Measured(samples, self.per_px, self.pixel_integrated).width_px
+            for samples in (self.samples, sharpest)
+        ]
         x, y = np.min(widths, axis=0).tolist()
         return x, y
 
@@ -245,10 +261,14 @@ class GlassPsf(SampledPsf):
         y, x = np.indices((height, width))
         ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
         light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
-        left_out = np.abs(1 - np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)).max(axis=0)
+        left_out = np.abs(
+            1 - np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
+        ).max(axis=0)
         wide = np.flatnonzero(left_out > MAX_CUT)
         last = min(int(wide[-1]) + 1 if len(wide) else 0, len(left_out) - 1)
-        side = 2 * math.ceil((last + 0.5) / self.per_px + (0.5 if self.pixel_integrated else 0.0)) + 1
+        side = (
+            2 * math.ceil((last + 0.5) / self.per_px + (0.5 if self.pixel_integrated else 0.0)) + 1
+        )
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
                 f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what lies further out"
@@ -272,7 +292,9 @@ class GlassPsf(SampledPsf):
         side = self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
         shape = self.optics.basis.shape[1:]
-        found = (_pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated) for size in shape)
+        found = (
+            _pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated) for size in shape
+        )
         return [part.reshape(steps + 1, side, -1) for part in found]
 
     @cached_property
@@ -294,32 +316,47 @@ class GlassPsf(SampledPsf):
         reduced to few stamps.
         """
         side, squares = self.footprint_px, self._squares
-        steps_a_square = min(MAX_STEPS, max(MIN_STEPS, min(TABLE_SIDE // side, MAX_STEPS * 6) // squares))
+        steps_a_square = min(
+            MAX_STEPS, max(MIN_STEPS, min(TABLE_SIDE // side, MAX_STEPS * 6) // squares)
+        )
         steps, count = steps_a_square * squares, len(self.optics.basis)
-        down, across = (_normal_floats(part.reshape(-1, part.shape[2])) for part in self._tabulated(steps))
-        used = np.maximum(np.sqrt((self.optics.weights**2).mean(axis=(0, 1))), 1e-30).astype(np.float32)
+        down, across = (
+            _normal_floats(part.reshape(-1, part.shape[2])) for part in self._tabulated(steps)
+        )
+        used = np.maximum(np.sqrt((self.optics.weights**2).mean(axis=(0, 1))), 1e-30).astype(
+            np.float32
+        )
         table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
         for image, scale, own in zip(_normal_floats(self.optics.basis), used, table, strict=True):
             pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
             own[:] = pixels.transpose(0, 2, 1, 3).reshape(own.shape)
         stamps, coefficients = _few(table.reshape(-1, side * side), side)
-        by_place = (coefficients.reshape(count, -1) / used[:, None]).reshape(count, steps + 1, steps + 1, -1)
+        by_place = (coefficients.reshape(count, -1) / used[:, None]).reshape(
+            count, steps + 1, steps + 1, -1
+        )
         places = np.linspace(-1, 1, steps_a_square + 1)
         y, x = (part.ravel() for part in np.meshgrid(places, places, indexing="ij"))
         fit = np.linalg.pinv(_terms(x, y)).astype(np.float32)
         parts = np.empty((squares**2, fit.shape[0], count, len(stamps)), dtype=np.float32)
         for number, own in enumerate(parts):
             row, column = (steps_a_square * place for place in divmod(number, squares))
-            square = by_place[:, row : row + steps_a_square + 1, column : column + steps_a_square + 1]
+            square = by_place[
+                :, row : row + steps_a_square + 1, column : column + steps_a_square + 1
+            ]
             own[:] = np.tensordot(fit, square.reshape(count, -1, len(stamps)), axes=(1, 1))
         light = table.sum(axis=2) / used[:, None]
-        return _Stamps(stamps, parts.reshape(squares**2, -1, len(stamps)), stamps.sum(axis=1), light)
+        return _Stamps(
+            stamps, parts.reshape(squares**2, -1, len(stamps)), stamps.sum(axis=1), light
+        )
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
         """How much stars at places (n,) have of each basis image (n, K); `shares` as in
         `of_stars`.
         """
-        by_field, shares = self.field(x_px, y_px).T.astype(np.float32), shares.T.astype(np.float32, order="C")
+        by_field, shares = (
+            self.field(x_px, y_px).T.astype(np.float32),
+            shares.T.astype(np.float32, order="C"),
+        )
         by_point = by_field[:, None] * shares.reshape(shares.shape[0], -1)
         return np.asarray(by_point.reshape(len(self._light), -1).T @ self._light)
 
@@ -357,10 +394,14 @@ class GlassPsf(SampledPsf):
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
         x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
-        firsts = np.stack([self.optics.basis.sum(axis=1) @ x, self.optics.basis.sum(axis=2) @ y], axis=1)
+        firsts = np.stack(
+            [self.optics.basis.sum(axis=1) @ x, self.optics.basis.sum(axis=2) @ y], axis=1
+        )
         return np.asarray(self.optics.weights @ firsts / self.per_px)
 
-    def centroids_px(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def centroids_px(
+        self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The centroids (n,) of the light of stars at places (n,), px, and their illumination
         relative to the axis.
 
@@ -370,14 +411,22 @@ class GlassPsf(SampledPsf):
         falls = optics.illumination * optics.inside
         total = ((by_field @ falls) * shares).sum(axis=1)
         lit = total > DARK
-        off = [((by_field @ (falls * off)) * shares).sum(axis=1) for off in np.moveaxis(self.moved_px, 2, 0)]
+        off = [
+            ((by_field @ (falls * off)) * shares).sum(axis=1)
+            for off in np.moveaxis(self.moved_px, 2, 0)
+        ]
         x, y = (
-            place + np.where(lit, first / np.where(lit, total, 1), 0) for place, first in zip((x_px, y_px), off, strict=True)
+            place + np.where(lit, first / np.where(lit, total, 1), 0)
+            for place, first in zip((x_px, y_px), off, strict=True)
         )
         return x, y, ((by_field @ optics.illumination) * shares).sum(axis=1)
 
     def of_stars(
-        self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray, electrons_per_s: FloatArray | Float32Array
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        shares: FloatArray,
+        electrons_per_s: FloatArray | Float32Array,
     ) -> Float32Array:
         """The light of stars at places (n,) in squares of pixels (n, side, side) about the pixels
         nearest to them.
@@ -385,12 +434,16 @@ class GlassPsf(SampledPsf):
         Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
         """
         order = np.argsort(_square(x_px, y_px, self._squares)[0])
-        stamps, scale = self._drawn(x_px[order], y_px[order], shares[order] if shares.ndim == 2 else shares)
+        stamps, scale = self._drawn(
+            x_px[order], y_px[order], shares[order] if shares.ndim == 2 else shares
+        )
         squares = np.empty_like(stamps)
         squares[order] = stamps * (electrons_per_s[order] * scale)[:, None]
         return squares.reshape(-1, self.footprint_px, self.footprint_px)
 
-    def _drawn(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> tuple[Float32Array, Float32Array]:
+    def _drawn(
+        self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
+    ) -> tuple[Float32Array, Float32Array]:
         """What pixels get of stars at places (n,), sorted by `_square`: (n, side^2), times
         factors (n,).
         """
@@ -398,7 +451,9 @@ class GlassPsf(SampledPsf):
         parts = self._parts(weights, x_px, y_px)
         # Polynomials and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
         light, whole = weights @ self._sums, parts @ self._stamps.sums
-        return parts @ self._stamps.stamps, np.asarray(light / np.where(whole > 0, whole, np.inf), dtype=np.float32)
+        return parts @ self._stamps.stamps, np.asarray(
+            light / np.where(whole > 0, whole, np.inf), dtype=np.float32
+        )
 
     def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
         """The same of stars of 1 electron per second, by the whole basis: exact, and some
@@ -407,16 +462,25 @@ class GlassPsf(SampledPsf):
         side = self.footprint_px
         at_px = np.arange(side) - side // 2
         found = np.empty((len(x_px), side, side))
-        for own, weights, x, y in zip(found, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True):
+        for own, weights, x, y in zip(
+            found, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True
+        ):
             image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
             down, across = (
-                _pixels_of(size, self.per_px, at_px - (place - np.floor(place + 0.5)), self.pixel_integrated)
+                _pixels_of(
+                    size,
+                    self.per_px,
+                    at_px - (place - np.floor(place + 0.5)),
+                    self.pixel_integrated,
+                )
                 for size, place in zip(image.shape, (y, x), strict=True)
             )
             own[:] = down @ image @ across.T
         return found
 
-    def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
+    def image(
+        self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]
+    ) -> Float32Array:
         """The light of sprites (n,) in all pixels (height, width), electrons per second;
         `shares` as in `of_stars`.
         """
@@ -426,14 +490,25 @@ class GlassPsf(SampledPsf):
         side, (width, height) = self.footprint_px, resolution_px
         across = width + 2 * side
         size, near = (height + 2 * side) * across, np.arange(side, dtype=np.int32)
-        near, at_once = (near[:, None] * across + near).ravel(), max(1, SPRITES_AT_ONCE_PX // side**2)
-        order, room = np.argsort(_square(sprites.x_px, sprites.y_px, self._squares)[0]), np.empty(0, np.float32)
+        near, at_once = (
+            (near[:, None] * across + near).ravel(),
+            max(1, SPRITES_AT_ONCE_PX // side**2),
+        )
+        order, room = (
+            np.argsort(_square(sprites.x_px, sprites.y_px, self._squares)[0]),
+            np.empty(0, np.float32),
+        )
         for begin in range(0, max(len(order), 1), at_once):
             part = order[begin : begin + at_once]
             x_px, y_px = sprites.x_px[part], sprites.y_px[part]
             stamps, scale = self._drawn(x_px, y_px, shares[part] if shares.ndim == 2 else shares)
-            columns, rows = (np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in (x_px, y_px))
-            places, ends = (rows * across + columns)[:, None] + near, np.arange(len(part) + 1, dtype=np.int32) * side**2
+            columns, rows = (
+                np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in (x_px, y_px)
+            )
+            places, ends = (
+                (rows * across + columns)[:, None] + near,
+                np.arange(len(part) + 1, dtype=np.int32) * side**2,
+            )
             sparse = csc_array((stamps.ravel(), places.ravel(), ends), (size, len(part)))
             light = np.asarray(sparse @ (sprites.data["electrons_per_s"][part] * scale))
             room = room + light if begin else light
@@ -446,7 +521,9 @@ class GlassPsf(SampledPsf):
         sigma = sigma_px * self.per_px
         more = math.ceil(6 * sigma)
         wide = np.pad(self.optics.basis, ((0, 0), (more, more), (more, more)))
-        spread = np.stack([np.fft.ifft2(fourier_gaussian(np.fft.fft2(image), sigma)).real for image in wide])
+        spread = np.stack(
+            [np.fft.ifft2(fourier_gaussian(np.fft.fft2(image), sigma)).real for image in wide]
+        )
         optics = replace(self.optics, basis=spread)
         return replace(self, samples=_middle(optics, self.field, self.mean_shares), optics=optics)
 
@@ -457,13 +534,16 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     """
     at_focus = NodeSpline(glass.focuses_um)(np.array([focus_um]))[0]
     weights, illumination, inside = (
-        np.tensordot(part, at_focus, axes=(2, 0)) for part in (glass.weights, glass.illumination, 1 - glass.outside)
+        np.tensordot(part, at_focus, axes=(2, 0))
+        for part in (glass.weights, glass.illumination, 1 - glass.outside)
     )
     lateral_px = np.tensordot(glass.lateral_px, at_focus, axes=(2, 0))
     basis = glass.basis.astype(np.float64)
     optics = Focused(basis, weights, illumination, inside)
     if lateral_px.any() or len(glass.focuses_um) > 1:
-        optics = _rebased(optics, lateral_px * glass.per_px, 1 if glass.pixel_integrated else glass.per_px)
+        optics = _rebased(
+            optics, lateral_px * glass.per_px, 1 if glass.pixel_integrated else glass.per_px
+        )
     field = Field(glass.places_px)
     return GlassPsf(
         _middle(optics, field, mean_shares),
@@ -488,17 +568,25 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
     area = abs(float(np.linalg.det(matrix)))
     new_per_px = max(MIN_REGRIDDED, math.ceil(per_px / math.sqrt(area)))
     to_samples = np.linalg.inv(matrix) * per_px / new_per_px
-    half_x, half_y = np.ceil(np.abs(np.linalg.inv(to_samples)) @ (np.array([width, height]) // 2)).astype(int).tolist()
+    half_x, half_y = (
+        np.ceil(np.abs(np.linalg.inv(to_samples)) @ (np.array([width, height]) // 2))
+        .astype(int)
+        .tolist()
+    )
     y, x = np.indices((2 * half_y + 1, 2 * half_x + 1)) - np.array([half_y, half_x])[:, None, None]
     columns, rows = np.tensordot(to_samples, np.stack([x, y]), axes=1)
     at = np.stack([rows + height // 2, columns + width // 2])
-    drawn: FloatArray = np.stack([map_coordinates(image, at, np.float64, SPLINE_DEGREE) for image in images])
+    drawn: FloatArray = np.stack(
+        [map_coordinates(image, at, np.float64, SPLINE_DEGREE) for image in images]
+    )
     return drawn * abs(float(np.linalg.det(to_samples))), new_per_px
 
 
 def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
     middle = field(*field.places_px.mean(axis=0)[:, None])[0]
-    return np.asarray(np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1))
+    return np.asarray(
+        np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1)
+    )
 
 
 def with_components(psf: GlassPsf, count: int) -> GlassPsf:
@@ -506,7 +594,10 @@ def with_components(psf: GlassPsf, count: int) -> GlassPsf:
     Each PSF still sums to 1.
     """
     optics = psf.optics
-    flat, basis = optics.weights.reshape(-1, len(optics.basis)), optics.basis.reshape(len(optics.basis), -1)
+    flat, basis = (
+        optics.weights.reshape(-1, len(optics.basis)),
+        optics.basis.reshape(len(optics.basis), -1),
+    )
     mean = flat.mean(axis=0)
     values, vectors = np.linalg.eigh(basis @ basis.T)
     # its square is the metric of weights
@@ -528,26 +619,34 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     y, x = np.indices((height, width))
     place = np.stack([x.ravel() - width // 2, y.ravel() - height // 2], axis=1) / psf.per_px
     images = []
-    for stamp, centroid in zip(psf._centred().astype(np.float64), psf.moved_px.reshape(-1, 2), strict=True):
+    for stamp, centroid in zip(
+        psf._centred().astype(np.float64), psf.moved_px.reshape(-1, 2), strict=True
+    ):
         off, spread = pixel - centroid, np.eye(2)
         for _ in range(WIDTH_ROUNDS):  # as `SampledPsf.width_px`
             light = stamp * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off))
             spread = 2 * (off.T * light) @ off / light.sum()
-            spread += np.eye(2) * max(0.0, PIXEL_VARIANCE + MIN_WIDTH_PX**2 - float(np.linalg.eigvalsh(spread)[0]))
+            spread += np.eye(2) * max(
+                0.0, PIXEL_VARIANCE + MIN_WIDTH_PX**2 - float(np.linalg.eigvalsh(spread)[0])
+            )
         if not psf.pixel_integrated:
             spread = spread - np.eye(2) * PIXEL_VARIANCE
         off = place - centroid
         images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
     found = np.stack(images)
     found /= found.sum(axis=1, keepdims=True)
-    basis, weights, _ = principal(found, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px)
+    basis, weights, _ = principal(
+        found, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px
+    )
     return _of_images(psf, basis.astype(np.float64), weights)
 
 
 def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassPsf:
     """A glass by other images (K, m) and weights (n, K) of its PSFs."""
     basis = images.reshape(-1, *psf.optics.basis.shape[1:])
-    weights = (weights / (weights @ images.sum(axis=1))[:, None]).reshape(*psf.optics.weights.shape[:2], -1)
+    weights = (weights / (weights @ images.sum(axis=1))[:, None]).reshape(
+        *psf.optics.weights.shape[:2], -1
+    )
     optics = replace(psf.optics, basis=basis, weights=weights)
     return replace(psf, samples=_middle(optics, psf.field, psf.mean_shares), optics=optics)
 
@@ -564,10 +663,15 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     flat, moves = optics.weights.reshape(-1, len(optics.basis)), lateral.reshape(-1, 2)
     padded = np.pad(optics.basis, ((0, 0), (room, room), (room, room)))
     unmoved = (np.tensordot(weight, padded, axes=1) for weight in flat)
-    moved = [shift(image, move[::-1], order=5) if move.any() else image for image, move in zip(unmoved, moves, strict=True)]
+    moved = [
+        shift(image, move[::-1], order=5) if move.any() else image
+        for image, move in zip(unmoved, moves, strict=True)
+    ]
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
-    basis, weights, _ = principal(images.reshape(len(images), -1), images.shape[1:], TOLERANCE, width)
+    basis, weights, _ = principal(
+        images.reshape(len(images), -1), images.shape[1:], TOLERANCE, width
+    )
     weights /= (weights @ basis.sum(axis=1, dtype=np.float64))[:, None]
     return replace(
         optics,
@@ -576,7 +680,9 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     )
 
 
-def _square(x_px: FloatArray, y_px: FloatArray, squares: int) -> tuple[IntArray, FloatArray, FloatArray]:
+def _square(
+    x_px: FloatArray, y_px: FloatArray, squares: int
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """In which square of its pixel each star (n,) is, and its place in it, -1 to 1 right and
     down.
     """
@@ -623,7 +729,10 @@ def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
     carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
     moments = table @ terms
     rest = table - moments @ carriers
-    rng, total = np.random.default_rng(0), float(np.einsum("ij,ij->", table, table, dtype=np.float64))
+    rng, total = (
+        np.random.default_rng(0),
+        float(np.einsum("ij,ij->", table, table, dtype=np.float64)),
+    )
     wanted, left = FIRST_STAMPS, float(np.einsum("ij,ij->", rest, rest, dtype=np.float64))
     while True:
         wanted = min(wanted, *rest.shape)
@@ -633,7 +742,9 @@ def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
         found, turn = np.linalg.eigh(held.T @ held)
         enough = np.flatnonzero(left - np.cumsum(found[::-1]) <= STAMP_TOLERANCE**2 * total)
         if len(enough) or wanted in (MAX_STAMPS, *rest.shape):
-            turn = turn[:, ::-1][:, : int(enough[0]) + 1 if len(enough) else wanted].astype(np.float32)
+            turn = turn[:, ::-1][:, : int(enough[0]) + 1 if len(enough) else wanted].astype(
+                np.float32
+            )
             break
         wanted = min(2 * wanted, MAX_STAMPS)
     stamps = (span @ turn).T

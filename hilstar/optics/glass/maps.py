@@ -11,20 +11,34 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import read_bytes
 from hilstar.basics.text_tables import finite_numbers, read_rows
-from hilstar.optics.glass.psf_file import AXES, FACTS, MAX_FILE_BYTES, Glass, Stack, facts_of, glass_of
+from hilstar.optics.glass.psf_file import (
+    AXES,
+    FACTS,
+    MAX_FILE_BYTES,
+    Glass,
+    Stack,
+    facts_of,
+    glass_of,
+)
 
-STACK_ADVICE = "give a FITS cube (n, height, width) of odd sides, the chief ray in the middle of each image"
+STACK_ADVICE = (
+    "give a FITS cube (n, height, width) of odd sides, the chief ray in the middle of each image"
+)
 POINTS_ADVICE = f"write x_px,y_px, and as far as known {', '.join((*AXES[2:], *FACTS))}"
 MAX_CSV_BYTES = 10_000_000
 
 
-def glass_of_map(stack: Path, points: Path, per_px: int, pixel_integrated: bool, tolerance: float) -> Glass:
+def glass_of_map(
+    stack: Path, points: Path, per_px: int, pixel_integrated: bool, tolerance: float
+) -> Glass:
     """The glass of a stack's images, image k at row k of the points. Raises InputError."""
     images = _images(stack)
     at, facts = _points(points)
     try:
         history = (f"hilstar optics map of {stack.name} and {points.name}",)
-        return glass_of(Stack(images, at, facts, per_px, pixel_integrated), tolerance, history=history)
+        return glass_of(
+            Stack(images, at, facts, per_px, pixel_integrated), tolerance, history=history
+        )
     except InputError as error:
         raise InputError(f"{stack}, {points}: {error}") from error
 
@@ -54,8 +68,15 @@ def _points(path: Path) -> tuple[FloatArray, FloatArray]:
     for line, cells in read_rows(path, AXES[:2], POINTS_ADVICE, MAX_CSV_BYTES, more):
         named = [(name, cell) for name, cell in zip(more, cells[2:], strict=True) if cell]
         place = finite_numbers(path, line, AXES[:2], cells[:2], POINTS_ADVICE)
-        given = finite_numbers(path, line, tuple(n for n, _ in named), [cell for _, cell in named], POINTS_ADVICE)
+        given = finite_numbers(
+            path, line, tuple(n for n, _ in named), [cell for _, cell in named], POINTS_ADVICE
+        )
         known = dict(zip((name for name, _ in named), given, strict=True))
-        rows.append([*place, *(known.get(name, default) for name, default in zip(more, defaults, strict=True))])
+        rows.append(
+            [
+                *place,
+                *(known.get(name, default) for name, default in zip(more, defaults, strict=True)),
+            ]
+        )
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     return table[:, :4], table[:, 4:]

@@ -123,7 +123,9 @@ def _read(path: Path) -> "_Lens":
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # optiland raises whatever a broken file causes in its layers
-        raise InputError(f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+        raise InputError(
+            f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}"
+        ) from error
     return replace(lens, notes=(*lens.notes, *warned))
 
 
@@ -178,7 +180,9 @@ def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_
     return _traced(_Lens(optic, _fields_of(optic)), plate, per_px, tolerance, made_by)
 
 
-def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
+def _traced(
+    lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, made_by: str
+) -> Traced:
     try:
         with _quiet() as warned:
             made = _glass(_LensRays(lens.optic, lens.fields), plate, per_px, tolerance, made_by)
@@ -186,7 +190,9 @@ def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, mad
     except InputError:
         raise
     except Exception as error:  # as in `_read`
-        raise InputError(f"optiland cannot trace it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+        raise InputError(
+            f"optiland cannot trace it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}"
+        ) from error
 
 
 class _LensRays:
@@ -196,7 +202,9 @@ class _LensRays:
 
     def __init__(self, optic: Any, points: tuple[FieldPoint, ...]) -> None:
         if not optic.object_surface.is_infinite:
-            raise InputError("its object is near; write a lens whose object is at infinity, as stars are")
+            raise InputError(
+                "its object is near; write a lens whose object is at infinity, as stars are"
+            )
         self.optic = optic
         self.max_field = float(optic.fields.max_field)
         self._vignetting = _vignetting(points)
@@ -207,9 +215,13 @@ class _LensRays:
         self.focal_length_mm = abs(float(np.asarray(optic.paraxial.f2()).ravel()[0]))
         self.f_number = abs(float(np.asarray(optic.paraxial.FNO()).ravel()[0]))
         if not math.isfinite(self.focal_length_mm) or not self.wavelengths_um:
-            raise InputError("it has no focal length or no wavelength; write a lens that forms an image")
+            raise InputError(
+                "it has no focal length or no wavelength; write a lens that forms an image"
+            )
         frame = optic.image_surface.geometry.cs
-        self._image_mm, self._to_image = (np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform())
+        self._image_mm, self._to_image = (
+            np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform()
+        )
         self.centre_mm, self.sign = np.zeros(2), 1.0
         edge = np.array([[0.0, 0.0], [0.0, EDGE]])
         tangents, places = self.chiefs(edge, self.primary_um)
@@ -238,9 +250,13 @@ class _LensRays:
         (n, 2) relative to the largest.
         """
         none = np.zeros(len(fields))
-        starts = self.optic.ray_tracer.ray_generator.generate_rays(fields[:, 0], fields[:, 1], none, none, um)
+        starts = self.optic.ray_tracer.ray_generator.generate_rays(
+            fields[:, 0], fields[:, 1], none, none, um
+        )
         tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        return tangents, self.at_image(self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um))[0].T
+        return tangents, self.at_image(
+            self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
+        )[0].T
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
         """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
@@ -251,7 +267,10 @@ class _LensRays:
         fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
             fields = np.clip(fields, -1.5, 1.5)
-            fields = fields + (places_mm - camera.places_mm(self.chiefs(fields, self.primary_um)[0])) / slope_mm
+            fields = (
+                fields
+                + (places_mm - camera.places_mm(self.chiefs(fields, self.primary_um)[0])) / slope_mm
+            )
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
@@ -260,7 +279,9 @@ class _LensRays:
         filled = _filled(rays)
         radius = float(np.hypot(*field))
         at_field = radius * self.max_field
-        beside_cut, along_cut, shift = (np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:])
+        beside_cut, along_cut, shift = (
+            np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:]
+        )
         # the field's direction is the factors' y
         turn = field / radius if radius else np.array([0.0, 1.0])
         along = across * turn[0] + down * turn[1]
@@ -273,7 +294,10 @@ class _LensRays:
         hx, hy = np.full(px.size, field[0]), np.full(px.size, field[1])
         generate = self.optic.ray_tracer.ray_generator.generate_rays
         first = generate(hx, hy, px.ravel(), py.ravel(), um)
-        x0, y0, z0, l0, m0, n0 = (np.array(getattr(first, name)).reshape(px.shape) for name in ("x", "y", "z", "L", "M", "N"))
+        x0, y0, z0, l0, m0, n0 = (
+            np.array(getattr(first, name)).reshape(px.shape)
+            for name in ("x", "y", "z", "L", "M", "N")
+        )
         found = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
         (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
         path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
@@ -282,7 +306,9 @@ class _LensRays:
         # stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
-        return _Bundle(x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0))
+        return _Bundle(
+            x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0)
+        )
 
 
 def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
@@ -316,7 +342,9 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
 def _filled(rays: int) -> FloatArray:
     """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
     fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
-    return np.asarray((fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3)))
+    return np.asarray(
+        (fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3))
+    )
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -325,7 +353,9 @@ def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a_right * b_down - a_down * b_right)
 
 
-def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
+def _glass(
+    lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str
+) -> Traced:
     pitch_mm, (width, height) = plate.pitch_um * 1e-3, plate.resolution_px
     middle = (np.array([width, height]) - 1) / 2
     camera = _Chiefs.of(lens)
@@ -339,13 +369,17 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
     for um in lens.wavelengths_um:
         axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
         if axis_light[um] <= 0:
-            raise InputError("no ray of its field's middle reaches the image; do apertures lie beside the beam?")
+            raise InputError(
+                "no ray of its field's middle reaches the image; do apertures lie beside the beam?"
+            )
         for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
             slopes = _slopes(lens, field, um)
             light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]
             for focus_um in sorted(set(plate.focuses_um)):
                 if light > MIN_LIT:
-                    image, outside = _psf(lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid)
+                    image, outside = _psf(
+                        lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid
+                    )
                 else:
                     image, outside = _dark(grid[0]), 0.0
                 images.append(image)
@@ -353,8 +387,15 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
                 moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
                 facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
     stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
-    history = (made_by, f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}")
-    return Traced(glass_of(stack, tolerance, camera.lens, history=history), camera.focal_length_mm, lens.f_number)
+    history = (
+        made_by,
+        f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}",
+    )
+    return Traced(
+        glass_of(stack, tolerance, camera.lens, history=history),
+        camera.focal_length_mm,
+        lens.f_number,
+    )
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
@@ -364,14 +405,18 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
     half = (np.array(plate.resolution_px) - 1) / 2
     if lens.max_field == 0:
         return np.zeros((1, 2))
-    edge_px = float(np.linalg.norm(lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)[1])) / (plate.pitch_um * 1e-3)
+    edge_px = float(np.linalg.norm(lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)[1])) / (
+        plate.pitch_um * 1e-3
+    )
     scale = min(1.0, edge_px / float(np.hypot(*half)))
     columns, rows = (np.unique(np.linspace(-size * scale, size * scale, POINTS)) for size in half)
     return np.stack([part.ravel() for part in np.meshgrid(columns, rows)], axis=1)
 
 
 def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
-    rays = lens.optic.trace_generic(np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um)
+    rays = lens.optic.trace_generic(
+        np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um
+    )
     cosines = lens.at_image(rays)[1][:, 0]
     return np.asarray(cosines[:2] / cosines[2])
 
@@ -383,7 +428,10 @@ def _dark(side: int) -> FloatArray:
 
 
 def _psf(
-    lens: _LensRays, light: tuple[FloatArray, float, float], centre: FloatArray, grid: tuple[int, float]
+    lens: _LensRays,
+    light: tuple[FloatArray, float, float],
+    centre: FloatArray,
+    grid: tuple[int, float],
 ) -> tuple[FloatArray, float]:
     """A PSF about its chief ray's place `centre` on its stamp's samples, and the share of its light
     outside of them.
@@ -394,7 +442,9 @@ def _psf(
     needed = math.ceil(PERIOD_MARGIN * side * step_mm / (um * 1e-3 * lens.f_number))
     if needed > MAX_RAYS:
         return _counted(lens.bundle(field, um, GEOMETRIC_RAYS), defocus_mm, centre, side, step_mm)
-    return _waves(lens.bundle(field, um, max(MIN_RAYS, needed)), um, defocus_mm, centre, (side, step_mm))
+    return _waves(
+        lens.bundle(field, um, max(MIN_RAYS, needed)), um, defocus_mm, centre, (side, step_mm)
+    )
 
 
 def _waves(
@@ -408,7 +458,9 @@ def _waves(
     # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
     angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
     lit = rays.light > 0
-    path = rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
+    path = (
+        rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
+    )
     path = path[lit] - np.median(path[lit])
     light, angle, cos_x, cos_y = rays.light[lit], angle[lit], cos_x[lit], cos_y[lit]
     part = np.sqrt(light * angle) * np.exp(1j * wave * path)
@@ -429,7 +481,9 @@ def _fastest(rays: _Bundle) -> float:
     return 1 / max(1e-6, float(max(np.ptp(cosine[lit]) for cosine in rays.cosines[:2])))
 
 
-def _counted(rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, step_mm: float) -> tuple[FloatArray, float]:
+def _counted(
+    rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, step_mm: float
+) -> tuple[FloatArray, float]:
     """Rays shared out among the four samples nearest to each."""
     lit = rays.light > 0
     light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
@@ -441,7 +495,12 @@ def _counted(rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, st
     image = np.zeros((side, side))
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = light * np.abs(1 - down - (y - row)) * np.abs(1 - right - (x - column))
-        inside = (column + right >= 0) & (column + right < side) & (row + down >= 0) & (row + down < side)
+        inside = (
+            (column + right >= 0)
+            & (column + right < side)
+            & (row + down >= 0)
+            & (row + down < side)
+        )
         np.add.at(image, (row[inside] + down, column[inside] + right), share[inside])
     return image, float(np.clip(1 - image.sum() / light.sum(), 0, 0.999))
 
@@ -466,15 +525,24 @@ class _Chiefs:
             return cls(lens.focal_length_mm, None)
         turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
         radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
-        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(-1, 2)
+        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(
+            -1, 2
+        )
         tangents, places = lens.chiefs(fields, lens.primary_um)
         known = np.isfinite(places).all(axis=1)
         largest = float(np.hypot(*tangents.T).max())
         (u, v), places = tangents[known].T / largest, places[known] / largest
         r2 = u * u + v * v
         radial = [np.concatenate([part * r2**power for part in (u, v)]) for power in range(4)]
-        sides = [np.concatenate(part) for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))]
-        found = np.linalg.lstsq(np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None)[0].tolist()
+        sides = [
+            np.concatenate(part)
+            for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))
+        ]
+        found = np.linalg.lstsq(np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None)[
+            0
+        ].tolist()
         focal, *bent = found
-        k1, k2, k3, p1, p2 = (part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True))
+        k1, k2, k3, p1, p2 = (
+            part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True)
+        )
         return cls(focal, Lens((k1, k2, k3), (p1, p2)))

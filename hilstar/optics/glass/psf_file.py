@@ -122,11 +122,15 @@ def glass_of(
     images, count, per_px = stack.images, len(stack.images), stack.per_px
     if images.ndim != 3 or not all(side % 2 for side in images.shape[1:]):
         found = " x ".join(map(str, images.shape[::-1]))
-        raise InputError(f"a stack of {found} has no middle samples; write images (n, height, width) of odd sides")
+        raise InputError(
+            f"a stack of {found} has no middle samples; write images (n, height, width) of odd sides"
+        )
     if not 1 <= count <= MAX_IMAGES:
         raise InputError(f"{count} images; write 1 to {MAX_IMAGES}")
     if len(stack.at) != count:
-        raise InputError(f"{count} images and {len(stack.at)} points; write one point for each image")
+        raise InputError(
+            f"{count} images and {len(stack.at)} points; write one point for each image"
+        )
     for number, image in enumerate(images, start=1):
         if not np.isfinite(image).all() or image.sum() <= 0:
             raise InputError(
@@ -136,7 +140,9 @@ def glass_of(
     if per_px < 1:
         raise InputError(f"PSFs of {per_px} samples a pixel; write 1 or more")
     width = 1 if stack.pixel_integrated else per_px
-    basis, weights, residual = principal(images.reshape(count, -1), images.shape[1:], tolerance, width)
+    basis, weights, residual = principal(
+        images.reshape(count, -1), images.shape[1:], tolerance, width
+    )
     sums = basis.sum(axis=1, dtype=np.float64)
     weights /= (weights @ sums)[:, None]
     axes, place = _product(stack.at)
@@ -194,14 +200,22 @@ def principal(
     residual, count = 1.0, 0
     for count in range(len(images) + 1):
         residual = _elsewhere(in_pixels)
-        if residual <= tolerance or count == len(images) or values[-1 - count] <= 1e-14 * values[-1]:
+        if (
+            residual <= tolerance
+            or count == len(images)
+            or values[-1 - count] <= 1e-14 * values[-1]
+        ):
             break
         vector = vectors[:, -1 - count]
         in_pixels -= np.outer(vector, vector @ in_pixels)
     own = vectors[:, ::-1][:, :count]
     basis = own.T @ rest
     size = np.maximum(np.linalg.norm(basis, axis=1), 1e-300)
-    return np.concatenate([carriers, basis / size[:, None]]).astype(np.float32), np.hstack([moments, own * size]), residual
+    return (
+        np.concatenate([carriers, basis / size[:, None]]).astype(np.float32),
+        np.hstack([moments, own * size]),
+        residual,
+    )
 
 
 def _by_pixels(images: FloatArray, width: int) -> FloatArray:
@@ -214,7 +228,10 @@ def _by_pixels(images: FloatArray, width: int) -> FloatArray:
     apart = max(1, round(width / PHASES))
     found = images
     for axis in (1, 2):
-        summed = np.cumsum(np.pad(found, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]), axis=axis)
+        summed = np.cumsum(
+            np.pad(found, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]),
+            axis=axis,
+        )
         last = np.arange(width, summed.shape[axis], apart)
         found = summed.take(last, axis) - summed.take(last - width, axis)
     return np.asarray(found.reshape(len(images), -1) * (apart / width) ** 2)
@@ -225,7 +242,9 @@ def _elsewhere(residuals: FloatArray) -> float:
     return 0.5 * float(np.abs(residuals).sum(axis=1).max())
 
 
-def _product(at: FloatArray) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[IntArray, ...]]:
+def _product(
+    at: FloatArray,
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[IntArray, ...]]:
     """Field points (F, 2), wavelengths (L,) and focus positions (Z,), and the place of each row
     among them.
 
@@ -247,7 +266,9 @@ def _product(at: FloatArray) -> tuple[tuple[FloatArray, FloatArray, FloatArray],
             f"focus {focuses_um[focus]:g} um; give each point one image of each wavelength and focus"
         )
     if np.isnan(wavelengths_nm).any() and len(wavelengths_nm) > 1:
-        raise InputError("some points have a wavelength and others none; write wavelength_nm for each, or for none")
+        raise InputError(
+            "some points have a wavelength and others none; write wavelength_nm for each, or for none"
+        )
     return (places_px, wavelengths_nm, focuses_um), place
 
 
@@ -266,22 +287,35 @@ def _check(glass: Glass) -> None:
 def _check_numbers(glass: Glass) -> None:
     if glass.per_px < 1:
         raise InputError(f"PSFs of {glass.per_px} samples a pixel; write 1 or more")
-    numbers = (*(glass.places_px, glass.focuses_um, glass.weights, glass.basis), glass.outside, glass.lateral_px)
+    numbers = (
+        *(glass.places_px, glass.focuses_um, glass.weights, glass.basis),
+        glass.outside,
+        glass.lateral_px,
+    )
     if not all(np.isfinite(part).all() for part in numbers):
         raise InputError("a place, a focus, a weight or a sample is not finite; write numbers")
     if not (np.isnan(glass.wavelengths_nm).all() or (glass.wavelengths_nm > 0).all()):
-        raise InputError(f"wavelength_nm from {glass.wavelengths_nm.min():g}; write wavelengths over 0 nm")
+        raise InputError(
+            f"wavelength_nm from {glass.wavelengths_nm.min():g}; write wavelengths over 0 nm"
+        )
     if not ((glass.illumination >= 0) & (glass.illumination <= 2)).all():
-        raise InputError("relative_illumination is not within 0 to 2; write each point's light relative to the axis")
+        raise InputError(
+            "relative_illumination is not within 0 to 2; write each point's light relative to the axis"
+        )
     if not ((glass.outside >= 0) & (glass.outside < 1)).all():
-        raise InputError("outside_share is not within 0 to 1; write the share of light that an image has not")
+        raise InputError(
+            "outside_share is not within 0 to 1; write the share of light that an image has not"
+        )
 
 
 def _check_psfs(glass: Glass) -> None:
     binned = [_binned(image, glass.per_px) for image in glass.basis]
     _, height, width = glass.basis.shape
     x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
-    firsts = np.stack([glass.basis.sum(axis=(1, 2)), (glass.basis.sum(axis=1) @ x), glass.basis.sum(axis=2) @ y], axis=1)
+    firsts = np.stack(
+        [glass.basis.sum(axis=(1, 2)), (glass.basis.sum(axis=1) @ x), glass.basis.sum(axis=2) @ y],
+        axis=1,
+    )
     for f, wavelength, focus in np.ndindex(*glass.weights.shape[:3]):
         weights = glass.weights[f, wavelength, focus]
         where = f"the PSF at ({glass.places_px[f, 0]:g}, {glass.places_px[f, 1]:g}) px"
@@ -297,7 +331,9 @@ def _check_psfs(glass: Glass) -> None:
             )
         negative = -np.tensordot(weights, binned, axes=1).clip(max=0).sum()
         if negative > MAX_NEGATIVE:
-            raise InputError(f"{where}: {negative:.1%} of its light is negative; subtract its background")
+            raise InputError(
+                f"{where}: {negative:.1%} of its light is negative; subtract its background"
+            )
 
 
 def _binned(image: Float32Array, per_px: int) -> FloatArray:
@@ -315,25 +351,40 @@ def write_glass(path: Path, glass: Glass) -> None:
     header["OVERSAMP"] = (glass.per_px, "samples a tracker pixel")
     header["PIXINT"] = (glass.pixel_integrated, "whether the pixel is integrated")
     header["RESIDUAL"] = (glass.residual, "max share of a PSF's light put elsewhere")
-    for key, value in zip(LENS_KEYS, () if glass.lens is None else (*glass.lens.radial, *glass.lens.tangential), strict=False):
+    for key, value in zip(
+        LENS_KEYS,
+        () if glass.lens is None else (*glass.lens.radial, *glass.lens.tangential),
+        strict=False,
+    ):
         header[key] = (value, "distortion, Brown-Conrady of tangents")
     header["CREATOR"] = f"hilstar {__version__}"
     for line in glass.history:
         header["HISTORY"] = line
     f, wavelength, focus = (part.ravel() for part in np.indices(glass.illumination.shape))
     columns = dict(zip(AXES[:2], glass.places_px[f].T, strict=True))
-    columns |= {"wavelength_nm": glass.wavelengths_nm[wavelength], "focus_um": glass.focuses_um[focus]}
+    columns |= {
+        "wavelength_nm": glass.wavelengths_nm[wavelength],
+        "focus_um": glass.focuses_um[focus],
+    }
     lateral = glass.lateral_px.reshape(-1, 2).T
-    columns |= dict(zip(FACTS, (glass.illumination.ravel(), glass.outside.ravel(), *lateral), strict=True))
+    columns |= dict(
+        zip(FACTS, (glass.illumination.ravel(), glass.outside.ravel(), *lateral), strict=True)
+    )
     table = [fits.Column(name, "D", array=value) for name, value in columns.items()]
     count = glass.weights.shape[-1]
     table.append(fits.Column("weights", f"{count}D", array=glass.weights.reshape(-1, count)))
     hdus = [fits.PrimaryHDU(glass.basis, header), fits.BinTableHDU.from_columns(table, name=POINTS)]
     if glass.transmission is not None:
         curve = zip(
-            ("wavelength_nm", "transmission"), (glass.transmission.wavelength_nm, glass.transmission.value), strict=True
+            ("wavelength_nm", "transmission"),
+            (glass.transmission.wavelength_nm, glass.transmission.value),
+            strict=True,
         )
-        hdus.append(fits.BinTableHDU.from_columns([fits.Column(n, "D", array=v) for n, v in curve], name=TRANSMISSION))
+        hdus.append(
+            fits.BinTableHDU.from_columns(
+                [fits.Column(n, "D", array=v) for n, v in curve], name=TRANSMISSION
+            )
+        )
     written(path, fits.HDUList(hdus).writeto)
 
 
@@ -380,12 +431,18 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
             f"PSFVERS is {header.get('PSFVERS')!r}, and this hilstar reads {VERSION}; make it with `hilstar optics`"
         )
     if type(per_px) is not int or type(integrated) is not bool:
-        raise InputError(f"OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F")
+        raise InputError(
+            f"OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F"
+        )
     missing = [name for name in (*AXES, *FACTS, "weights") if name not in table.names]
     if missing:
-        raise InputError(f"the table {POINTS} has no column {missing[0]}; make it with `hilstar optics`")
+        raise InputError(
+            f"the table {POINTS} has no column {missing[0]}; make it with `hilstar optics`"
+        )
     if basis is None or basis.ndim != 3 or not all(side % 2 for side in basis.shape[1:]):
-        raise InputError("its first image is no cube of odd width and height; make it with `hilstar optics`")
+        raise InputError(
+            "its first image is no cube of odd width and height; make it with `hilstar optics`"
+        )
     column = {name: np.asarray(table[name], dtype=np.float64) for name in (*AXES, *FACTS)}
     weights = np.asarray(table["weights"], dtype=np.float64).reshape(len(table), -1)
     if weights.shape[1] != len(basis) or not 1 <= len(table) <= MAX_IMAGES:
@@ -399,17 +456,28 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
     lens = Lens((k1, k2, k3), (p1, p2)) if any(numbers) else None
     transmission = None
     if TRANSMISSION in hdus:
-        curve = [np.asarray(hdus[TRANSMISSION].data[name], dtype=np.float64) for name in ("wavelength_nm", "transmission")]
+        curve = [
+            np.asarray(hdus[TRANSMISSION].data[name], dtype=np.float64)
+            for name in ("wavelength_nm", "transmission")
+        ]
         transmission = Curve(*curve)
-        if len(curve[0]) < 2 or not (np.diff(curve[0]) > 0).all() or not ((curve[1] >= 0) & (curve[1] <= 1)).all():
-            raise InputError(f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to 1; write those")
+        if (
+            len(curve[0]) < 2
+            or not (np.diff(curve[0]) > 0).all()
+            or not ((curve[1] >= 0) & (curve[1] <= 1)).all()
+        ):
+            raise InputError(
+                f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to 1; write those"
+            )
     return Glass(
         *axes,
         basis=basis.astype(np.float32),
         weights=_ordered(weights, place, shape),
         illumination=_ordered(column["relative_illumination"], place, shape),
         outside=_ordered(column["outside_share"], place, shape),
-        lateral_px=_ordered(np.stack([column["lateral_x_px"], column["lateral_y_px"]], axis=1), place, shape),
+        lateral_px=_ordered(
+            np.stack([column["lateral_x_px"], column["lateral_y_px"]], axis=1), place, shape
+        ),
         per_px=per_px,
         pixel_integrated=integrated,
         residual=float(header.get("RESIDUAL", 0.0)),

@@ -56,9 +56,13 @@ class Pupil(Table, frozen=True):
     focal_length_mm: Positive
     pixel_pitch_um: Positive
     resolution_px: tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
-    wavelengths_nm: Annotated[tuple[Annotated[float, Meta(ge=100, le=20_000)], ...], Meta(min_length=1, max_length=50)]
+    wavelengths_nm: Annotated[
+        tuple[Annotated[float, Meta(ge=100, le=20_000)], ...], Meta(min_length=1, max_length=50)
+    ]
     reference_nm: Positive = 550.0
-    focuses_um: Annotated[tuple[Annotated[float, Meta(ge=-1e5, le=1e5)], ...], Meta(min_length=1, max_length=50)] = (0.0,)
+    focuses_um: Annotated[
+        tuple[Annotated[float, Meta(ge=-1e5, le=1e5)], ...], Meta(min_length=1, max_length=50)
+    ] = (0.0,)
     points: Annotated[int, Meta(ge=1, le=50)] = 5
     half_px: Annotated[int, Meta(ge=1, le=100)] = 8
     obstruction: Annotated[float, Meta(ge=0, lt=1)] = 0.0
@@ -77,7 +81,9 @@ def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
     finest_um = min(pupil.wavelengths_nm) * 1e-3 * pupil.focal_length_mm / pupil.aperture_mm / 2
-    samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(pupil.pixel_pitch_um / finest_um)))
+    samples = per_px or min(
+        MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(pupil.pixel_pitch_um / finest_um))
+    )
     try:
         stack = diffracted(pupil, samples)
         return glass_of(stack, tolerance, history=(f"hilstar optics zernike of {path.name}",))
@@ -92,10 +98,13 @@ def diffracted(pupil: Pupil, per_px: int) -> Stack:
     pupil_field = PupilField(pupil)
     (width, height), middle = pupil.resolution_px, (np.array(pupil.resolution_px) - 1) / 2
     columns, rows = (
-        np.linspace(0, size - 1, pupil.points) if pupil.points > 1 else [(size - 1) / 2] for size in (width, height)
+        np.linspace(0, size - 1, pupil.points) if pupil.points > 1 else [(size - 1) / 2]
+        for size in (width, height)
     )
     images, places, facts = [], [], []
-    for x_px, y_px, nm, focus_um in product(columns, rows, sorted(set(pupil.wavelengths_nm)), sorted(set(pupil.focuses_um))):
+    for x_px, y_px, nm, focus_um in product(
+        columns, rows, sorted(set(pupil.wavelengths_nm)), sorted(set(pupil.focuses_um))
+    ):
         off_px = np.array([x_px, y_px]) - middle
         image, outside = psf_of(pupil, pupil_field(off_px, nm, focus_um), nm, per_px)
         images.append(image)
@@ -118,7 +127,11 @@ class PupilField:
         at = (np.arange(PUPIL) + 0.5) / PUPIL * 2 - 1
         self._x, self._y = np.meshgrid(at, at)
         self._r2 = self._x**2 + self._y**2
-        polar = {"rho": np.minimum(np.sqrt(self._r2), 1.0), "theta": np.arctan2(self._y, self._x), "outside": 0.0}
+        polar = {
+            "rho": np.minimum(np.sqrt(self._r2), 1.0),
+            "theta": np.arctan2(self._y, self._x),
+            "outside": 0.0,
+        }
         nolls = {term.noll for term in pupil.terms if term.kind == "zernike"}
         self._zernikes: dict[int, FloatArray] = {j: zernike.zernike1(j, **polar) for j in nolls}
 
@@ -135,7 +148,9 @@ class PupilField:
             size_nm = term.nm + term.per_nm * (nm - pupil.reference_nm)
             match term.kind:
                 case "zernike":
-                    wave_nm = wave_nm + size_nm * radius**term.field_power * self._zernikes[term.noll]
+                    wave_nm = (
+                        wave_nm + size_nm * radius**term.field_power * self._zernikes[term.noll]
+                    )
                 case "W020":
                     wave_nm = wave_nm + size_nm * self._r2
                 case "W040":
@@ -147,7 +162,11 @@ class PupilField:
                 case "W220":
                     wave_nm = wave_nm + size_nm * radius**2 * self._r2
         lit = self._amplitude > 0
-        steps = [np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(initial=0.0) / nm for k in (0, 1)]
+        steps = [
+            np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(initial=0.0)
+            / nm
+            for k in (0, 1)
+        ]
         if max(steps) > MAX_STEP_WAVES:
             raise InputError(
                 f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g} waves from one of {PUPIL} "
@@ -165,7 +184,10 @@ def aperture(pupil: Pupil) -> FloatArray:
     half = pupil.spider_width_mm / pupil.aperture_mm
     for k in range(pupil.spiders):
         angle = math.radians(pupil.spider_angle_deg + 360 * k / pupil.spiders)
-        along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+        along, across = (
+            x * math.cos(angle) + y * math.sin(angle),
+            y * math.cos(angle) - x * math.sin(angle),
+        )
         is_open &= (np.abs(across) > half) | (along < 0)
     return np.asarray(is_open.reshape(PUPIL, FINER, PUPIL, FINER).mean(axis=(1, 3)))
 
@@ -183,7 +205,9 @@ def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[Flo
     step = pupil.pixel_pitch_um / per_px / resolution_um  # in units of wavelength / D
     if step >= 1:
         finest = math.ceil(2 * pupil.pixel_pitch_um / resolution_um)
-        raise InputError(f"{per_px} samples a pixel are too few for light of {nm:g} nm; write --oversampling {finest}")
+        raise InputError(
+            f"{per_px} samples a pixel are too few for light of {nm:g} nm; write --oversampling {finest}"
+        )
     transform = _poppy().matrixDFT.MatrixFourierTransform(centering="SYMMETRIC")
     image = np.abs(transform.perform(field, side * step, side)) ** 2
     return image, max(0.0, 1 - float(image.sum() / np.abs(field).sum()))

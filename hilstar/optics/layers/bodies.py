@@ -11,7 +11,15 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
-from hilstar.optics.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, Shear, disc_lights
+from hilstar.optics.extended import (
+    DiscLight,
+    DiscView,
+    ExtendedLight,
+    LightMap,
+    Pose,
+    Shear,
+    disc_lights,
+)
 from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.sprites import Sprites
@@ -67,13 +75,19 @@ class BodyLayer:
             self.unhidden(light, stars, discs, view),
             extended=(*light.extended, *itertools.chain.from_iterable(lights)),
             discs=tuple(name for name, its in zip(names, lights, strict=True) if its),
-            over_white=tuple(name for name, its in zip(names, lights, strict=True) if self._clips(its, white_e_per_s)),
+            over_white=tuple(
+                name
+                for name, its in zip(names, lights, strict=True)
+                if self._clips(its, white_e_per_s)
+            ),
         )
 
     def on_image(self, view: View) -> list[Disc]:
         """Discs that touch the image of a camera at rest, nearest first."""
         camera, icrs_to_image = self.canvas.camera, view.icrs_to_image(self.canvas.camera)
-        lights = (DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view))
+        lights = (
+            DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view)
+        )
         return [light.disc for light in lights if light.region(camera.resolution_px) is not None]
 
     def alone(self, disc: Disc, view: View) -> tuple[ExtendedLight, ...]:
@@ -85,8 +99,13 @@ class BodyLayer:
         for each kind.
         """
         ahead = np.array([0.0, 0.0, 1.0])
-        radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
-        discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
+        radii_rad = (
+            np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
+        )
+        discs = [
+            Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert")
+            for r in radii_rad.tolist()
+        ]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
 
     def unhidden(self, light: Sprites, stars: Stars, discs: list[Disc], view: View) -> Sprites:
@@ -99,7 +118,11 @@ class BodyLayer:
         # those that nothing hides.
         satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
         point = np.flatnonzero(which >= first)
-        far_km = self._moving.distances_km(*view.observer)[which[point] - first] if len(point) else np.empty(0)
+        far_km = (
+            self._moving.distances_km(*view.observer)[which[point] - first]
+            if len(point)
+            else np.empty(0)
+        )
         for disc in discs:
             # more than a cosine rounds
             reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7
@@ -115,7 +138,9 @@ class BodyLayer:
             return light
         data = light.data[kept]
         data["electrons_per_s"] *= through[kept].astype(np.float32)
-        return replace(light, data=data, star=light.star[kept], x_px=light.x_px[kept], y_px=light.y_px[kept])
+        return replace(
+            light, data=data, star=light.star[kept], x_px=light.x_px[kept], y_px=light.y_px[kept]
+        )
 
     def _near(self, view: View) -> list[Disc]:
         """Discs that may be on the image at some time of a view, and that no other hides,
@@ -123,12 +148,16 @@ class BodyLayer:
         """
         reach_rad, wide_rad = self._reach_rad, POINT_PX / self._px_per_rad
         if view.turns:
-            reach_rad += view.turn.speed_rad_s * (view.scan.whole_s / 2 if view.exposed else view.scan.longest_s)
+            reach_rad += view.turn.speed_rad_s * (
+                view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
+            )
         axis = view.icrs_to_image(self.canvas.camera)[2]
         found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         kept = []
         for k, disc in enumerate(found):
-            places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
+            places = (
+                np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
+            )
             through = np.ones(len(places))
             for nearer in found[:k]:
                 through *= nearer.transmission(places)
@@ -144,25 +173,34 @@ class BodyLayer:
         the exposure's mean light.
         """
         camera, exposure_s = self.canvas.camera, view.scan.hold_s
-        length_sigma = view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        length_sigma = (
+            view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        )
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
         place, weight = gauss_legendre(count)
         maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
         poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
-        return DiscView(camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera))
+        return DiscView(
+            camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera)
+        )
 
     def _turning(self, view: View, max_poses: int) -> DiscView:
         """The camera while a screen's rows light up one after the other, each held for a time."""
         camera, scan = self.canvas.camera, view.scan
         turn, _ = slowed(view.turn, scan, camera)
-        length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        length_sigma = (
+            turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
+        )
         count = 1
         if length_sigma > POINT_SIGMA:
             # odd: one is in the middle
             count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)
         place, weight = gauss_legendre(count)
         times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
-        attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
+        attitudes = (
+            (propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share)
+            for seconds, share in times
+        )
         poses = tuple(Pose(camera.cam_to_image @ to_matrix(q), share) for q, share in attitudes)
         return DiscView(camera, self.canvas.psf, poses, _shear(scan, turn.rate_cam_rad_s, camera))
 
@@ -179,7 +217,9 @@ class BodyLayer:
         """
         if not math.isfinite(white_e_per_s):
             return False
-        brightest = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
+        brightest = sum(
+            float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap)
+        )
         large = [light for light in lights if isinstance(light, DiscLight)]
         if large:
             brightest = self._px_sr * self._brightest(large[len(large) // 2])
@@ -192,7 +232,10 @@ class BodyLayer:
         if region is None:
             return 0.0
         left, top, width, height = region
-        x, y = np.meshgrid(np.linspace(left, left + width - 1, LATTICE), np.linspace(top, top + height - 1, LATTICE))
+        x, y = np.meshgrid(
+            np.linspace(left, left + width - 1, LATTICE),
+            np.linspace(top, top + height - 1, LATTICE),
+        )
         u, v = camera.tangents(x.ravel(), y.ravel())
         seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
         # And of its lit face: a crescent may lie between those of the lattice
@@ -206,9 +249,14 @@ def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | No
     """What the turn of a camera does to an image whose rows are lit one after the other."""
     if not scan.scanout_s:
         return None
-    late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
+    late_s = tuple(
+        down * scan.scanout_s / size
+        for down, size in zip(scan.down, camera.resolution_px, strict=True)
+    )
     middle = tuple((size - 1) / 2 for size in camera.resolution_px)
-    return Shear(camera.cam_to_image @ rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
+    return Shear(
+        camera.cam_to_image @ rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1])
+    )
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:

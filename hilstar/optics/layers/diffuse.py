@@ -47,7 +47,9 @@ class DiffuseLayer:
         least = self._faintest / self._sr.max()
         sigma_px = math.sqrt(math.fsum(canvas.psf.variance_px2) / 2)
         seen = [one.seen_by(finest_rad, sigma_px) for one in images]
-        self._brightest = max((float(one.image.max() * self._sr.max()) for one in seen), default=0.0)
+        self._brightest = max(
+            (float(one.image.max() * self._sr.max()) for one in seen), default=0.0
+        )
         self._faces = [_Face(one, coarsest_rad, least) for one in seen if one.image.max() > least]
         self._middles = np.array([face.middle for face in self._faces]).reshape(-1, 3)
         reach_rad = math.acos(float(np.nanmin(self._rays[..., 2])))
@@ -64,13 +66,24 @@ class DiffuseLayer:
         """
         cell = view.q_icrs_to_cam
         if self._cell_q:
-            cell = np.rint(cell * np.sign(cell[np.argmax(np.abs(cell))]) / self._cell_q) * self._cell_q
+            cell = (
+                np.rint(cell * np.sign(cell[np.argmax(np.abs(cell))]) / self._cell_q) * self._cell_q
+            )
         if self._kept is None or not np.array_equal(cell, self._kept[0]):
             icrs_to_cam = to_matrix(normalise(cell))
-            near = [self._faces[k] for k in np.flatnonzero(self._middles @ icrs_to_cam[2] >= self._cos_reach)]
+            near = [
+                self._faces[k]
+                for k in np.flatnonzero(self._middles @ icrs_to_cam[2] >= self._cos_reach)
+            ]
             faces_of_cube = sum(face.is_of_cube for face in near)
-            taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool) if faces_of_cube > 1 else None
-            lit = (self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near)
+            taken = (
+                np.zeros(self._camera.resolution_px[::-1], dtype=bool)
+                if faces_of_cube > 1
+                else None
+            )
+            lit = (
+                self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near
+            )
             self._kept = cell, tuple(itertools.chain.from_iterable(lit))
         maps = self._kept[1]
         return replace(light, extended=(*light.extended, *maps)) if maps else light
@@ -78,10 +91,16 @@ class DiffuseLayer:
     def line(self) -> str:
         """How bright it is on a monitor."""
         steps = self._brightest / (self._faintest or math.inf)
-        drawn = "is drawn where it passes one" if steps > 1 else "is not drawn; the virtual tracker has it"
+        drawn = (
+            "is drawn where it passes one"
+            if steps > 1
+            else "is not drawn; the virtual tracker has it"
+        )
         return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
 
-    def _lit(self, face: "_Face", icrs_to_cam: FloatArray, taken: BoolArray | None) -> list[LightMap]:
+    def _lit(
+        self, face: "_Face", icrs_to_cam: FloatArray, taken: BoolArray | None
+    ) -> list[LightMap]:
         """The map of each group of cells that have light at an attitude.
 
         Pixels (h, w) that another face has `taken` are left out, and those of this one are noted.
@@ -104,7 +123,9 @@ class DiffuseLayer:
             x, y, sr = (part.spread(of) for of in (x_px, y_px, self._sr[around]))
             if taken is not None:
                 part.keep(face.holds(x, y), taken)
-            image = map_coordinates(face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32)
+            image = map_coordinates(
+                face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32
+            )
             found.append(LightMap(image * sr * part.own, part.corner_px, bv_mag=face.image.bv_mag))
         return found
 
@@ -114,14 +135,20 @@ class DiffuseLayer:
         """
         first = [part.start + whole.start for part, whole in zip(box, around, strict=True)]
         rows, columns = (
-            np.ceil(np.arange(at, at + part.stop - part.start + 1) * size / (count - 1) - 0.5).astype(int)
-            for at, part, size, count in zip(first, box, self._camera.resolution_px[::-1], self._counts[::-1], strict=True)
+            np.ceil(
+                np.arange(at, at + part.stop - part.start + 1) * size / (count - 1) - 0.5
+            ).astype(int)
+            for at, part, size, count in zip(
+                first, box, self._camera.resolution_px[::-1], self._counts[::-1], strict=True
+            )
         )
         return _Part(
             (int(columns[0]), int(rows[0])),
             tuple(slice(part.start, part.stop + 1) for part in box),
             self._down[rows[0] : rows[-1], first[0] : first[0] + len(rows)].astype(np.float32),
-            self._across[columns[0] : columns[-1], first[1] : first[1] + len(columns)].astype(np.float32),
+            self._across[columns[0] : columns[-1], first[1] : first[1] + len(columns)].astype(
+                np.float32
+            ),
             np.repeat(np.repeat(own, np.diff(rows), axis=0), np.diff(columns), axis=1),
         )
 
@@ -140,7 +167,9 @@ class _Part:
 
     def spread(self, at_corners: FloatArray) -> Float32Array:
         """Values at all cells' corners, interpolated to this part's pixels."""
-        return np.asarray(self.down @ np.nan_to_num(at_corners[self.nodes]).astype(np.float32) @ self.across.T)
+        return np.asarray(
+            self.down @ np.nan_to_num(at_corners[self.nodes]).astype(np.float32) @ self.across.T
+        )
 
     def keep(self, held: BoolArray, taken: BoolArray) -> None:
         """Leave pixels that are not `held` here or `taken` before, and take the others, in an
@@ -163,29 +192,45 @@ class _Face:
         from scipy.ndimage import maximum_filter
 
         self.image = image
-        self.middle_px, self.is_of_cube = (len(image.image) - 1) / 2, math.isfinite(image.max_tangent)
+        self.middle_px, self.is_of_cube = (
+            (len(image.image) - 1) / 2,
+            math.isfinite(image.max_tangent),
+        )
         # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's
         # corner
         self._reach_px = math.ceil(CELL_PX * px_rad * image.px_per_tangent * 3 * math.sqrt(2)) + 1
         rows, columns = np.nonzero(image.image > least)
-        lit = np.stack([columns - self.middle_px, rows - self.middle_px, np.full(len(rows), image.px_per_tangent)], axis=-1)
+        lit = np.stack(
+            [
+                columns - self.middle_px,
+                rows - self.middle_px,
+                np.full(len(rows), image.px_per_tangent),
+            ],
+            axis=-1,
+        )
         lit = (lit / np.linalg.norm(lit, axis=1, keepdims=True)) @ image.axes
         self.middle = lit.mean(axis=0)
         self.middle /= np.linalg.norm(self.middle)
         radius_rad = math.acos(np.clip((lit @ self.middle).min(), -1.0, 1.0)) + 3 * CELL_PX * px_rad
         self.cos_radius = math.cos(min(radius_rad, math.pi))
-        self.most = maximum_filter(np.pad(image.image, self._reach_px), 2 * self._reach_px + 1, mode="constant")
+        self.most = maximum_filter(
+            np.pad(image.image, self._reach_px), 2 * self._reach_px + 1, mode="constant"
+        )
 
     def most_at(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The most light near places; none at NaN."""
         size = len(self.most)
         x, y = (np.nan_to_num(np.rint(at) + self._reach_px, nan=-1.0) for at in (x_px, y_px))
         inside = (x >= 0) & (y >= 0) & (x < size) & (y < size)
-        return np.where(inside, self.most[(y * inside).astype(np.intp), (x * inside).astype(np.intp)], 0.0)
+        return np.where(
+            inside, self.most[(y * inside).astype(np.intp), (x * inside).astype(np.intp)], 0.0
+        )
 
     def holds(self, x_px: Float32Array, y_px: Float32Array) -> BoolArray:
         """Which places are not beyond its edge, or hardly: two faces both hold a place on their
         edge.
         """
         half_px = self.image.max_tangent * self.image.px_per_tangent + ON_EDGE_PX
-        return np.asarray((np.abs(x_px - self.middle_px) <= half_px) & (np.abs(y_px - self.middle_px) <= half_px))
+        return np.asarray(
+            (np.abs(x_px - self.middle_px) <= half_px) & (np.abs(y_px - self.middle_px) <= half_px)
+        )

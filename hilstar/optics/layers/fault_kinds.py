@@ -18,7 +18,13 @@ from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.toml_tables import Kind, Table, explained
 
 REFERENCE = "docs/faults.md"
-TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
+TYPE_WORDS = {
+    "float": "number",
+    "int": "whole number",
+    "str": "text",
+    "object": "table",
+    "bool": "true or false",
+}
 MAX_TIME_S, MAX_LIGHT_E, MAX_PLACE_PX = 1e7, 1e12, 1e6
 MAX_TRACK_PX = 20_000  # a burst's tracks together: bounds a frame's work
 UNIT_TOLERANCE = 1e-3
@@ -61,7 +67,9 @@ class Fault(Table, frozen=True, kw_only=True):
             if len(given) > 1:
                 raise InputError(f"has {given[0]} and {given[1]}; write one of them")
             if not given:
-                raise InputError(f"lacks one of {', '.join(names)}; write one of them (see {REFERENCE})")
+                raise InputError(
+                    f"lacks one of {', '.join(names)}; write one of them (see {REFERENCE})"
+                )
 
 
 class PlacedFault(Fault, frozen=True, kw_only=True):
@@ -79,10 +87,16 @@ class PlacedFault(Fault, frozen=True, kw_only=True):
         """Refuse (InputError) also a vector that is no direction, and a rate without a pixel."""
         super().check()
         if self.icrs is not None and abs(math.hypot(*self.icrs) - 1) > UNIT_TOLERANCE:
-            raise InputError(f"icrs = {list(self.icrs)}: its norm is {math.hypot(*self.icrs):.6g}; write a unit vector x, y, z")
+            raise InputError(
+                f"icrs = {list(self.icrs)}: its norm is {math.hypot(*self.icrs):.6g}; write a unit vector x, y, z"
+            )
         if any(self.rate_px_s) and self.tracker_px is None and self.screen_px is None:
-            given = next(name for names in self.ONE_OF for name in names if getattr(self, name) is not None)
-            raise InputError(f"rate_px_s moves a tracker_px or a screen_px, not {given}; leave one of them out")
+            given = next(
+                name for names in self.ONE_OF for name in names if getattr(self, name) is not None
+            )
+            raise InputError(
+                f"rate_px_s moves a tracker_px or a screen_px, not {given}; leave one of them out"
+            )
 
 
 class PointLight(PlacedFault, frozen=True, kw_only=True):
@@ -116,7 +130,9 @@ class Flash(PointLight, frozen=True, kw_only=True):
         """Refuse (InputError) also a flash without an end."""
         super().check()
         if self.for_s is None:
-            raise InputError("the key for_s is missing; a flash has a length: write for_s = 0.1 or the like")
+            raise InputError(
+                "the key for_s is missing; a flash has a length: write for_s = 0.1 or the like"
+            )
 
 
 class StarGone(Fault, frozen=True, kw_only=True):
@@ -251,7 +267,9 @@ class AttitudeStep(Fault, frozen=True, kw_only=True):
         super().check()
         size_rad = math.hypot(*self.turn_rad)
         if size_rad > math.pi:
-            raise InputError(f"turns by {math.degrees(size_rad):.6g} deg; write a turn of 180 deg at most")
+            raise InputError(
+                f"turns by {math.degrees(size_rad):.6g} deg; write a turn of 180 deg at most"
+            )
 
     @property
     def turn_rad(self) -> tuple[float, float, float]:
@@ -299,7 +317,9 @@ def fault_of(table: Any) -> Fault:
     what to write.
     """
     if not isinstance(table, dict):
-        raise InputError(f"{shortened(table)} is no table; write keys, such as kind and name (see {REFERENCE})")
+        raise InputError(
+            f"{shortened(table)} is no table; write keys, such as kind and name (see {REFERENCE})"
+        )
     keys = {key: value for key, value in table.items() if key != "kind"}
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
@@ -314,7 +334,9 @@ def fault_of(table: Any) -> Fault:
     except msgspec.ValidationError as error:
         missing = re.search(r"missing required field `(.*)`", str(error))
         if missing:
-            raise InputError(f"the key {missing[1]} is missing; add it (see {REFERENCE})") from error
+            raise InputError(
+                f"the key {missing[1]} is missing; add it (see {REFERENCE})"
+            ) from error
         message = str(error).replace(" | null", "")
         raise InputError(explained(message, keys, Kind(made, REFERENCE, TYPE_WORDS))) from error
     if not (fault.name.isprintable() and fault.name.strip() == fault.name):

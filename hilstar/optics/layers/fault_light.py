@@ -80,7 +80,11 @@ class FaultView:
     """
 
     def __init__(
-        self, by: FaultCamera, seed: int = 0, folder: Path | None = None, lasting: frozenset[Fault] = frozenset()
+        self,
+        by: FaultCamera,
+        seed: int = 0,
+        folder: Path | None = None,
+        lasting: frozenset[Fault] = frozenset(),
     ) -> None:
         self.by, self._seed, self._folder, self._lasting = by, seed, folder, lasting
         self._glow_kept: tuple[Fault, float, extended.GlowLight] | None = None
@@ -94,7 +98,9 @@ class FaultView:
         (see `FaultSchedule`).
         """
         if not self.by.exposure_s and getattr(fault, "electrons", None) is not None:
-            raise InputError("electrons: [tracker] exposure_s is 0, and no exposure has them; write a longer one")
+            raise InputError(
+                "electrons: [tracker] exposure_s is 0, and no exposure has them; write a longer one"
+            )
         if isinstance(fault, CosmicRays) and fault.for_s is None:
             fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
         by_star = isinstance(fault, Flash | StarGone) and (fault.hip or fault.star)
@@ -108,18 +114,25 @@ class FaultView:
             self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
         if isinstance(fault, Gradient | MeasuredMap):
             self._map(fault)
-        if isinstance(fault, PlacedFault) and (fault.tracker_px is not None or fault.screen_px is not None):
+        if isinstance(fault, PlacedFault) and (
+            fault.tracker_px is not None or fault.screen_px is not None
+        ):
             camera, place = self._source(fault)
             if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
                 key = "tracker_px" if fault.tracker_px is not None else "screen_px"
-                raise InputError(f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image")
+                raise InputError(
+                    f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image"
+                )
         return fault
 
     def light_e_per_s(self, fault: Fault) -> float:
         """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1
         where a map says it.
         """
-        per_s, in_exposure = getattr(fault, "electrons_per_s", None), getattr(fault, "electrons", None)
+        per_s, in_exposure = (
+            getattr(fault, "electrons_per_s", None),
+            getattr(fault, "electrons", None),
+        )
         if per_s is not None:
             return float(per_s)
         if in_exposure is not None:
@@ -147,7 +160,9 @@ class FaultView:
                 values = read_map(self._folder / fault.file)
                 if fault.electrons_per_s is not None or fault.electrons is not None:
                     values = values / values.max()
-                image = map_image(values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor)
+                image = map_image(
+                    values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor
+                )
             known = extended.LightMap(image, times=self.light_e_per_s(fault), bv_mag=fault.bv_mag)
         with self._lock:
             self._maps.pop(fault, None)
@@ -172,11 +187,19 @@ class FaultView:
         vectors, lights = [], []
         for one in now:
             fault = one.fault
-            if not isinstance(fault, FalseStar | Flash) or fault.tracker_px is not None or fault.screen_px is not None:
+            if (
+                not isinstance(fault, FalseStar | Flash)
+                or fault.tracker_px is not None
+                or fault.screen_px is not None
+            ):
                 continue
             if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
                 # A star too faint to show is among all of the bench's stars.
-                at = [known.vectors[place] for known in (stars, self.by.stars) for place in self._places(known, fault)[:1]]
+                at = [
+                    known.vectors[place]
+                    for known in (stars, self.by.stars)
+                    for place in self._places(known, fault)[:1]
+                ]
             else:
                 at = [self.by.apparent(icrs_direction(fault)[None])[0]]
             if at:
@@ -191,16 +214,25 @@ class FaultView:
 
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
         rate = self.light_e_per_s(fault) * share
-        return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
+        return AddedLight(
+            fault.name,
+            float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))),
+            fault.bv_mag,
+            rate,
+        )
 
-    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> "tuple[list[PointChain], list[AddedLight]]":
+    def camera_points(
+        self, now: Sequence[Now], scan: Scan | None
+    ) -> "tuple[list[PointChain], list[AddedLight]]":
         """False stars and flashes that move with the camera, and tracks: chains, and the name
         and light of each line.
         """
         chains, lights = [], []
         for one in now:
             fault = one.fault
-            if isinstance(fault, FalseStar | Flash) and (fault.tracker_px is not None or fault.screen_px is not None):
+            if isinstance(fault, FalseStar | Flash) and (
+                fault.tracker_px is not None or fault.screen_px is not None
+            ):
                 chains.append(self._moving(fault, one, scan))
                 lights.append(self._added(fault, one.share))
             elif isinstance(fault, CosmicRays):
@@ -217,9 +249,14 @@ class FaultView:
         rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
         begin_s, hold_s = since_s, 0.0
         if scan is not None and rate.any():
-            x_px, y_px = by.canvas.camera.pixels_from(source, *(np.array([place]) + rate * since_s).T)
+            x_px, y_px = by.canvas.camera.pixels_from(
+                source, *(np.array([place]) + rate * since_s).T
+            )
             late_s = scan.late_s(x_px, y_px, by.canvas.camera.resolution_px)[0]
-            begin_s, hold_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0), scan.hold_s
+            begin_s, hold_s = (
+                since_s + (float(late_s) if math.isfinite(late_s) else 0.0),
+                scan.hold_s,
+            )
         ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
         light = np.array([self.light_e_per_s(fault) * one.share])
         return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.psf)
@@ -232,14 +269,21 @@ class FaultView:
         if key not in self._tracks:
             if len(self._tracks) >= KEPT_BURSTS:
                 self._tracks.clear()
-            made = tracks(fault, by.tracker.resolution_px, by.exposure_s, self.rng(fault.name, TRACK_SEED, number))
+            made = tracks(
+                fault,
+                by.tracker.resolution_px,
+                by.exposure_s,
+                self.rng(fault.name, TRACK_SEED, number),
+            )
             self._tracks[key] = made.seen_by(by.canvas.camera, by.tracker, by.canvas.psf)
         return self._tracks[key]
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
         """Stars that a fault removes, and the share of their light that is left in this frame."""
         taken = [one for one in now if isinstance(one.fault, StarGone)]
-        return [(int(star), 1 - one.share) for one in taken for star in self._places(stars, one.fault)]
+        return [
+            (int(star), 1 - one.share) for one in taken for star in self._places(stars, one.fault)
+        ]
 
     def _places(self, stars: Stars, fault: Fault) -> IntArray:
         """The places of a fault's star in `stars`; empty if it is not among them, or the fault is
@@ -261,7 +305,9 @@ class FaultView:
             known = self._found[key] = (stars.hip, _places(stars, wanted))
         return known[1]
 
-    def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
+    def surfaces(
+        self, now: Sequence[Now], q_icrs_to_cam: FloatArray
+    ) -> list[extended.ExtendedLight]:
         """The stray light of the faults that are on."""
         found: list[extended.ExtendedLight] = []
         for one in now:
@@ -270,7 +316,9 @@ class FaultView:
                 found.append(self._glow(fault, one.share, q_icrs_to_cam))
             elif isinstance(fault, Gradient | MeasuredMap):
                 light = self._map(fault)
-                found.append(light if one.share == 1 else replace(light, times=light.times * one.share))
+                found.append(
+                    light if one.share == 1 else replace(light, times=light.times * one.share)
+                )
         return found
 
     def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
@@ -289,7 +337,14 @@ class FaultView:
         covered = (by.tracker.focal_length_px / by.canvas.camera.focal_length_px) ** 2
         peak = self.light_e_per_s(fault) * share * covered
         unit = direction / np.linalg.norm(direction)
-        made = extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera, fault.bv_mag)
+        made = extended.GlowLight(
+            unit,
+            peak,
+            math.radians(fault.scale_deg),
+            fault.exponent,
+            by.canvas.camera,
+            fault.bv_mag,
+        )
         if fixed:
             self._glow_kept = fault, share, made
         return made
@@ -301,8 +356,15 @@ class FaultView:
         made, first = [], 0
         for chain in chains:
             star = -1 - first - chain.line
-            size_px, footprint_px = self.by.canvas.camera.resolution_px, self.by.canvas.psf.footprint_px
-            made.append(pack_sprites(chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px))
+            size_px, footprint_px = (
+                self.by.canvas.camera.resolution_px,
+                self.by.canvas.psf.footprint_px,
+            )
+            made.append(
+                pack_sprites(
+                    chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px
+                )
+            )
             first += chain.lines
         return made
 
@@ -324,14 +386,19 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     number = re.fullmatch(r"HIP (\d{1,9})", wanted)
     if number is not None:
         return np.flatnonzero(stars.hip == int(number[1]))
-    hip = next((hip for hip, names in star_names().items() if wanted in (names.name, names.designation)), None)
+    hip = next(
+        (hip for hip, names in star_names().items() if wanted in (names.name, names.designation)),
+        None,
+    )
     if hip is not None:
         return np.flatnonzero(stars.hip == hip)
     identifier = stars.catalog.identifier_of(wanted)
     if identifier is None:
         return np.empty(0, dtype=np.intp)
     nameless = np.flatnonzero(stars.hip[:first] == 0)
-    return np.asarray(nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp)
+    return np.asarray(
+        nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,10 +428,14 @@ class Lines:
         """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its
         lens have no points.
         """
-        ends = [np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)]
+        ends = [
+            np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)
+        ]
         length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(psf.width_px)[:, None]))
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
-        counts = np.where(known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1)
+        counts = np.where(
+            known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1
+        )
         line = np.repeat(np.arange(len(counts)), counts)
         first = np.repeat(np.cumsum(counts) - counts, counts)
         # One point of a line that is none lies at its place; those of a longer one in the middles
@@ -375,7 +446,9 @@ class Lines:
         return PointChain(x_px, y_px, self.electrons_per_s[line] / counts[line], line, len(counts))
 
 
-def tracks(burst: CosmicRays, resolution_px: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> Lines:
+def tracks(
+    burst: CosmicRays, resolution_px: tuple[int, int], exposure_s: float, rng: np.random.Generator
+) -> Lines:
     """The tracks of one exposure in tracker pixels: their middles anywhere on the detector, in
     any direction.
     """

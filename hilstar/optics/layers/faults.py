@@ -10,7 +10,15 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.extended import DiscLight, LightMap
-from hilstar.optics.layers.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now, StarGone
+from hilstar.optics.layers.fault_kinds import (
+    AttitudeStep,
+    Blank,
+    Drop,
+    Fault,
+    Freeze,
+    Now,
+    StarGone,
+)
 from hilstar.optics.layers.fault_light import FaultView
 from hilstar.optics.layers.layers import no_light
 from hilstar.optics.layers.view import View
@@ -44,7 +52,8 @@ class FaultLayer:
     def drops(self, frame: int) -> bool:
         """Whether frame number `frame` is never shown."""
         return any(
-            one.fault.share == 1 or self.view.rng(one.fault.name, FRAME_SEED, frame).random() < one.fault.share
+            one.fault.share == 1
+            or self.view.rng(one.fault.name, FRAME_SEED, frame).random() < one.fault.share
             for one in self.now
             if isinstance(one.fault, Drop)
         )
@@ -61,7 +70,9 @@ class FaultLayer:
                 turn_rad = np.array(one.fault.turn_rad)
                 q, step = propagate(q, turn_rad, 1.0), propagate(step, turn_rad, 1.0)
         rate = view.rate_cam_rad_s
-        return replace(view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate)
+        return replace(
+            view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate
+        )
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
         """The light before without the stars that faults take away, and with the light that they
@@ -72,17 +83,25 @@ class FaultLayer:
             return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
         gone = by.gone(now, stars)
         if gone:
-            removed = {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star}
+            removed = {
+                one.fault.star: 1 - one.share
+                for one in now
+                if isinstance(one.fault, StarGone) and one.fault.star
+            }
             light = _without_discs(_dimmed(light, gone), removed)
         directions, named = by.sky_points(now, stars)
         chains, lines = by.camera_points(now, None if view.rate_cam_rad_s is None else view.scan)
         surfaces = by.surfaces(now, view.q_icrs_to_cam)
         parts = by.footprints(chains)
         if named:
-            drawn = by.by.points.add(no_light(light.footprint_px), few_stars(directions, named, stars), view)
+            drawn = by.by.points.add(
+                no_light(light.footprint_px), few_stars(directions, named, stars), view
+            )
             parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
         if parts:
-            longest = (int(np.unique(part.star, return_counts=True)[1].max(initial=1)) for part in parts)
+            longest = (
+                int(np.unique(part.star, return_counts=True)[1].max(initial=1)) for part in parts
+            )
             per_star = max(light.per_star, *(part.per_star for part in parts), *longest)
             light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
         return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
@@ -101,7 +120,13 @@ def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
     whole = replace(sprites, data=data)
     if kept.all():
         return whole
-    return replace(whole, data=data[kept], star=sprites.star[kept], x_px=sprites.x_px[kept], y_px=sprites.y_px[kept])
+    return replace(
+        whole,
+        data=data[kept],
+        star=sprites.star[kept],
+        x_px=sprites.x_px[kept],
+        y_px=sprites.y_px[kept],
+    )
 
 
 def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
@@ -117,7 +142,12 @@ def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
         for light in sprites.extended
     )
     discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)
-    return replace(sprites, extended=lights, discs=discs, over_white=tuple(n for n in sprites.over_white if n in discs))
+    return replace(
+        sprites,
+        extended=lights,
+        discs=discs,
+        over_white=tuple(n for n in sprites.over_white if n in discs),
+    )
 
 
 def few_stars(vectors: FloatArray, lights: Sequence[AddedLight], like: Stars) -> Stars:

@@ -36,7 +36,9 @@ def seen_in(view: View, stars: Stars, moving: "MovingSky | None") -> Stars:
     """A bench's stars as a view has them; bodies are moved to their places in the arrays of
     `stars`.
     """
-    return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
+    return (
+        stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
+    )
 
 
 def sky_layers(
@@ -105,7 +107,11 @@ class StarLayer:
             made = swept_sprites(stars, view.turn, view.scan, camera, canvas.psf)
             made = replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
         else:
-            icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
+            icrs_to_image = (
+                view.motion.icrs_to_image(MIDDLE_S, camera)[0]
+                if view.exposed
+                else view.icrs_to_image(camera)
+            )
             candidates = self.candidates if stars is self.frequent else None
             made = make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
         return with_sprites(light, [made]) if light.extended or len(light.data) else made

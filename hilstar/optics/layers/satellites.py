@@ -11,7 +11,18 @@ from hilstar.optics.frame_motion import slowed
 from hilstar.optics.layers.bodies import POINT_PX
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.sprites import Sprites
-from hilstar.optics.trails import EVERY, Brush, Lit, TrailView, disc_of, disc_trail, hidden, trails, wide, with_trails
+from hilstar.optics.trails import (
+    EVERY,
+    Brush,
+    Lit,
+    TrailView,
+    disc_of,
+    disc_trail,
+    hidden,
+    trails,
+    wide,
+    with_trails,
+)
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -50,7 +61,12 @@ class SatelliteLayer:
         if seen is None or satellites is None:
             return light
         icrs_to_image = view.icrs_to_image(canvas.camera)
-        path = TrailView(canvas.camera, icrs_to_image, canvas.camera.cam_to_image @ turn.rate_cam_rad_s, stars.velocity_km_s)
+        path = TrailView(
+            canvas.camera,
+            icrs_to_image,
+            canvas.camera.cam_to_image @ turn.rate_cam_rad_s,
+            stars.velocity_km_s,
+        )
         close = path.in_reach(seen, longest_s, margin_px)
         if not len(close):
             return light
@@ -72,14 +88,21 @@ class SatelliteLayer:
         satellites = self.moving.satellites
         if satellites is None or not satellites.sized:
             return []
-        seen = self._passing(view, self.canvas.camera.field_radius_rad(0.0), 0.0, faintest_e_per_s=0.0)
+        seen = self._passing(
+            view, self.canvas.camera.field_radius_rad(0.0), 0.0, faintest_e_per_s=0.0
+        )
         if seen is None:
             return []
         broad = np.flatnonzero(wide(seen, self.canvas.camera.scales_px_rad()[1], POINT_PX))
         names = satellites.names
-        return [disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s) for k in broad.tolist()]
+        return [
+            disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s)
+            for k in broad.tolist()
+        ]
 
-    def _passing(self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None) -> "Pass | None":
+    def _passing(
+        self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None
+    ) -> "Pass | None":
         """The satellites that may be within `reach_rad` of the boresight; None for none."""
         from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
 
@@ -88,7 +111,9 @@ class SatelliteLayer:
         return self.moving.passing(Cone(axis, reach_rad, longest_s, faintest), *view.observer)
 
     def _brush(self, view: View) -> Brush:
-        most, poses = (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
+        most, poses = (
+            (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
+        )
         return Brush(self.canvas.psf, most, poses)
 
     def _lit(self, seen: "Pass", path: TrailView, view: View) -> Lit:
@@ -99,7 +124,9 @@ class SatelliteLayer:
             late_s = np.nan_to_num(rows.late_s(x_px, y_px, self.canvas.camera.resolution_px))
         return Lit(view.begin_s + late_s, rows.hold_s)
 
-    def _with_discs(self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View) -> Sprites:
+    def _with_discs(
+        self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View
+    ) -> Sprites:
         """The light before with satellites as discs, the farthest first, and without what they
         hide.
         """
@@ -114,13 +141,21 @@ class SatelliteLayer:
             if found is not None:
                 drawn.append(found)
                 light = hidden(light, stars.directions(light.star), found)
-        index, rates = np.array([one.index for one in drawn], dtype=np.intp), np.array([one.electrons_per_s for one in drawn])
-        satellites.write(stars, index, np.array([one.middle for one in drawn]).reshape(-1, 3), rates)
+        index, rates = (
+            np.array([one.index for one in drawn], dtype=np.intp),
+            np.array([one.electrons_per_s for one in drawn]),
+        )
+        satellites.write(
+            stars, index, np.array([one.middle for one in drawn]).reshape(-1, 3), rates
+        )
         white_e_per_s = self.canvas.white_in(view)
         names = tuple(one.along[0].name for one in drawn)
         return replace(
             light,
             extended=(*light.extended, *(part for one in drawn for part in one.lights)),
             discs=(*light.discs, *names),
-            over_white=(*light.over_white, *(one.along[0].name for one in drawn if one.brightest_e_per_s > white_e_per_s)),
+            over_white=(
+                *light.over_white,
+                *(one.along[0].name for one in drawn if one.brightest_e_per_s > white_e_per_s),
+            ),
         )

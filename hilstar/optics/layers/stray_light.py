@@ -33,13 +33,18 @@ def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32A
     """
     x_px, y_px, area = pixels_in(camera, tracker)
     width, height = tracker.resolution_px
-    right, down = math.cos(math.radians(fault.towards_deg)), math.sin(math.radians(fault.towards_deg))
+    right, down = (
+        math.cos(math.radians(fault.towards_deg)),
+        math.sin(math.radians(fault.towards_deg)),
+    )
     extent_px = abs(right) * width + abs(down) * height
     rise = 0.5 + ((x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down) / extent_px
     return as_light(np.maximum(rise, 0.0) * area)
 
 
-def map_image(values: FloatArray, fault: MeasuredMap, camera: Camera, source: Camera) -> Float32Array:
+def map_image(
+    values: FloatArray, fault: MeasuredMap, camera: Camera, source: Camera
+) -> Float32Array:
     """Electrons per second of each camera pixel (h, w) of a map over the whole image of
     `source`; nothing outside it.
     """
@@ -77,7 +82,9 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
         return PixelsIn(x, y, np.ones((height, width)))
     from scipy.interpolate import RectBivariateSpline
 
-    across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
+    across, down = (
+        np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px
+    )
     x, y = np.meshgrid(across, down)
     places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
     if not all(np.isfinite(place).all() for place in places):
@@ -90,7 +97,9 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
     x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
     x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
     covered = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
-    return PixelsIn(*(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered)))
+    return PixelsIn(
+        *(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered))
+    )
 
 
 def map_sha256(path: Path) -> str:
@@ -105,12 +114,16 @@ def read_map(path: Path) -> FloatArray:
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     values = _decoded(path, raw)
     if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:
-        raise InputError(f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a side")
+        raise InputError(
+            f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a side"
+        )
     if values.dtype.kind not in "fiub":
         raise InputError(f"{path}: values of type {values.dtype}; {MAP_ADVICE}")
     image = values.astype(np.float64)
     if not (np.isfinite(image).all() and image.min() >= 0):
-        raise InputError(f"{path}: a value is negative or not finite; give electrons per second, 0 or more")
+        raise InputError(
+            f"{path}: a value is negative or not finite; give electrons per second, 0 or more"
+        )
     if not image.max() > 0:
         raise InputError(f"{path}: is dark everywhere; {MAP_ADVICE}")
     return image

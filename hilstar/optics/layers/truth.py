@@ -47,10 +47,14 @@ TRUTH_DTYPE = np.dtype(
 def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
     """The rows of a table of TRUTH_DTYPE that clip: HIP numbers, or names without one."""
     rows = truth[truth["clipped"]]
-    return [name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)]
+    return [
+        name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)
+    ]
 
 
-def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
+def truth_table(
+    stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
+) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none
     clipped yet.
     """
@@ -64,7 +68,10 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
     truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
     listed = stars.row[star] >= 0
     row, catalog = stars.row[star[listed]], stars.catalog
-    truth["variable"][listed], truth["double"][listed] = catalog.variable[row], catalog.multiple[row]
+    truth["variable"][listed], truth["double"][listed] = (
+        catalog.variable[row],
+        catalog.multiple[row],
+    )
     for name in ("range_mag", "period_d", "separation_arcsec"):
         truth[name] = np.nan
         # Back to the catalogue's decimals from float32.
@@ -79,7 +86,10 @@ def with_columns(
     False.
     """
     where = np.arange(len(truth)) if rows is None else rows
-    found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())])
+    found = np.zeros(
+        len(truth),
+        dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())],
+    )
     for name in truth.dtype.names or ():
         found[name] = truth[name]
     for name, values in added.items():
@@ -97,12 +107,20 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
     light = (
         None
         if colours is None
-        else dict(zip(CHANNEL_COLUMNS, (truth["electrons_per_s"] * part for part in colours.T), strict=True))
+        else dict(
+            zip(
+                CHANNEL_COLUMNS,
+                (truth["electrons_per_s"] * part for part in colours.T),
+                strict=True,
+            )
+        )
     )
     return truth if light is None else with_columns(truth, light)
 
 
-def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:
+def with_errors(
+    truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float
+) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`,
     rms of its two axes.
 
@@ -117,7 +135,9 @@ def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: floa
     facts = errors_of(stars)
     covariance = motion_at(stars, facts, epoch_jyear).covariance
     found = truth.copy()
-    found["sigma_pos_mas"][listed] = np.round(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS)
+    found["sigma_pos_mas"][listed] = np.round(
+        np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS
+    )
     found["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
     return found
 
@@ -137,7 +157,9 @@ def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
     return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
 
 
-def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
+def sprite_truth(
+    stars: Stars, sprites: Sprites, clipped: IntArray
+) -> tuple[npt.NDArray[np.void], IntArray]:
     """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped`
     are positions of sprites.
 
@@ -175,7 +197,14 @@ def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np
     for k, added in enumerate(sprites.added[-1 - index] for index in star.tolist()):
         rows[k]["name"], rows[k]["v_mag"], rows[k]["bv"] = added.name, added.v_mag, added.bv_mag
         rows[k]["electrons_per_s"] = added.electrons_per_s
-    for name in ("temperature_k", "range_mag", "period_d", "separation_arcsec", "sigma_pos_mas", "sigma_mag"):
+    for name in (
+        "temperature_k",
+        "range_mag",
+        "period_d",
+        "separation_arcsec",
+        "sigma_pos_mas",
+        "sigma_mag",
+    ):
         rows[name] = np.nan
     rows["drawn"] = True
     rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0
@@ -201,7 +230,9 @@ class StarInView:
     name: str
 
 
-def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
+def brightest_in_view(
+    light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int
+) -> list[StarInView]:
     """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the
     brightest first.
 
@@ -216,14 +247,19 @@ def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_ca
     found, cam, vectors, x_px, y_px = found[kept], cam[kept], vectors[kept], x_px[kept], y_px[kept]
     off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
     x, y, z = vectors.T
-    ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    ra_deg, dec_deg = (
+        np.degrees(np.arctan2(y, x)) % 360.0,
+        np.degrees(np.arctan2(z, np.hypot(x, y))),
+    )
     constellations: list[str] = []
     if len(found):
         # takes half a second, which only this needs
         from astropy.coordinates import SkyCoord, get_constellation
 
         # IAU boundaries of 1930
-        constellations = [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]
+        constellations = [
+            str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))
+        ]
     columns = (
         stars.hip[found].tolist(),
         stars.v_mag[found].tolist(),

@@ -83,7 +83,9 @@ class View:
     @property
     def turn(self) -> CameraTurn:
         """The attitude and the rate; at rest a rate of 0."""
-        return CameraTurn(self.q_icrs_to_cam, STILL if self.rate_cam_rad_s is None else self.rate_cam_rad_s)
+        return CameraTurn(
+            self.q_icrs_to_cam, STILL if self.rate_cam_rad_s is None else self.rate_cam_rad_s
+        )
 
     @property
     def motion(self) -> Motion:

@@ -45,10 +45,16 @@ class UnderConvention:
 
 
 def _angle(off_rad: float) -> str:
-    return f"{np.degrees(off_rad):.2f} deg" if off_rad > np.radians(1.0) else f"{off_rad * ARCSEC_PER_RAD:.1f} arcsec"
+    return (
+        f"{np.degrees(off_rad):.2f} deg"
+        if off_rad > np.radians(1.0)
+        else f"{off_rad * ARCSEC_PER_RAD:.1f} arcsec"
+    )
 
 
-def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[UnderConvention]:
+def under_conventions(
+    answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None
+) -> list[UnderConvention]:
     """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of
     what is shown.
     """
@@ -58,14 +64,21 @@ def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray 
     sent = decoder.sent.as_sent(answer.q_icrs_to_cam)
     frames = ("cam", "body") if mounted is not None else ("cam",)
     found = []
-    for scalar, direction, frame in product(("first", "last"), ("icrs_to_cam", "cam_to_icrs"), frames):
+    for scalar, direction, frame in product(
+        ("first", "last"), ("icrs_to_cam", "cam_to_icrs"), frames
+    ):
         convention = Convention(scalar=scalar, direction=direction, frame=frame)  # type: ignore[arg-type]
         q = SentAttitudes(convention, Mounting(mounted)).q_icrs_to_cam(sent)
-        found.append(UnderConvention(convention, q, None if shown is None else angle_between_rad(q, shown)))
+        found.append(
+            UnderConvention(convention, q, None if shown is None else angle_between_rad(q, shown))
+        )
     if shown is None:
         return found
     nearest, *others = sorted(found, key=lambda each: each.off_rad or 0.0)
-    off, next_off = nearest.off_rad or 0.0, min((other.off_rad or 0.0 for other in others), default=np.pi)
+    off, next_off = (
+        nearest.off_rad or 0.0,
+        min((other.off_rad or 0.0 for other in others), default=np.pi),
+    )
     certain = off < NEAR_RAD and next_off > APART * off
     return [replace(each, matches=certain and each is nearest) for each in found]
 
@@ -81,13 +94,17 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
     settings = decoder.settings
     if settings.format != "frame":
         text = raw[:1] in {b"{", b" "}
-        return [f"  {printable(shortened(raw.decode(errors='replace'))) if text else hex_line(raw)}"]
+        return [
+            f"  {printable(shortened(raw.decode(errors='replace'))) if text else hex_line(raw)}"
+        ]
     lines = [f"  {hex_line(raw)}"]
     if settings.checksum != "none" and raw:
         _, size = CHECKSUMS[settings.checksum]
         at = (-size if settings.checksum_at is None else settings.checksum_at) % len(raw)
         said = decoder.frames.fault(raw) or f"{settings.checksum}, right"
-        lines.append(f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum: {said}")
+        lines.append(
+            f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum: {said}"
+        )
     for field in sorted(settings.fields, key=lambda field: field.at):
         _, size, _ = field_format(field.type) or ("u", 1, False)
         part = raw[field.at : field.at + size]
@@ -96,17 +113,27 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
         except IndexError as error:
             value = f"beyond the frame ({error})"
         by = "".join(
-            f", {name} {number:.12g}" for name, number in (("x", field.scale), ("+", field.add)) if number != (name == "x")
+            f", {name} {number:.12g}"
+            for name, number in (("x", field.scale), ("+", field.add))
+            if number != (name == "x")
         )
         span = f"{field.at:3} to {field.at + size - 1:3}"
-        lines.append(f"  bytes {span}  {part.hex(' '):<24} {field.name:<5} = {value}  ({field.type}{by})")
+        lines.append(
+            f"  bytes {span}  {part.hex(' '):<24} {field.name:<5} = {value}  ({field.type}{by})"
+        )
     return lines
 
 
-def lines_of(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[str]:
+def lines_of(
+    found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None
+) -> list[str]:
     """An answer or a refusal explained, a line each."""
     if isinstance(found, RefusedAnswer):
-        return [f"  {hex_line(found.raw)}"] if found.reason == "framing" else byte_lines(found.raw, decoder)
+        return (
+            [f"  {hex_line(found.raw)}"]
+            if found.reason == "framing"
+            else byte_lines(found.raw, decoder)
+        )
     said = under_conventions(found, decoder, shown)
     lines = [*byte_lines(found.raw, decoder), *(each.line() for each in said)]
     matching = next((each for each in said if each.matches), None)
@@ -115,9 +142,17 @@ def lines_of(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: Float
         scalar = "first" if form == "frame" else found_as.scalar
         written = msgspec.structs.replace(found_as, scalar=scalar)
         own = found_as == decoder.sent.convention
-        lines.append("  the bench file's convention matches" if own else f"  write [answers] convention = {written}")
+        lines.append(
+            "  the bench file's convention matches"
+            if own
+            else f"  write [answers] convention = {written}"
+        )
         if form == "frame" and found_as.scalar == "last":
-            lines.append("  and name its four fields qx, qy, qz, qw in the order in which they now are qw, qx, qy, qz")
+            lines.append(
+                "  and name its four fields qx, qy, qz, qw in the order in which they now are qw, qx, qy, qz"
+            )
     elif shown is not None and said:
-        lines.append("  no convention matches what is shown: is it another sky, another mounting, or a mirrored frame?")
+        lines.append(
+            "  no convention matches what is shown: is it another sky, another mounting, or a mirrored frame?"
+        )
     return lines

@@ -32,7 +32,13 @@ from hilstar.basics.errors import InputError, one_line, printable, shortened
 from hilstar.basics.process.user_code import PREFIX, UserCodeError, user_function
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.answers.answer import Answer, ReportedStar
-from hilstar.server.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, FrameField, FrameLength, field_format
+from hilstar.server.bench.config.answers import (
+    MAX_FRAME_BYTES,
+    AnswersSettings,
+    FrameField,
+    FrameLength,
+    field_format,
+)
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
@@ -78,16 +84,33 @@ class JsonAnswer(msgspec.Struct, frozen=True):
     centroids: list[list[float | None]] = []
 
 
-def answer_of(sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer) -> Answer | RefusedAnswer:
+def answer_of(
+    sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer
+) -> Answer | RefusedAnswer:
     """The answer that a tracker's numbers are, or why they are none; `sent` says what its
     quaternions mean.
     """
     t_ns = said.t_ns
     if t_ns is not None and t_ns not in INT64:
         return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
-    mode = "" if said.mode is None else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+    mode = (
+        ""
+        if said.mode is None
+        else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+    )
     stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
-    plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, stars, said.rms_arcsec, _reported(said.centroids))
+    plain = Answer(
+        host_ns,
+        raw,
+        t_ns,
+        None,
+        None,
+        said.valid,
+        mode,
+        stars,
+        said.rms_arcsec,
+        _reported(said.centroids),
+    )
     if said.q is None or not said.valid:  # without an attitude its numbers may be anything
         return replace(plain, valid=False) if said.q is None else plain
     checked = checked_sample(0, said.q, said.rate)
@@ -103,7 +126,11 @@ def _reported(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
     for row in rows:
         x_px, y_px, dn, hip = [*row, None, None, None, None][:4]
         if x_px is not None and y_px is not None and math.isfinite(x_px) and math.isfinite(y_px):
-            stars.append(ReportedStar(x_px, y_px, dn, int(hip) if hip is not None and 0 < hip <= MAX_HIP else None))
+            stars.append(
+                ReportedStar(
+                    x_px, y_px, dn, int(hip) if hip is not None and 0 < hip <= MAX_HIP else None
+                )
+            )
     return tuple(stars)
 
 
@@ -123,7 +150,14 @@ class Delimited:
     of a stream may be cut off.
     """
 
-    def __init__(self, end: bytes, max_bytes: int, unstuff: Callable[[bytes], bytes], word: str, whole: bool = False) -> None:
+    def __init__(
+        self,
+        end: bytes,
+        max_bytes: int,
+        unstuff: Callable[[bytes], bytes],
+        word: str,
+        whole: bool = False,
+    ) -> None:
         self._end, self._max, self._unstuff, self._word = end, max_bytes, unstuff, word
         self._kept, self._overlong, self._whole = bytearray(), False, whole
 
@@ -178,7 +212,9 @@ class Measured:
     byte on.
     """
 
-    def __init__(self, settings: AnswersSettings, check: Callable[[bytes], str], certain: bool) -> None:
+    def __init__(
+        self, settings: AnswersSettings, check: Callable[[bytes], str], certain: bool
+    ) -> None:
         self._sync = b"" if settings.sync_hex is None else bytes.fromhex(settings.sync_hex)
         self._length, self._ccsds = settings.length, settings.framing == "ccsds"
         self._check, self._certain = check, certain
@@ -252,13 +288,20 @@ class Measured:
                 return None
             size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(kept[at + 4 : at + 6], "big")
             wanted = self._length if isinstance(self._length, int) else size
-            return size if not kept[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES else 0
+            return (
+                size
+                if not kept[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES
+                else 0
+            )
         if not isinstance(self._length, FrameLength):
             return self._length
         end = self._length.at + (field_format(self._length.type) or ("u", 1, False))[1]
         if len(kept) - at < end:
             return None
-        size = int(raw_number(bytes(kept[at : at + end]), self._length.at, self._length.type)) + self._length.add
+        size = (
+            int(raw_number(bytes(kept[at : at + end]), self._length.at, self._length.type))
+            + self._length.add
+        )
         return size if end <= size <= MAX_FRAME_BYTES else 0
 
 
@@ -293,7 +336,11 @@ class FrameDecoder:
             return f"too short for its checksum: {len(body)} bytes"
         found = int.from_bytes(body[at : at + size], settings.checksum_order)
         wanted = calculate(body[settings.checksum_from : at])
-        return "" if found == wanted else f"the {settings.checksum} checksum is {found:#x}, and {wanted:#x} by the bytes"
+        return (
+            ""
+            if found == wanted
+            else f"the {settings.checksum} checksum is {found:#x}, and {wanted:#x} by the bytes"
+        )
 
     def decoded(self, body: bytes) -> JsonAnswer | RefusedAnswer:
         """What a frame says."""
@@ -302,7 +349,9 @@ class FrameDecoder:
         if any(body[at : at + len(wanted)] != wanted for at, wanted in self._matches):
             return RefusedAnswer("other", "a frame of another kind ([answers] match)", body)
         try:
-            found: dict[str, int | float] = {field.name: self.value(body, field) for field in self.settings.fields}
+            found: dict[str, int | float] = {
+                field.name: self.value(body, field) for field in self.settings.fields
+            }
         except IndexError as error:
             return RefusedAnswer("length", f"a field needs {error}", body)
         return said_by(found, body)
@@ -325,7 +374,9 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     rate = tuple(float(found[name]) for name in ("wx", "wy", "wz")) if "wx" in found else None
     # Each by itself: whole seconds and a fraction stay exact.
     times_ns = [
-        found[name] * unit_ns for name, unit_ns in (("t_ns", 1), ("t_s", NS_PER_S), ("t_sub", NS_PER_S)) if name in found
+        found[name] * unit_ns
+        for name, unit_ns in (("t_ns", 1), ("t_s", NS_PER_S), ("t_sub", NS_PER_S))
+        if name in found
     ]
     if not all(map(math.isfinite, times_ns)):
         return RefusedAnswer("nan", "its time is not finite", body)
@@ -353,7 +404,11 @@ class AnswerDecoder:
     """
 
     def __init__(
-        self, settings: AnswersSettings, q_body_to_cam: Components | None, messages: bool, folder: Path | None = None
+        self,
+        settings: AnswersSettings,
+        q_body_to_cam: Components | None,
+        messages: bool,
+        folder: Path | None = None,
     ) -> None:
         self.settings, self.q_body_to_cam = settings, q_body_to_cam
         self.sent = SentAttitudes(settings.convention, Mounting(q_body_to_cam))
@@ -383,7 +438,11 @@ class AnswerDecoder:
             return [self._answer(host_ns, said, chunk) for said in self._said(chunk)]
         cuts = cutter.cut(chunk + self._end() if self._messages else chunk)
         # A program that writes a file may leave a frame in two for as long as it likes.
-        if isinstance(cutter, Measured) and host_ns - self._last_ns > PAUSE_NS and self.settings.source != "file":
+        if (
+            isinstance(cutter, Measured)
+            and host_ns - self._last_ns > PAUSE_NS
+            and self.settings.source != "file"
+        ):
             cuts = chain(cutter.pause(), cuts)
         self._last_ns = host_ns
         found: list[Answer | RefusedAnswer] = []
@@ -398,7 +457,9 @@ class AnswerDecoder:
         """A message over UDP or ZeroMQ need not have the end that its framing has on a line."""
         return {"cobs": b"\0", "slip": SLIP_END}.get(self.settings.framing or "", b"")
 
-    def _answer(self, host_ns: int, said: JsonAnswer | RefusedAnswer, raw: bytes) -> Answer | RefusedAnswer:
+    def _answer(
+        self, host_ns: int, said: JsonAnswer | RefusedAnswer, raw: bytes
+    ) -> Answer | RefusedAnswer:
         return said if isinstance(said, RefusedAnswer) else answer_of(self.sent, host_ns, raw, said)
 
     def _said(self, body: bytes) -> Iterable[JsonAnswer | RefusedAnswer]:
@@ -414,14 +475,20 @@ class AnswerDecoder:
 def _of_packet(body: bytes) -> JsonAnswer | RefusedAnswer:
     found = decode(body)
     if isinstance(found, Refusal):
-        return RefusedAnswer(found.reason, found.detail.replace("an attitude of 64", "an answer of 68"), body)
+        return RefusedAnswer(
+            found.reason, found.detail.replace("an attitude of 64", "an answer of 68"), body
+        )
     if not isinstance(found, AnswerPacket):
-        return RefusedAnswer("format", f"a packet of another kind; send kind {protocol.KIND_ANSWER}", body)
+        return RefusedAnswer(
+            "format", f"a packet of another kind; send kind {protocol.KIND_ANSWER}", body
+        )
     w, x, y, z = found.q_icrs_to_cam
     rx, ry, rz = found.rate_cam_rad_s
     rate = (rx, ry, rz) if found.flags & protocol.ANSWER_RATE_VALID else None
     mode = next((word for bit, word in MODES if found.flags & bit), "")
-    return JsonAnswer(found.t_ns, (w, x, y, z), rate, bool(found.flags & protocol.ANSWER_VALID), mode, found.stars)
+    return JsonAnswer(
+        found.t_ns, (w, x, y, z), rate, bool(found.flags & protocol.ANSWER_VALID), mode, found.stars
+    )
 
 
 _json = msgspec.json.Decoder(JsonAnswer)
@@ -429,7 +496,9 @@ _json = msgspec.json.Decoder(JsonAnswer)
 
 def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
     if len(line) > MAX_JSON_BYTES:
-        return RefusedAnswer("format", f"more than {MAX_JSON_BYTES} bytes of JSON", line[:MAX_FRAME_BYTES])
+        return RefusedAnswer(
+            "format", f"more than {MAX_JSON_BYTES} bytes of JSON", line[:MAX_FRAME_BYTES]
+        )
     try:
         return _json.decode(line)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
@@ -443,10 +512,14 @@ def _load(settings: AnswersSettings, folder: Path | None) -> Callable[[bytes], A
         return user_function(settings.format, folder or Path(), settings.trust)
     except UserCodeError as error:
         said = f'[answers] format = "{settings.format}": {error}'
-        raise InputError(f"{one_line(said)}; name a module beside the bench file and its function") from error
+        raise InputError(
+            f"{one_line(said)}; name a module beside the bench file and its function"
+        ) from error
 
 
-def _of_function(function: Callable[[bytes], Any], chunk: bytes) -> Iterator[JsonAnswer | RefusedAnswer]:
+def _of_function(
+    function: Callable[[bytes], Any], chunk: bytes
+) -> Iterator[JsonAnswer | RefusedAnswer]:
     """The answers of a user's function: a dictionary each, as the JSON object."""
     try:
         for said in function(chunk) or ():

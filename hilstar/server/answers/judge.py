@@ -135,13 +135,17 @@ class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
 class AnswerTimes:
     """When the tracker looked: the middle of an answer's exposure on the host's clock."""
 
-    def __init__(self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset) -> None:
+    def __init__(
+        self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset
+    ) -> None:
         self._rules, self._unix_offset = rules, unix_offset
         self._known, self._known_ns = UnixOffset(0, 0), -KNOWN_AGAIN_NS
         self._clock = SenderClock()
         self._late = 0
         self.order = StampOrder()
-        self.guess_s = rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
+        self.guess_s = (
+            rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
+        )
         self.fits = rules.latency_s is None and (rules.clock == "own" or rules.stamp == "arrival")
         self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S if self.fits else 0.0
 
@@ -186,7 +190,9 @@ class DelayFit(NamedTuple):
     sigma_s: float
 
 
-def fitted_delay(error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float) -> DelayFit | None:
+def fitted_delay(
+    error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float
+) -> DelayFit | None:
     """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they
     tell none.
 
@@ -284,7 +290,11 @@ class AnswerJudge:
         """
         row = self._rows[self._count % MAX_IN_WINDOW]
         row[:] = 0.0
-        row[:3] = found.answer.host_ns / NS_PER_S, VERDICTS.index(found.verdict), self._frames.dark_ns / NS_PER_S
+        row[:3] = (
+            found.answer.host_ns / NS_PER_S,
+            VERDICTS.index(found.verdict),
+            self._frames.dark_ns / NS_PER_S,
+        )
         if found.lit is not None and found.residual is not None:
             row[ERROR], row[RATE] = found.residual, ARCSEC_PER_RAD * found.lit.rate_rad_s
         self._count += 1
@@ -293,7 +303,11 @@ class AnswerJudge:
 
     def _lately(self, now_ns: int) -> FloatArray:
         at = self._count % MAX_IN_WINDOW
-        rows = self._rows[: self._count] if self._count < MAX_IN_WINDOW else np.roll(self._rows, -at, axis=0)
+        rows = (
+            self._rows[: self._count]
+            if self._count < MAX_IN_WINDOW
+            else np.roll(self._rows, -at, axis=0)
+        )
         return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]
 
     def _fit(self, now_ns: int) -> None:
@@ -329,26 +343,43 @@ class AnswerJudge:
         told: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
         told["out_of_order"] = self.times.order.fallen
         cycle_s = cycle_of(rows[:, HOST_S])
-        since_s = (now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)) / NS_PER_S
+        since_s = (
+            now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)
+        ) / NS_PER_S
         limit_s = FIRST_S if newest is None else max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
         if newest is not None:
             late_s = (newest.answer.host_ns - newest.middle_ns) / NS_PER_S
-            told |= {"mode": newest.answer.mode, "stars": newest.answer.star_count, "verdict": newest.verdict}
-            told |= {"latency_ms": round(1e3 * late_s, 3), "latency_sigma_ms": round(1e3 * newest.sigma_s, 3)}
+            told |= {
+                "mode": newest.answer.mode,
+                "stars": newest.answer.star_count,
+                "verdict": newest.verdict,
+            }
+            told |= {
+                "latency_ms": round(1e3 * late_s, 3),
+                "latency_sigma_ms": round(1e3 * newest.sigma_s, 3),
+            }
             told |= {
                 "residual_arcsec": None if newest.residual is None else _rounded(newest.residual),
                 "age_s": round(since_s, 3),
             }
         error = rows[rows[:, VERDICT] == 0][:, ERROR]
         if len(error):
-            told |= {"mean_arcsec": _rounded(error.mean(axis=0)), "rms_arcsec": _rounded(np.sqrt((error**2).mean(axis=0)))}
+            told |= {
+                "mean_arcsec": _rounded(error.mean(axis=0)),
+                "rms_arcsec": _rounded(np.sqrt((error**2).mean(axis=0))),
+            }
         if len(error) > 1:
             told |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
         if cycle_s is not None:  # arrivals jitter by less than half a cycle
             dark_s = self._frames.dark_ns / NS_PER_S - rows[0, DARK_S]
             due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
-            told |= {"rate_hz": round(1 / cycle_s, 3), "availability": round(min(len(error) / max(due, 1), 1.0), 4)}
-        words = "the tracker has not answered" + (" yet" if newest is None else f" for {since_s:.1f} s")
+            told |= {
+                "rate_hz": round(1 / cycle_s, 3),
+                "availability": round(min(len(error) / max(due, 1), 1.0), 4),
+            }
+        words = "the tracker has not answered" + (
+            " yet" if newest is None else f" for {since_s:.1f} s"
+        )
         words += f" ({trouble})" if trouble else ""
         return TrackerFigures(
             answers=sum(self.counts.values()),

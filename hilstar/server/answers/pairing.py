@@ -9,7 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, normalise, propagate, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    propagate,
+    to_rotation_vector,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 
 # how long a frame is kept: an answer that comes later than that is not compared
@@ -87,25 +94,37 @@ class LitFrames:
         kept, lit_ns, whole_ns = [], [], 0
         for k in range(first, last + 1):
             begin_ns = self._begin_ns(frames[k])
-            gone_ns = self._begin_ns(frames[k + 1]) if k + 1 < len(frames) else begin_ns + MAX_HELD_NS
-            overlap_ns = max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0) if end_ns > start_ns else 1
+            gone_ns = (
+                self._begin_ns(frames[k + 1]) if k + 1 < len(frames) else begin_ns + MAX_HELD_NS
+            )
+            overlap_ns = (
+                max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0) if end_ns > start_ns else 1
+            )
             if frames[k].q is not None and overlap_ns:
                 kept.append(k)
                 lit_ns.append(overlap_ns)
                 whole_ns += overlap_ns
         if not kept or whole_ns < MIN_LIT_SHARE * (end_ns - start_ns):
             return None
-        return self._mean(frames, kept, np.array(lit_ns, dtype=np.float64), (start_ns + end_ns) // 2)
+        return self._mean(
+            frames, kept, np.array(lit_ns, dtype=np.float64), (start_ns + end_ns) // 2
+        )
 
     def _begin_ns(self, frame: LitFrame) -> int:
         return frame.host_ns - (self._early_ns if frame.rate_rad_s is None else 0)
 
-    def _mean(self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int) -> Lit | None:
+    def _mean(
+        self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int
+    ) -> Lit | None:
         """The mean rotation of the frames `kept`, weighted by how long each was lit; None across
         a jump.
         """
         # The rate needs two frames: of a short exposure a neighbour too.
-        near = kept if len(kept) > 1 else [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
+        near = (
+            kept
+            if len(kept) > 1
+            else [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
+        )
         near = [k for k in near if frames[k].q is not None]
         q = np.array([self._shown(frames[k]) for k in near])
         turned = to_rotation_vector(multiply(q, conjugate(q[:1])))
@@ -115,7 +134,11 @@ class LitFrames:
         at_s = np.array([(frames[k].host_ns - middle_ns) / NS_PER_S for k in near])
         spread_s = at_s - at_s.mean()
         power = float(spread_s @ spread_s)
-        rate = -(spread_s @ turned) / power if power and (not len(steps) or steps.max() <= MAX_STEP_RAD) else np.zeros(3)
+        rate = (
+            -(spread_s @ turned) / power
+            if power and (not len(steps) or steps.max() <= MAX_STEP_RAD)
+            else np.zeros(3)
+        )
         inside = [near.index(k) for k in kept]
         mean = lit_ns @ turned[inside] / lit_ns.sum()
         nearest = min((frames[k] for k in kept), key=lambda frame: abs(frame.host_ns - middle_ns))
@@ -128,7 +151,11 @@ class LitFrames:
         its light.
         """
         assert frame.q is not None
-        return frame.q if frame.rate_rad_s is None else propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
+        return (
+            frame.q
+            if frame.rate_rad_s is None
+            else propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
+        )
 
 
 def residual_arcsec(reported: FloatArray, lit: FloatArray) -> FloatArray:

@@ -70,7 +70,9 @@ class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 hand_over = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist).encode
-handed_over = msgspec.msgpack.Decoder(HandedOver, dec_hook=lambda kind, numbers: np.array(numbers)).decode
+handed_over = msgspec.msgpack.Decoder(
+    HandedOver, dec_hook=lambda kind, numbers: np.array(numbers)
+).decode
 
 
 @dataclass(frozen=True)
@@ -93,12 +95,16 @@ class ReadPlan:
             keys = CurveKeys(*(None if name is None else self.folder / name for name in names))
             endpoint, bind = settings.endpoint or ZMQ_ENDPOINT, settings.bind is True
             try:
-                return ZmqBytes(ZmqReceiver(endpoint, bind=bind, keys=keys, notices=notices), notices)
+                return ZmqBytes(
+                    ZmqReceiver(endpoint, bind=bind, keys=keys, notices=notices), notices
+                )
             except InputError as error:
                 raise InputError(f"[answers] endpoint: {error}") from error
         if settings.connect is not None:
             place: Any = host_and_port(settings.connect)
-            _, allowed = answers_place(msgspec.structs.replace(settings, listen=None, bind=None, port="", endpoint=None))
+            _, allowed = answers_place(
+                msgspec.structs.replace(settings, listen=None, bind=None, port="", endpoint=None)
+            )
         else:
             place, allowed = answers_place(settings)
         return (TcpBytes if settings.source == "tcp" else UdpBytes)(place, allowed, notices)
@@ -129,7 +135,11 @@ class DecodingLink:
         self._question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
         self._period_s = 1 / settings.poll_hz
         self._next_question = clock.within(0.0)
-        self._bytes_left, self._answers_left, self._work_left_s = float(MAX_BURST_BYTES), float(MAX_ANSWERS_PER_S), MAX_WORK_S
+        self._bytes_left, self._answers_left, self._work_left_s = (
+            float(MAX_BURST_BYTES),
+            float(MAX_ANSWERS_PER_S),
+            MAX_WORK_S,
+        )
         self._seen_ns = clock.now_ns()
         self._trouble: str | None = None
 
@@ -171,14 +181,18 @@ class DecodingLink:
                     given.append(chunk._replace(parts=[hand_over(HandedOver(found))], sender=None))
             self._work_left_s -= (self._clock.now_ns() - begun_ns) / NS_PER_S
         if refused:
-            given.append(RawMessage(now_ns, [hand_over(HandedOver(refused=dict(refused), details=details))]))
+            given.append(
+                RawMessage(now_ns, [hand_over(HandedOver(refused=dict(refused), details=details))])
+            )
             self._clock.sleep(FLOOD_REST_S if refused[FLOOD] else 0.0)
         return given + self._new_trouble(now_ns)
 
     def _refill(self, now_ns: int) -> None:
         passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
         self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
-        self._answers_left = min(self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S)
+        self._answers_left = min(
+            self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S
+        )
         self._work_left_s = min(self._work_left_s + passed_s * WORK_SHARE, MAX_WORK_S)
 
     def _new_trouble(self, now_ns: int) -> list[RawMessage]:
@@ -261,7 +275,9 @@ class AnswersApart(Closing):
         self._process.close()
 
 
-def recorded_answers(plan: ReadPlan, decoder: AnswerDecoder, path: Path) -> Iterator[Answer | RefusedAnswer]:
+def recorded_answers(
+    plan: ReadPlan, decoder: AnswerDecoder, path: Path
+) -> Iterator[Answer | RefusedAnswer]:
     """The answers in a file of recorded bytes. Raises InputError where it cannot be read."""
     with open_regular(path, "give the bytes that were recorded from the tracker's line") as file:
         while chunk := file.read(CHUNK_BYTES):
@@ -288,7 +304,9 @@ def live_answers(
         if question is not None and due.over:
             link.put(question)
             due = clock.within(1 / settings.poll_hz)
-        for chunk in link.taken(LOOK_MS if question is None else min(LOOK_MS, max(int(due.left_s * 1000), 1))):
+        for chunk in link.taken(
+            LOOK_MS if question is None else min(LOOK_MS, max(int(due.left_s * 1000), 1))
+        ):
             yield from decoder.feed(chunk.host_ns, chunk.parts[-1])
 
 
@@ -297,5 +315,7 @@ def open_answers(config: BenchConfig, folder: Path, notices: Notices) -> Answers
     they cannot be opened.
     """
     if config.answers is None:
-        raise InputError('the bench file has no [answers]; write [answers] with source = "serial" or the like')
+        raise InputError(
+            'the bench file has no [answers]; write [answers] with source = "serial" or the like'
+        )
     return AnswersApart(ReadPlan(config.answers, folder, config.tracker.q_body_to_cam), notices)

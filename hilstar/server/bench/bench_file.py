@@ -28,9 +28,22 @@ from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import place_of
 from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 from hilstar.display.calibration import BUILT_IN
-from hilstar.server.bench.config import GAUSSIAN, GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
+from hilstar.server.bench.config import (
+    GAUSSIAN,
+    GEOCENTRE,
+    SOURCE,
+    AttitudeSettings,
+    BenchConfig,
+    config_of,
+    parse_config,
+)
 from hilstar.server.bench.config.bench_config import HEADS, UNIX, today, with_dates
-from hilstar.server.bench.config.render import DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX, HASHED_TOLERANCE, RenderSettings
+from hilstar.server.bench.config.render import (
+    DEFAULT_TOLERANCE_MAG,
+    DEFAULT_TOLERANCE_PX,
+    HASHED_TOLERANCE,
+    RenderSettings,
+)
 from hilstar.sky.spectrum import BUILT_IN_CURVES
 from hilstar.sky.star_table import file_sha256
 
@@ -120,7 +133,11 @@ def stated_in(config: BenchConfig) -> "Stated":
     from hilstar.attitude.logs.entries import Stated
 
     convention = None if config.attitude.convention == HILSTARS else config.attitude.convention
-    return Stated(Mounting(config.tracker.q_body_to_cam), convention=convention, convention_by="[attitude] convention")
+    return Stated(
+        Mounting(config.tracker.q_body_to_cam),
+        convention=convention,
+        convention_by="[attitude] convention",
+    )
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
@@ -144,7 +161,12 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     sky = (orbit, bodies.satellites, bodies.satellite_magnitudes, *air)
     named: tuple[str | float | None, ...] = (*curves, *files, *true, *sky)
     for name in named:
-        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos", GAUSSIAN):
+        if isinstance(name, str) and name not in (
+            *BUILT_IN_CURVES,
+            *BUILT_IN,
+            "hipparcos",
+            GAUSSIAN,
+        ):
             with suppress(InputError):  # its own reader explains better why a file cannot be read
                 digest.update(read_bytes(folder / name, "", MAX_NAMED_BYTES))
     for large in (config.sky.catalogue, config.sky.diffuse.map):
@@ -161,7 +183,11 @@ def _hashed_tolerance(render: RenderSettings) -> dict[str, float]:
     if render.effort == "auto" or render.quantisation == "auto" or render.psf != GAUSSIAN:
         return {}
     defaults = {"tolerance_mag": DEFAULT_TOLERANCE_MAG, "tolerance_px": DEFAULT_TOLERANCE_PX}
-    return {key: HASHED_TOLERANCE for key, default in defaults.items() if getattr(render, key) == default}
+    return {
+        key: HASHED_TOLERANCE
+        for key, default in defaults.items()
+        if getattr(render, key) == default
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +242,9 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
         raise InputError(f"{path}: heads = {shortened(repr(listed))}: no list of files; {EXAMPLE}")
     if not MIN_HEADS <= len(listed) <= MAX_HEADS:
-        raise InputError(f"{path}: heads names {len(listed)} files; {EXAMPLE}, from {MIN_HEADS} to {MAX_HEADS}")
+        raise InputError(
+            f"{path}: heads names {len(listed)} files; {EXAMPLE}, from {MIN_HEADS} to {MAX_HEADS}"
+        )
     paths = [path.parent / name for name in listed]
     names = tuple(head.stem for head in paths)
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
@@ -229,9 +257,13 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     for k, place in enumerate(places):
         if place in places[:k]:
             first = paths[places.index(place)]
-            raise InputError(f"{path}: heads: {paths[k].name} is the same file as {first.name}; give each a file of its own")
+            raise InputError(
+                f"{path}: heads: {paths[k].name} is the same file as {first.name}; give each a file of its own"
+            )
     if files[0].config.attitude.lockstep:
-        raise InputError(f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out")
+        raise InputError(
+            f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out"
+        )
     return HeadsFile(path, names, files)
 
 
@@ -248,7 +280,9 @@ def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
             ' write frame = "body", or leave it out'
         )
     convention = msgspec.structs.replace(source.convention, frame="body")
-    config = msgspec.structs.replace(file.config, attitude=msgspec.structs.replace(source, convention=convention))
+    config = msgspec.structs.replace(
+        file.config, attitude=msgspec.structs.replace(source, convention=convention)
+    )
     return replace(file, config=config)
 
 
@@ -260,7 +294,11 @@ def as_head(head: Path, heads: Path) -> BenchFile:
 
 
 def with_key(
-    text: str, table: str, key: str, value: float | str | bool | Sequence[float], instead_of: tuple[str, ...] = ()
+    text: str,
+    table: str,
+    key: str,
+    value: float | str | bool | Sequence[float],
+    instead_of: tuple[str, ...] = (),
 ) -> str:
     """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in
     `instead_of`, or one added.

@@ -35,23 +35,64 @@ from hilstar.optics.layers.truth import StarInView, brightest_in_view
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.cameras import before_detector, bench_camera, display_psfs, tracker_camera, tracker_psf
+from hilstar.server.bench.cameras import (
+    before_detector,
+    bench_camera,
+    display_psfs,
+    tracker_camera,
+    tracker_psf,
+)
 from hilstar.server.bench.colours import Colours, mixed_for
-from hilstar.server.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
-from hilstar.server.bench.config.bench_config import drives_apart, epoch_utc_ns, has_observer, sky_jd
+from hilstar.server.bench.config import (
+    DEFAULT_BRIGHTEST_V_MAG,
+    BenchConfig,
+    Monitor,
+    RenderSettings,
+    Tracker,
+)
+from hilstar.server.bench.config.bench_config import (
+    drives_apart,
+    epoch_utc_ns,
+    has_observer,
+    sky_jd,
+)
 from hilstar.server.bench.config.sky import SkySettings
 from hilstar.server.bench.config.values import MAX_NUMBER, MIN_POSITIVE
-from hilstar.server.bench.effort import BEST, CHEAP, IN_TIME_SHARE, SURELY_IN_TIME, Effort, FieldCost, Light, plan_effort
+from hilstar.server.bench.effort import (
+    BEST,
+    CHEAP,
+    IN_TIME_SHARE,
+    SURELY_IN_TIME,
+    Effort,
+    FieldCost,
+    Light,
+    plan_effort,
+)
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.glass import glass_transmission
 from hilstar.server.bench.least_psf import WHOLE, Choice
 from hilstar.sky.air import SiteAir, dimmed_mag
 from hilstar.sky.catalog import Catalog
-from hilstar.sky.electrons import Optics, Photometry, all_channels, star_temperatures_k, tabulate, tabulate_pickles
+from hilstar.sky.electrons import (
+    Optics,
+    Photometry,
+    all_channels,
+    star_temperatures_k,
+    tabulate,
+    tabulate_pickles,
+)
 from hilstar.sky.spectral_types import star_types, tabulate_types
 from hilstar.sky.spectrum import QUANTUM_EFFICIENCIES, Curve, load_curve
 from hilstar.sky.star_table import TableChoice, choose_catalog
-from hilstar.sky.stars import BV_MAG, Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
+from hilstar.sky.stars import (
+    BV_MAG,
+    Stars,
+    aberrate,
+    make_stars,
+    split_by_rate,
+    total_and_colours,
+    unit_vectors_icrs,
+)
 
 if TYPE_CHECKING:
     from hilstar.display.render.context import Context
@@ -63,7 +104,10 @@ S_PER_MS = 1e-3
 BAND_NM, KNOT_NM = 25.0, 5.0
 # Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times
 # allow. The fastest frame of each field counts.
-TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
+TIMED_FIELDS = [
+    from_radec_roll_deg(*place, 0.0)
+    for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))
+]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
 V_BAND_NM, V_BAND_POINTS = (470.0, 700.0), 231  # Johnson V
@@ -77,7 +121,9 @@ def load(path: str | Path) -> Bench:
     return open_bench(read_bench_file(Path(path)))
 
 
-def open_bench(file: BenchFile, context: Context | None = None, *, timed: bool = False, on_screen: bool = False) -> Bench:
+def open_bench(
+    file: BenchFile, context: Context | None = None, *, timed: bool = False, on_screen: bool = False
+) -> Bench:
     """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is
     missing. Raises InputError.
 
@@ -148,7 +194,9 @@ def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
             white_e_per_s=white_e_per_s * display.darkest,
             rates_e_per_s=stars.electrons_per_s,
             # about
-            sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),
+            sky_share=math.prod(camera.resolution_px)
+            / math.prod(camera.scales_px_rad())
+            / (4 * math.pi),
             refresh_hz=file.config.monitor.refresh_hz,
             seen=seen_by(file, camera),
             centroider=file.config.verify.judge,
@@ -171,7 +219,9 @@ def _planned(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, Ef
         if choice is None:
             return scene, effort
         is_last = choice.choice == WHOLE
-        if not is_last and (choice.error_mag > render.tolerance_mag or choice.error_px > render.tolerance_px):
+        if not is_last and (
+            choice.error_mag > render.tolerance_mag or choice.error_px > render.tolerance_px
+        ):
             continue
         near.append((scene, effort))
         if effort.within:
@@ -179,11 +229,15 @@ def _planned(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, Ef
     return near[0]
 
 
-def white_of(render: RenderSettings, stars: Stars, psf: Psf, drive: FloatArray | float = 1.0) -> float:
+def white_of(
+    render: RenderSettings, stars: Stars, psf: Psf, drive: FloatArray | float = 1.0
+) -> float:
     """Full scale, electrons per second of a pixel. Raises InputError as
     `brightest_peak_e_per_s`.
     """
-    return render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
+    return render.flux_at_white_e_per_s or brightest_peak_e_per_s(
+        stars, psf, render.brightest_v_mag, drive
+    )
 
 
 def turning_of(config: BenchConfig, on_screen: bool) -> float:
@@ -200,7 +254,14 @@ def turning_of(config: BenchConfig, on_screen: bool) -> float:
     return (scan.scanout_s + scan.hold_s) / 2 / scan.longest_s
 
 
-def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool, on_screen: bool) -> Bench:
+def _assembled(
+    file: BenchFile,
+    stars: Stars,
+    context: Context | None,
+    sources: Sources,
+    timed: bool,
+    on_screen: bool,
+) -> Bench:
     render, calibration = file.config.render, bench_calibration(file.config, file.folder)
     camera = bench_camera(file.config, file.folder)
     colours = bench_colours(file.config, file.folder, stars.catalog)
@@ -236,7 +297,9 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         )
         if colours is not None:
             together = colours.by_primary.T @ colours.by_primary
-            target = dataclasses.replace(target, primaries=panels, places_px=colours.places_px, together=together)
+            target = dataclasses.replace(
+                target, primaries=panels, places_px=colours.places_px, together=together
+            )
         faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
         shown, faint = split_by_rate(stars, faintest, drive)
         return Bench(
@@ -277,14 +340,20 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             benches[method] = bench_by(plan_effort(replace(render, quantisation=method), light))
         return timed_frame_ms(benches[method], for_s)
 
-    cost = measured_cost(frame_ms, light.tabulated_cost(bench.psf), IN_TIME_SHARE * light.refresh_ms)
+    cost = measured_cost(
+        frame_ms, light.tabulated_cost(bench.psf), IN_TIME_SHARE * light.refresh_ms
+    )
     effort = plan_effort(render, dataclasses.replace(light, measured=cost))
     bench = benches[effort.quantisation]
-    config = replace(bench.config, render=replace(bench.config.render, codes_ms=(cost.cheap_ms, cost.best_ms)))
+    config = replace(
+        bench.config, render=replace(bench.config.render, codes_ms=(cost.cheap_ms, cost.best_ms))
+    )
     return dataclasses.replace(bench, effort=effort, config=config)
 
 
-def measured_cost(frame_ms: Callable[[Quantisation, float], float], table: FieldCost, limit_ms: float) -> FieldCost:
+def measured_cost(
+    frame_ms: Callable[[Quantisation, float], float], table: FieldCost, limit_ms: float
+) -> FieldCost:
     """The cost of codes by `frame_ms`, which times a frame of a quantisation for so many seconds.
 
     Where `exact` is clearly in time, `round` is not timed: its share of that is the table's.
@@ -295,10 +364,16 @@ def measured_cost(frame_ms: Callable[[Quantisation, float], float], table: Field
     else:
         cheap_ms = best_ms * (table.cheap_ms / table.best_ms if table.best_ms else 1.0)
     cheap_ms, best_ms = (max(float(f"{ms:.3g}"), MIN_POSITIVE) for ms in (cheap_ms, best_ms))
-    return FieldCost(cheap_ms, best_ms, f"as measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)")
+    return FieldCost(
+        cheap_ms,
+        best_ms,
+        f"as measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)",
+    )
 
 
-def timed_frame_ms(bench: Bench, for_s: float, now_ns: Callable[[], int] = time.monotonic_ns) -> float:
+def timed_frame_ms(
+    bench: Bench, for_s: float, now_ns: Callable[[], int] = time.monotonic_ns
+) -> float:
     """The time of a frame of an average field that turns at 1 deg/s, ms, by drawing for about
     `for_s` after a warm-up.
     """
@@ -322,7 +397,9 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
     """
     tracker = file.config.tracker
     pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
-    blur_px = math.sqrt(math.prod(before_detector(file.config, file.folder, camera).width_px)) * pixel_px
+    blur_px = (
+        math.sqrt(math.prod(before_detector(file.config, file.folder, camera).width_px)) * pixel_px
+    )
     return Seen(blur_px=blur_px, pixel_px=pixel_px)
 
 
@@ -331,14 +408,23 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     relative to `folder`.
     """
     given = tracker.quantum_efficiencies.items()
-    efficiencies = [load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES) for key, source in given]
+    efficiencies = [
+        load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES)
+        for key, source in given
+    ]
     transmission = glass_transmission(tracker, folder)
     if not any(_sees_v(curve) for curve in efficiencies):
         names = ", ".join(tracker.quantum_efficiencies)
         band = f"{V_BAND_NM[0]:g} to {V_BAND_NM[1]:g} nm"
-        warn_once(f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from their colours")
+        warn_once(
+            f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from their colours"
+        )
     return tuple(
-        Optics(tracker.aperture_mm, Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor), transmission)
+        Optics(
+            tracker.aperture_mm,
+            Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor),
+            transmission,
+        )
         for one in efficiencies
     )
 
@@ -363,7 +449,13 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     one, bv_mag = np.ones(1), diffuse.bv_mag
     v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, bv_mag * one, np.nan * one)[0])
     faces = read_diffuse_map(folder / diffuse.map)
-    return Sources(moving, tuple(dataclasses.replace(face, image=face.image * v0_e_per_s, bv_mag=bv_mag) for face in faces))
+    return Sources(
+        moving,
+        tuple(
+            dataclasses.replace(face, image=face.image * v0_e_per_s, bv_mag=bv_mag)
+            for face in faces
+        ),
+    )
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
@@ -400,7 +492,9 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
     faintest = math.inf if sky.variables == "phase" else sky.faintest_v_mag
-    chosen = choose_catalog(dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest))
+    chosen = choose_catalog(
+        dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest)
+    )
     if sky.variables == "phase":
         chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
@@ -422,22 +516,37 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     # the air takes of each star by its own spectrum
     if config.site is not None and moving is not None:
         moving.air = site_air(config, folder, catalog, kind)
-    return dataclasses.replace(make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv)
+    return dataclasses.replace(
+        make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv
+    )
 
 
-def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None) -> SiteAir:
+def site_air(
+    config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None
+) -> SiteAir:
     """The air over `[site]` for stars of a catalogue. Raises InputError."""
     # ERFA takes 30 ms
-    from hilstar.server.bench.site import Ground, site_extinction, site_glow_e_per_s_sr, site_refraction
+    from hilstar.server.bench.site import (
+        Ground,
+        site_extinction,
+        site_glow_e_per_s_sr,
+        site_refraction,
+    )
 
     if config.site is None:
         raise AssertionError("the file has a site")
     extinction, optics = site_extinction(config.site, folder), bench_optics(config.tracker, folder)
     channels = bench_channels(config.tracker, folder)
-    v, bv, vi = (np.append(c, one) for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True))
+    v, bv, vi = (
+        np.append(c, one)
+        for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True)
+    )
     kinds = None if kind is None else np.vstack([kind, np.full((1, 2), np.nan)])
     dimming = [
-        dimmed_mag(lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction) for one in channels
+        dimmed_mag(
+            lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction
+        )
+        for one in channels
     ]
     return SiteAir(
         up_at=Ground(config.site).up,
@@ -456,7 +565,10 @@ def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
 
     Raises InputError or MachineError (see `bench_sources`).
     """
-    canvas = Canvas(tracker_camera(file.config.tracker, file.folder), tracker_psf(file.config.tracker, file.folder))
+    canvas = Canvas(
+        tracker_camera(file.config.tracker, file.folder),
+        tracker_psf(file.config.tracker, file.folder),
+    )
     sources = bench_sources(file.config, file.folder)
     stars = moved(bench_stars(file.config, file.folder, sources.moving), sources.moving)
     stars = seen_in(view, stars, sources.moving)
@@ -470,7 +582,12 @@ class StarRates(Protocol):
     """
 
     def __call__(
-        self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None = None, /
+        self,
+        v_mag: FloatArray,
+        bv_mag: FloatArray,
+        vi_mag: FloatArray,
+        kind: FloatArray | None = None,
+        /,
     ) -> FloatArray:
         """The rates (n,), or by channel (n, channels)."""
 
@@ -479,7 +596,11 @@ def star_kinds(config: BenchConfig, catalog: Catalog) -> FloatArray | None:
     """The types (n, 2) of stars, as `star_types` reads them, where a bench's spectra follow
     types; None elsewhere.
     """
-    return star_types(catalog) if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk") else None
+    return (
+        star_types(catalog)
+        if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk")
+        else None
+    )
 
 
 def star_rates(config: BenchConfig, folder: Path) -> StarRates:
@@ -503,7 +624,9 @@ def channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
         by_colour = tabulate_pickles(optics, photometry)
-        return lambda v_mag, bv_mag, vi_mag, _kind=None: by_colour.electrons_per_s(v_mag, bv_mag, vi_mag)
+        return lambda v_mag, bv_mag, vi_mag, _kind=None: by_colour.electrons_per_s(
+            v_mag, bv_mag, vi_mag
+        )
     if sky.brightness == "dgs" and sky.spectrum == "mk":
         return tabulate_types(optics, photometry).electrons_per_s
     by_temperature = tabulate(sky.brightness, optics, photometry)
@@ -551,12 +674,22 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
         )
     places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
     channels, rates_by = named_channels(config.tracker, folder), partial(channel_rates, config.sky)
-    psf = before_detector(config, folder, bench_camera(config, folder)) if len(channels) == 1 else None
-    return mixed_for(primaries, channels, places_px, rates_by, star_kinds(config, catalog), psf).for_stars(catalog)
+    psf = (
+        before_detector(config, folder, bench_camera(config, folder))
+        if len(channels) == 1
+        else None
+    )
+    return mixed_for(
+        primaries, channels, places_px, rates_by, star_kinds(config, catalog), psf
+    ).for_stars(catalog)
 
 
 def primary_panels(
-    file: BenchFile, colours: Colours, white_e_per_s: float, uniformity: Float32Array | None, name: str | None = None
+    file: BenchFile,
+    colours: Colours,
+    white_e_per_s: float,
+    uniformity: Float32Array | None,
+    name: str | None = None,
 ) -> tuple[Panel, ...]:
     """The panel of each primary of a monitor, of the calibration `name` (by default the
     bench's). Raises InputError.
@@ -569,7 +702,10 @@ def primary_panels(
 
 
 def brightest_peak_e_per_s(
-    stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG, drive: FloatArray | float = 1.0
+    stars: Stars,
+    psf: Psf,
+    brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG,
+    drive: FloatArray | float = 1.0,
 ) -> float:
     """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at
     or below that magnitude.
@@ -584,8 +720,14 @@ def brightest_peak_e_per_s(
     if not len(wanted) and magnitude == DEFAULT_BRIGHTEST_V_MAG:
         wanted = rates
     if not len(wanted):
-        key, better = ("[render] brightest_v_mag", "smaller") if len(stars) else ("[sky] faintest_v_mag", "larger")
-        raise InputError(f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s")
+        key, better = (
+            ("[render] brightest_v_mag", "smaller")
+            if len(stars)
+            else ("[sky] faintest_v_mag", "larger")
+        )
+        raise InputError(
+            f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s"
+        )
     peak_e_per_s = float(wanted.max()) * psf.peak_share
     if not MIN_POSITIVE <= peak_e_per_s <= MAX_NUMBER:
         raise InputError(
@@ -602,7 +744,11 @@ def orientation_of(monitor: Monitor) -> Orientation:
 
 def scan_of(monitor: Monitor) -> Scan:
     """When the rows light, and for how long."""
-    return Scan(orientation_of(monitor).down, monitor.panel_scanout_ms * S_PER_MS, monitor.panel_hold_ms * S_PER_MS)
+    return Scan(
+        orientation_of(monitor).down,
+        monitor.panel_scanout_ms * S_PER_MS,
+        monitor.panel_hold_ms * S_PER_MS,
+    )
 
 
 class StarGlass:
@@ -614,14 +760,18 @@ class StarGlass:
     spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
     """
 
-    def __init__(self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM) -> None:
+    def __init__(
+        self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM
+    ) -> None:
         self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
         self._catalog: Catalog | None = None
         self._of_row = np.empty((0, 0))
         self._bands: list[StarRates] = []
         self._of_band = np.ones((0, 1))
         if len(psf.wavelengths_nm) > 1:
-            flat = self._cut(file, optics or bench_optics(file.config.tracker, file.folder), band_nm)
+            flat = self._cut(
+                file, optics or bench_optics(file.config.tracker, file.folder), band_nm
+            )
             if optics is not None and self._bands:
                 self._mean = flat @ self._of_band / flat.sum()
 
@@ -633,7 +783,9 @@ class StarGlass:
         nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
         fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
         own_nm = optics.quantum_efficiency.wavelength_nm
-        knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
+        knots_nm = np.union1d(
+            np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)]
+        )
         efficiency = optics.quantum_efficiency(knots_nm)
         shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
         for number in range(len(nodes_nm)):
@@ -642,7 +794,10 @@ class StarGlass:
             if not response.any():
                 continue
             try:
-                rates = channel_rates(file.config.sky, dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)))
+                rates = channel_rates(
+                    file.config.sky,
+                    dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)),
+                )
             except InputError:
                 # so little light that some spectrum has none: the bands beside it stand for it
                 continue
@@ -659,14 +814,19 @@ class StarGlass:
         if not self._bands:
             return self._mean
         if self._catalog is not stars.catalog:
-            self._catalog, self._of_row = stars.catalog, np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
+            self._catalog, self._of_row = (
+                stars.catalog,
+                np.full((len(stars.catalog), self._of_band.shape[1]), np.nan),
+            )
         found = np.tile(self._mean, (len(which), 1))
         rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
         listed, body = rows >= 0, (rows < 0) & (which >= 0)
         new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
         if len(new):
             some = stars.catalog.taken(new)
-            self._of_row[new] = self._through(some.bv_mag, some.vi_mag, star_kinds(self._config, some))
+            self._of_row[new] = self._through(
+                some.bv_mag, some.vi_mag, star_kinds(self._config, some)
+            )
         found[listed] = self._of_row[rows[listed]]
         if body.any():
             bv_mag = stars.bv_mag[which[body]]
@@ -684,6 +844,10 @@ class StarGlass:
         at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
         return self.shares(stars, np.where(hip > 0, order[at], -1))
 
-    def _through(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
-        rates = np.stack([band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1)
+    def _through(
+        self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None
+    ) -> FloatArray:
+        rates = np.stack(
+            [band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1
+        )
         return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))

@@ -21,8 +21,22 @@ from hilstar.optics.camera import Camera, bounded
 from hilstar.optics.glass.glass_psf import regridded
 from hilstar.optics.psf import GaussianPsf, Psf, SampledPsf, read_psf
 from hilstar.server.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, Tracker
-from hilstar.server.bench.glass import Onto, bench_glass_psf, decentre_px, glass_in, say_once, through_glass
-from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, Choice, first_within, least_psf, psf_choices
+from hilstar.server.bench.glass import (
+    Onto,
+    bench_glass_psf,
+    decentre_px,
+    glass_in,
+    say_once,
+    through_glass,
+)
+from hilstar.server.bench.least_psf import (
+    ONE_PSF,
+    WHOLE,
+    Choice,
+    first_within,
+    least_psf,
+    psf_choices,
+)
 
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 # Share of the screen that the tracker sees, and of the tracker's field that the screen fills. A
@@ -33,7 +47,12 @@ MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
 # Limits of any bench: lenses are f/0.5 to f/21 (a factor of ten in one length mostly leaves this),
 # the widest sees 100 degrees, collimators are not shorter than a microscope's objective and not
 # longer than a room, pixels are those of the smallest sensors and of LED walls.
-F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (0.5, 21.0), 100.0, (0.3, 2000.0), (2.0, 50_000.0)
+F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (
+    (0.5, 21.0),
+    100.0,
+    (0.3, 2000.0),
+    (2.0, 50_000.0),
+)
 TRACKER_PITCHES_UM, MONITOR_PITCHES_UM = (0.5, 100.0), (1.0, 10_000.0)
 TRUE_RATIOS = (0.5, 2.0)  # a length of [verify] to the same length elsewhere in the file
 LENGTHS = (
@@ -89,7 +108,9 @@ def display_psf(config: BenchConfig, folder: Path, display: Camera) -> Psf:
     return first_within(display_psfs(config, folder, display), tolerance)[0]
 
 
-def display_psfs(config: BenchConfig, folder: Path, display: Camera) -> Iterator[tuple[Psf, Choice | None]]:
+def display_psfs(
+    config: BenchConfig, folder: Path, display: Camera
+) -> Iterator[tuple[Psf, Choice | None]]:
     """How a star may be drawn on the monitor, from the cheapest to the file's own; None where there
     is no choice.
 
@@ -105,16 +126,22 @@ def display_psfs(config: BenchConfig, folder: Path, display: Camera) -> Iterator
     x_px, y_px = camera.grid_px(FIELD_PLACES)
     places_px = onto.places_px(np.stack([x_px, y_px], axis=1))
     if not np.isfinite(places_px).all():
-        raise InputError('[render] psf = "tracker": the tracker looks past the display; check [collimator] q_cam_to_mon')
+        raise InputError(
+            '[render] psf = "tracker": the tracker looks past the display; check [collimator] q_cam_to_mon'
+        )
     try:
         if isinstance(own, GaussianPsf):
             spread = onto.matrix @ np.diag(np.square(own.sigma_px)) @ onto.matrix.T
             if abs(spread[0, 1]) > OBLIQUE * spread.trace():
-                raise InputError("its Gaussian is oval and lies obliquely on the display; give [tracker.optics] psf a file")
+                raise InputError(
+                    "its Gaussian is oval and lies obliquely on the display; give [tracker.optics] psf a file"
+                )
             yield GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
             return
         if isinstance(own, SampledPsf) and own.pixel_integrated:
-            raise InputError("it has the tracker's pixel in it (PIXINT), which the detector adds again; give one without")
+            raise InputError(
+                "it has the tracker's pixel in it (PIXINT), which the detector adds again; give one without"
+            )
         glass = glass_in(tracker, folder)
         if glass is not None:
             drawn: SampledPsf = bench_glass_psf(glass, tracker, folder, onto)
@@ -136,7 +163,11 @@ def before_detector(config: BenchConfig, folder: Path, display: Camera) -> Psf:
     """
     bare = config.render.psf != GAUSSIAN
     psf = GaussianPsf(NO_OBJECTIVE_PX) if bare else tracker_psf(config.tracker, folder)
-    blur_px = config.collimator.psf_sigma_px * tracker_camera(config.tracker, folder).focal_length_px / display.focal_length_px
+    blur_px = (
+        config.collimator.psf_sigma_px
+        * tracker_camera(config.tracker, folder).focal_length_px
+        / display.focal_length_px
+    )
     return psf.blurred(blur_px) if blur_px else psf
 
 
@@ -147,18 +178,28 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
     if tracker.optics.psf == GAUSSIAN:
         return GaussianPsf(tracker.psf_sigma_px)
     if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
-        say_once(f"psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}", "[tracker]")
+        say_once(
+            f"psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}", "[tracker]"
+        )
     glass = glass_in(tracker, folder)
-    own = read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
+    own = (
+        read_psf(folder / tracker.optics.psf)
+        if glass is None
+        else bench_glass_psf(glass, tracker, folder)
+    )
     if tracker.effort == "full":
         return own
-    found, choice = least_tracker_psf(own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))
+    found, choice = least_tracker_psf(
+        own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
+    )
     say_once(choice.line(), "[tracker] effort")
     return found
 
 
 @lru_cache(maxsize=4)
-def least_tracker_psf(own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]) -> tuple[Psf, Choice]:
+def least_tracker_psf(
+    own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]
+) -> tuple[Psf, Choice]:
     """The least PSF that `[tracker] effort = "auto"` allows, and why."""
     columns, rows = np.meshgrid(*(np.linspace(0, size - 1, FIELD_PLACES) for size in size_px))
     return least_psf(own, np.stack([columns.ravel(), rows.ravel()], axis=1), tolerance)
@@ -173,7 +214,9 @@ def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
         footprint_px = GaussianPsf(config.render.sprite_sigma_px).footprint_px
     else:
         tracker = config.tracker
-        ratio = camera.focal_length_px / (tracker.focal_length_mm * UM_PER_MM / tracker.pixel_pitch_um)
+        ratio = camera.focal_length_px / (
+            tracker.focal_length_mm * UM_PER_MM / tracker.pixel_pitch_um
+        )
         footprint_px = math.ceil(ratio * tracker_psf(tracker, folder).footprint_px) + 1
     return _bounded(camera, footprint_px / 2 + 1, folder / path)
 
@@ -184,7 +227,9 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     """
     optics = tracker.optics
     if optics.focus_um_per_k and optics.psf == GAUSSIAN:
-        raise InputError("[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave it out")
+        raise InputError(
+            "[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave it out"
+        )
     camera = monitor_camera(
         tracker.resolution_px,
         tracker.pixel_pitch_um,
@@ -200,15 +245,28 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     if tracker.distortion is not None:
         camera = load_distortion(path, camera)
     camera = through_glass(camera, tracker, folder)
-    return camera if camera.lens is None else _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
+    return (
+        camera
+        if camera.lens is None
+        else _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
+    )
 
 
 def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
     """The `true` tracker as its software knows it: at the reference temperature, the lens in its
     place. Raises InputError.
     """
-    optics = replace(tracker.optics, temperature_k=tracker.optics.reference_temperature_k, decentre_x_um=0.0, decentre_y_um=0.0)
-    return true if optics == tracker.optics else tracker_camera(replace(tracker, optics=optics), folder)
+    optics = replace(
+        tracker.optics,
+        temperature_k=tracker.optics.reference_temperature_k,
+        decentre_x_um=0.0,
+        decentre_y_um=0.0,
+    )
+    return (
+        true
+        if optics == tracker.optics
+        else tracker_camera(replace(tracker, optics=optics), folder)
+    )
 
 
 def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:
@@ -236,7 +294,9 @@ class FieldsOfView:
 
     def line(self) -> str:
         """ "screen 18.0 x 10.2 deg, tracker 10.9 deg, 0.89 tracker px a monitor px"."""
-        screen, tracker = ([figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg))
+        screen, tracker = (
+            [figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg)
+        )
         across = tracker[0] if tracker[0] == tracker[1] else " x ".join(tracker)
         pixel = figure(self.tracker_px_a_monitor_px)
         return f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a monitor px"
@@ -255,7 +315,11 @@ def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
     if not odd:
         return found
     mends = _mends(config, folder, sum(one.decades for one in odd))[:MAX_MENDS]
-    advice = f"is {', or '.join(mends)}?" if mends else "check the units of its lengths (_mm, _um) and its resolutions"
+    advice = (
+        f"is {', or '.join(mends)}?"
+        if mends
+        else "check the units of its lengths (_mm, _um) and its resolutions"
+    )
     return dataclasses.replace(found, warning=f"{odd[0].text}; {advice}")
 
 
@@ -276,10 +340,15 @@ def _sides_deg(camera: Camera) -> tuple[float, float]:
     x, y = (width - 1) / 2, (height - 1) / 2
     places = np.array([(-0.5, y), (width - 0.5, y), (x, -0.5), (x, height - 0.5)])
     rays = camera.rays(*places.T)
-    angles = [math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)) for a, b in (rays[:2], rays[2:])]
+    angles = [
+        math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)) for a, b in (rays[:2], rays[2:])
+    ]
     # beyond a lens that is known so far
     sides = [2 * math.atan(size / 2 / camera.focal_length_px) for size in (width, height)]
-    across, down = (math.degrees(side if math.isnan(angle) else angle) for angle, side in zip(angles, sides, strict=True))
+    across, down = (
+        math.degrees(side if math.isnan(angle) else angle)
+        for angle, side in zip(angles, sides, strict=True)
+    )
     return across, down
 
 
@@ -315,7 +384,11 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
     judged = [
         (past, found.field_on_screen, (MIN_FILLED, 1.0)),
         (part, found.screen_seen, (MIN_SEEN, 1.0)),
-        (f"a monitor pixel is {figure(pixels)} of the tracker's ({found.line()})", pixels, (1 / MAX_PIXELS, MAX_PIXELS)),
+        (
+            f"a monitor pixel is {figure(pixels)} of the tracker's ({found.line()})",
+            pixels,
+            (1 / MAX_PIXELS, MAX_PIXELS),
+        ),
     ]
     for name, value, (low, high), unit in (
         ("the tracker's lens", tracker.focal_length_mm / tracker.aperture_mm, F_NUMBERS, "f/"),
@@ -327,7 +400,13 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
         text = f"{name} is {unit}{figure(value)}, and none is known outside {unit}{low:g} to {unit}{high:g}"
         judged.append((text, value, (low, high)))
     text = f"{figure(widest_deg)} deg is wider than a lens sees ({found.line()})"
-    judged.append((text, math.tan(math.radians(widest_deg) / 2), (TINY, math.tan(math.radians(MAX_FIELD_DEG) / 2))))
+    judged.append(
+        (
+            text,
+            math.tan(math.radians(widest_deg) / 2),
+            (TINY, math.tan(math.radians(MAX_FIELD_DEG) / 2)),
+        )
+    )
     for key, true, said in (
         ("true_focal_length_mm", verify.true_focal_length_mm, config.collimator.focal_length_mm),
         ("true_pixel_pitch_um", verify.true_pixel_pitch_um, monitor.pixel_pitch_um),
@@ -351,7 +430,9 @@ def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
     rest_decades: dict[str, float] = {}
     for text, changed in _readings(config):
         try:
-            rest_decades[text] = sum(oddity.decades for oddity in _oddities(changed, _measured(changed, folder)))
+            rest_decades[text] = sum(
+                oddity.decades for oddity in _oddities(changed, _measured(changed, folder))
+            )
         except InputError:  # such a lens leaves the screen
             continue
     smallest = min(rest_decades.values(), default=math.inf)
@@ -380,7 +461,9 @@ def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
 
 def figure(value: float) -> str:
     """One digit after the point, two figures of a small number, four of a large one."""
-    return f"{value:.1f}" if 0.95 <= value < 1000 else f"{value:.2g}" if value < 1 else f"{value:.4g}"
+    return (
+        f"{value:.1f}" if 0.95 <= value < 1000 else f"{value:.2g}" if value < 1 else f"{value:.4g}"
+    )
 
 
 def _percent(share: float) -> str:

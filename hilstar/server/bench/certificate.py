@@ -113,7 +113,11 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
         """The largest |value| + half width of the interval of some quantities; None where it has
         none of them.
         """
-        found = [max(abs(each.lower), abs(each.upper)) for each in self.figures if each.quantity in set(quantities)]
+        found = [
+            max(abs(each.lower), abs(each.upper))
+            for each in self.figures
+            if each.quantity in set(quantities)
+        ]
         return max(found) if found else None
 
     @property
@@ -138,7 +142,9 @@ def read_certificate(path: Path) -> Certificate:
     except NOT_JSON as error:
         raise InputError(f"{path}: is no certificate ({shortened(error)}); {ADVICE}") from error
     if found.kind != KIND:
-        raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
+        raise InputError(
+            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+        )
     return found
 
 
@@ -153,7 +159,9 @@ def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Ce
         return None
     found = read_certificate((file.folder / name).resolve())
     if found.bench_sha256 != file.sha256:
-        say_once(f"{found.line} is of another state of this bench file; {ANEW}", "[certify] certificate")
+        say_once(
+            f"{found.line} is of another state of this bench file; {ANEW}", "[certify] certificate"
+        )
     if found.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
         say_once(f"{found.line} is over; {ANEW}", "[certify] certificate")
     return found

@@ -67,8 +67,12 @@ class CodeErrors:
         """
         fainter = [begin for begin, _, _ in self.by_span if begin >= mag]
         last = min(fainter, default=math.inf)
-        among = [(flux_mag, place_px) for begin, flux_mag, place_px in self.by_span if begin <= last]
-        return max((flux for flux, _ in among), default=0.0), max((place for _, place in among), default=0.0)
+        among = [
+            (flux_mag, place_px) for begin, flux_mag, place_px in self.by_span if begin <= last
+        ]
+        return max((flux for flux, _ in among), default=0.0), max(
+            (place for _, place in among), default=0.0
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +141,9 @@ def _grid(psf: Psf, seen: Seen, number: int) -> PhaseGrid:
 
 
 @lru_cache(maxsize=64)  # the benches of a campaign, a verdict or a study have few monitors
-def worst_errors(stars: CodeStars, method: Quantisation, limit: tuple[float, float] = (math.inf, math.inf)) -> CodeErrors:
+def worst_errors(
+    stars: CodeStars, method: Quantisation, limit: tuple[float, float] = (math.inf, math.inf)
+) -> CodeErrors:
     """The worst errors of a method; of one beyond the limit (mag, px) the first that are over
     it.
     """
@@ -177,7 +183,9 @@ class _Search:
         flux_mag = max(one.flux_mag for one in self._found.values())
         furthest = max(self._found.values(), key=lambda one: one.place_px)
         spans = self._stars.spans
-        by_span = tuple((spans[key[0]][0], one.flux_mag, one.place_px) for key, one in self._found.items())
+        by_span = tuple(
+            (spans[key[0]][0], one.flux_mag, one.place_px) for key, one in self._found.items()
+        )
         return CodeErrors(flux_mag, furthest.place_px, furthest.centroider, by_span)
 
     def worst_places(self) -> tuple[int, int]:

@@ -75,14 +75,20 @@ class Lateral:
         """That of a glass to the primaries' light; None where it moves none of it by LEAST_PX."""
         moved = psf.moved_px - psf.moved_px.mean(axis=1, keepdims=True)
         _, size, parts = np.linalg.svd(
-            moved.transpose(0, 2, 1).reshape(-1, moved.shape[1]) / np.sqrt(len(moved)), full_matrices=False
+            moved.transpose(0, 2, 1).reshape(-1, moved.shape[1]) / np.sqrt(len(moved)),
+            full_matrices=False,
         )
         px = (parts.T * size)[:, size > max(LEAST_PX, LEAST_PART * size[0])]
         by_primary = density @ NodeSpline(psf.wavelengths_nm)(nm) @ px
         spread = float(np.square(by_primary - by_primary.mean(axis=0)).sum())
         if spread < LEAST_PX**2:
             return None
-        weight = LATERAL_WEIGHT * MEAN_WEIGHT * float(np.square(density @ nm - (density @ nm).mean()).sum()) / spread
+        weight = (
+            LATERAL_WEIGHT
+            * MEAN_WEIGHT
+            * float(np.square(density @ nm - (density @ nm).mean()).sum())
+            / spread
+        )
         return cls(psf.wavelengths_nm, px, by_primary, np.zeros(px.shape[1]), weight)
 
     @property
@@ -148,7 +154,11 @@ class Colours:
             return np.asarray(stars.colours[which])
         row = stars.row[which]
         listed, none = row >= 0, np.full(len(which), np.nan)
-        vi = np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none) if len(stars.catalog) else none
+        vi = (
+            np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none)
+            if len(stars.catalog)
+            else none
+        )
         kind = None
         if self._kinds is not None:
             kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
@@ -168,7 +178,11 @@ class Colours:
         if self.lateral is None or not len(catalog):
             return self
         some = np.argsort(catalog.bv_mag)[:: math.ceil(len(catalog) / ASIDE_STARS)]
-        wanted = self._means(catalog.bv_mag[some], catalog.vi_mag[some], None if self._kinds is None else self._kinds[some])
+        wanted = self._means(
+            catalog.bv_mag[some],
+            catalog.vi_mag[some],
+            None if self._kinds is None else self._kinds[some],
+        )
         from scipy.optimize import minimize  # 0.2 s of every command that needs none of it
 
         lens, size_px = self.lateral, float(np.abs(self.lateral.px).max())
@@ -176,11 +190,17 @@ class Colours:
         # the mean square of what is out of reach, and its gradient
         def left(aside: FloatArray) -> tuple[float, FloatArray]:
             tried = replace(lens, aside=aside * size_px)
-            rest = replace(self, lateral=tried).shares(wanted) @ lens.by_primary - wanted[:, MOVED:] - tried.aside
+            rest = (
+                replace(self, lateral=tried).shares(wanted) @ lens.by_primary
+                - wanted[:, MOVED:]
+                - tried.aside
+            )
             square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
             return float(square), 2 * (ASIDE_COST * aside - rest.mean(axis=0) / size_px)
 
-        found = minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
+        found = (
+            minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
+        )
         return replace(self, lateral=replace(lens, aside=found))
 
     def shares(self, wanted: FloatArray) -> FloatArray:
@@ -209,7 +229,9 @@ class Colours:
             return stars.primaries, stars.primaries_by_bv
         by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
         if by_bv is None:
-            by_bv = self._means(BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan))
+            by_bv = self._means(
+                BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan)
+            )
         return self.shares(self.wanted(stars)), self.shares(by_bv)
 
     def drive(self, shares: FloatArray) -> FloatArray:
@@ -231,13 +253,17 @@ class Colours:
         Before a lens of known lateral colour, px rms over the field.
         """
         if (lens := self.lateral) is not None:
-            return np.asarray(np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1))
+            return np.asarray(
+                np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1)
+            )
         shown = self.shown(shares)
         return np.asarray(np.abs(shown - wanted[:, : shown.shape[1]]).sum(axis=1))
 
     def in_gamut(self, off: FloatArray) -> BoolArray:
         """Whether stars that are so far `off` have their colour."""
-        return np.asarray(off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX))
+        return np.asarray(
+            off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX)
+        )
 
     def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
         """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of
@@ -245,7 +271,9 @@ class Colours:
 
         The colour is blue's electrons over red's, or the mean wavelength.
         """
-        found = [np.interp(warmth(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)]
+        found = [
+            np.interp(warmth(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)
+        ]
         return np.asarray(found[0] / found[1])
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
@@ -254,7 +282,9 @@ class Colours:
         """
         return shares_at(self._shares_of_all(stars)[0], stars, star)
 
-    def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
+    def on_truth(
+        self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray
+    ) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by
         channel, and how far off.
 
@@ -263,14 +293,23 @@ class Colours:
         """
         own = np.flatnonzero(star >= 0)
         wanted, shares = self.wanted(stars, star[own]), self.shares_of(stars, star[own])
-        shown, off, rate = self.shown(shares), self.off(wanted, shares), truth["electrons_per_s"][own]
-        added = {"temperature_shown_k": truth["temperature_k"][own] * self.temperature_factor(wanted, shares)}
+        shown, off, rate = (
+            self.shown(shares),
+            self.off(wanted, shares),
+            truth["electrons_per_s"][own],
+        )
+        added = {
+            "temperature_shown_k": truth["temperature_k"][own]
+            * self.temperature_factor(wanted, shares)
+        }
         if self.mono:
             added |= {"wavelength_nm": wanted[:, 0], "wavelength_shown_nm": shown[:, 0]}
             added["electrons_shown_per_s"] = rate * shares.sum(axis=1)
         else:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
-                added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
+                added |= {
+                    f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)
+                }
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
         return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
 
@@ -278,14 +317,19 @@ class Colours:
         """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
         primaries, by_bv = self._shares_of_all(stars)
         shares = shares_of_sprites(sprites, stars, primaries, by_bv)
-        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
+        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(
+            np.float32
+        )
         if not sprites.extended:
             return replace(sprites, primaries=light)
         # the same objects are the same light: it is moved once
         if not self._kept or self._kept[0] != sprites.extended:
             each = extended_by_share(sprites, stars, primaries, by_bv)
             moved = zip(each, self.places_px.tolist(), strict=True)
-            self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved)]
+            self._kept[:] = [
+                sprites.extended,
+                tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved),
+            ]
         return replace(sprites, primaries=light, lights=self._kept[1])
 
 
@@ -296,7 +340,9 @@ def warmth(colour: FloatArray) -> FloatArray:
     if colour.shape[1] != len(PRIMARIES):
         return -colour[:, 0]
     tiny = np.finfo(np.float64).tiny
-    return np.asarray(np.log(np.maximum(colour[:, -1], tiny)) - np.log(np.maximum(colour[:, 0], tiny)))
+    return np.asarray(
+        np.log(np.maximum(colour[:, -1], tiny)) - np.log(np.maximum(colour[:, 0], tiny))
+    )
 
 
 def mixed_for(
@@ -328,7 +374,16 @@ def mixed_for(
     places = np.asarray(places_px)
     if len(channels) > 1:
         by_primary = matrix.e_per_s / of_white
-        return Colours(matrix, places, nm, density, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
+        return Colours(
+            matrix,
+            places,
+            nm,
+            density,
+            by_primary.T @ by_primary,
+            (),
+            kinds,
+            _scale(channels, True),
+        )
     up_to = np.cumsum(density, axis=1)
     gram = up_to @ up_to.T * STEP_NM
     # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's
@@ -337,12 +392,23 @@ def mixed_for(
     knots = nm[::KNOT_STEPS]
     plain = optics.quantum_efficiency
     edge_nm = plain.wavelength_nm if len(plain.wavelength_nm) else np.array(optics.range_nm)
-    knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
+    knots = np.unique(
+        np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm])
+    )
     lateral = Lateral.of(psf, nm, density) if isinstance(psf, GlassPsf) else None
     weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
-    weights += [] if lateral is None else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
-    curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
-    return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral)
+    weights += (
+        []
+        if lateral is None
+        else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
+    )
+    curves = tuple(
+        rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one)))
+        for one in weights
+    )
+    return Colours(
+        matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral
+    )
 
 
 def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
@@ -351,6 +417,12 @@ def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
     for optics in channels.values():
         curves = optics.quantum_efficiency, optics.transmission
         nm, weight = integration_nodes(*curves)
-        photons = blackbody_exitance_w_m2_m(nm, SCALE_K[:, None]) * nm * curves[0](nm) * curves[1](nm) * weight
+        photons = (
+            blackbody_exitance_w_m2_m(nm, SCALE_K[:, None])
+            * nm
+            * curves[0](nm)
+            * curves[1](nm)
+            * weight
+        )
         found.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
     return np.maximum.accumulate(warmth(np.stack(found, axis=1)))

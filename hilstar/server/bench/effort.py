@@ -130,7 +130,9 @@ class Light:
     def code_stars(self) -> CodeStars:
         """The catalogue's stars for the worst errors of codes."""
         peaks = self.rates_e_per_s * (self.psf.peak_share / self.white_e_per_s)
-        return code_stars(self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks)
+        return code_stars(
+            self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +252,9 @@ class Effort:
         """Whether both are within the tolerance; found sooner than how far they are over it."""
         if not self._found.within(self._tolerance):
             return False
-        return self.error_mag <= self.asked.tolerance_mag and self.error_px <= self.asked.tolerance_px
+        return (
+            self.error_mag <= self.asked.tolerance_mag and self.error_px <= self.asked.tolerance_px
+        )
 
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
@@ -263,7 +267,11 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
     best = [one for one in combinations if one.method == methods[-1]]
     # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
-    tested = combinations if len(best) > 1 else [one for one in combinations if one.method != methods[-1]]
+    tested = (
+        combinations
+        if len(best) > 1
+        else [one for one in combinations if one.method != methods[-1]]
+    )
     stars = light.code_stars() if tested else None
     for one in tested:
         if stars is not None and _is_within(render, light, stars, one):
@@ -298,13 +306,17 @@ def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float)
     and else by the table's.
     """
     if measured is not None:
-        clear = {measured.in_time(limit_ms * factor) for factor in (SURELY_IN_TIME, 1.0, SURELY_LATE)}
+        clear = {
+            measured.in_time(limit_ms * factor) for factor in (SURELY_IN_TIME, 1.0, SURELY_LATE)
+        }
         if len(clear) == 1:
             return clear.pop()
     return table.in_time(limit_ms)
 
 
-def _combinations(render: RenderSettings, light: Light, methods: tuple[Quantisation, ...]) -> Iterator[Combination]:
+def _combinations(
+    render: RenderSettings, light: Light, methods: tuple[Quantisation, ...]
+) -> Iterator[Combination]:
     motions = motion_candidates(render, light)
     for method in methods:
         method_ms = codes_ms(render, light, method)
@@ -408,7 +420,9 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
                 saved_ms,
             )
             found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
-    sides = _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
+    sides = (
+        _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
+    )
     mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
     smallest = min((side.side_px for side in sides), default=full)
     chosen = f"{smallest} to {full} px a side" if smallest < full else f"{full} px a side"
@@ -424,7 +438,9 @@ def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -
     unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
     if unlit:
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
-        sides += [(unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
+        sides += [
+            (unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest
+        ]
     return tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
 
 
@@ -470,7 +486,11 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
     path_ms = PATH_MS * light.stars * _scale(render, light)
     above_px = [floor_px]
     if render.effort == "auto":
-        above_px += [share * render.tolerance_px for share in MOTION_SHARES if share * render.tolerance_px > floor_px]
+        above_px += [
+            share * render.tolerance_px
+            for share in MOTION_SHARES
+            if share * render.tolerance_px > floor_px
+        ]
     found = []
     for px in above_px:
         # Only frames between the file's motion and this one are drawn sooner.
@@ -506,6 +526,10 @@ def depth_part(effort: Effort) -> Choice:
     if not dark.any():
         return Choice("depth", "all stars of the catalogue", *NO_ERROR)
     share = float(rates[dark].sum() / rates.sum())
-    saved_ms = light.sky_share * float(dark.sum()) * light.cost(QUANTISERS[effort.quantisation], light.psf).a_star_ms
+    saved_ms = (
+        light.sky_share
+        * float(dark.sum())
+        * light.cost(QUANTISERS[effort.quantisation], light.psf).a_star_ms
+    )
     note = f"{int(dark.sum())} of {len(dark)} stars light no pixel, {share:.2%} of all light"
     return Choice("depth", f"from {limit:.3g} electrons/s on", *NO_ERROR, 0.0, saved_ms, note)

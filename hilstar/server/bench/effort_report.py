@@ -26,7 +26,10 @@ def effort_lines(bench: Bench) -> list[str]:
     together = Choice("together", "", effort.error_mag, effort.error_px, 0.0, saved_ms)
     rows.append((together.part, _verdict(effort), *_errors(effort, together), _saved(together)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD))]
-    lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = [
+        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
     lines += [f"{choice.part}: {choice.note}" for choice in effort.choices if choice.note]
     for remedy in would_do(bench):
         head = "would do" if remedy.within else "would not do alone"

@@ -25,22 +25,45 @@ if TYPE_CHECKING:
 def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
     """The faults of a scenario as the monitor shows them."""
     tracker = tracker_camera(bench.config.tracker, bench.file.folder)
-    camera = _fault_camera(bench.file, bench.canvas, bench.camera, tracker, bench.stars, bench.moving)
-    return FaultView(camera, scenario.seed, scenario.folder if scenario.faults else None, frozenset(scenario.faults))
+    camera = _fault_camera(
+        bench.file, bench.canvas, bench.camera, tracker, bench.stars, bench.moving
+    )
+    return FaultView(
+        camera,
+        scenario.seed,
+        scenario.folder if scenario.faults else None,
+        frozenset(scenario.faults),
+    )
 
 
 def tracker_view(
-    file: BenchFile, canvas: Canvas, stars: Stars, moving: "MovingSky | None", scenario: Scenario = NO_SCENARIO
+    file: BenchFile,
+    canvas: Canvas,
+    stars: Stars,
+    moving: "MovingSky | None",
+    scenario: Scenario = NO_SCENARIO,
 ) -> FaultView:
     """The faults of a scenario as they fall on the virtual tracker's detector, which is
     `canvas`.
     """
-    camera = _fault_camera(file, canvas, bench_camera(file.config, file.folder), canvas.camera, stars, moving)
-    return FaultView(camera, scenario.seed, scenario.folder if scenario.faults else None, frozenset(scenario.faults))
+    camera = _fault_camera(
+        file, canvas, bench_camera(file.config, file.folder), canvas.camera, stars, moving
+    )
+    return FaultView(
+        camera,
+        scenario.seed,
+        scenario.folder if scenario.faults else None,
+        frozenset(scenario.faults),
+    )
 
 
 def _fault_camera(
-    file: BenchFile, canvas: Canvas, monitor: Camera, tracker: Camera, stars: Stars, moving: "MovingSky | None"
+    file: BenchFile,
+    canvas: Canvas,
+    monitor: Camera,
+    tracker: Camera,
+    stars: Stars,
+    moving: "MovingSky | None",
 ) -> FaultCamera:
     velocity_km_s = file.config.sky.observer_velocity_km_s
     tables = cache(lambda: star_rates(file.config, file.folder))  # 0.1 s, which only a fault needs

@@ -30,10 +30,23 @@ from hilstar.optics.frame_motion import Scan
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.layers.bodies import BodyLayer, disc_stars
 from hilstar.optics.layers.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
-from hilstar.optics.layers.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table, with_errors
+from hilstar.optics.layers.truth import (
+    clipped_in,
+    designations,
+    sprite_names,
+    sprite_truth,
+    truth_table,
+    with_errors,
+)
 from hilstar.optics.layers.view import STILL, Canvas, Layer, View
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import CLIP_TOLERANCE, Sprites, by_primary, clipped_sprites, without_stars
+from hilstar.optics.sprites import (
+    CLIP_TOLERANCE,
+    Sprites,
+    by_primary,
+    clipped_sprites,
+    without_stars,
+)
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.colours import Colours
 from hilstar.server.bench.config import BenchConfig, Vector
@@ -100,7 +113,9 @@ class Drawn:
     HIP number or a body's name.
     """
 
-    def __init__(self, renderer: Backend, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()) -> None:
+    def __init__(
+        self, renderer: Backend, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()
+    ) -> None:
         self.sprites = sprites
         self.clipped_hip = clipped_hip
         self.star_count = 0 if sprites is None else sprites.star_count
@@ -181,7 +196,9 @@ class Bench:
         bright; 1 for all in grey.
         """
         return (
-            1.0 if self.colours is None else self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
+            1.0
+            if self.colours is None
+            else self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
         )
 
     @property
@@ -199,7 +216,9 @@ class Bench:
         """The monitor as layers draw on it; white is that of its darkest pixel."""
         white_e_per_s = self.flux_at_white_e_per_s * self.darkest
         first_step = float(self.calibration.response.threshold[0])
-        return Canvas(self.camera, self.psf, white_e_per_s, first_step_e_per_s=first_step * white_e_per_s)
+        return Canvas(
+            self.camera, self.psf, white_e_per_s, first_step_e_per_s=first_step * white_e_per_s
+        )
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
@@ -246,19 +265,29 @@ class Bench:
         """The light of a frame as the monitor can show it, before anything is drawn."""
         return self._light(self.layers, self.shown_stars, view, faults)
 
-    def _light(self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None) -> Sprites:
+    def _light(
+        self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None
+    ) -> Sprites:
         layers = layers if faults is None else (*layers, faults)
-        return self._coloured(light_of(self.canvas, layers, seen_in(view, stars, self.moving), view), stars)
+        return self._coloured(
+            light_of(self.canvas, layers, seen_in(view, stars, self.moving), view), stars
+        )
 
     def _coloured(self, sprites: Sprites, stars: Stars) -> Sprites:
-        return sprites if self.spectra is None else replace(sprites, spectra=self.spectra(stars, sprites.star))
+        return (
+            sprites
+            if self.spectra is None
+            else replace(sprites, spectra=self.spectra(stars, sprites.star))
+        )
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
         """The sprites of `stars` (by default those bright enough to show) as points, at an
         attitude (unit quaternion).
         """
         stars = self.shown_stars if stars is None else stars
-        return self._coloured(light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam)), stars)
+        return self._coloured(
+            light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam)), stars
+        )
 
     def draw(
         self,
@@ -276,7 +305,11 @@ class Bench:
         first light. Bodies are where they are at `t_ns`, by default at the start; without a rate
         satellites' paths have their middle there.
         """
-        light = None if q_icrs_to_cam is None else self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
+        light = (
+            None
+            if q_icrs_to_cam is None
+            else self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
+        )
         return self.draw_sprites(light, frame)
 
     def discs(self, view: View) -> list[Disc]:
@@ -300,13 +333,21 @@ class Bench:
         clipped = None if sprites is None else self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
-        return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
+        return Drawn(
+            self.renderer,
+            sprites,
+            (*designations(self.shown_stars, sprites, clipped), *sprites.over_white),
+        )
 
     def _driven(self, sprites: Sprites | None, stars: Stars) -> Sprites | None:
         """Sprites with the light of each primary, where those are driven apart; `sprites.star`
         has places among `stars`.
         """
-        return sprites if sprites is None or self.colours is None else self.colours.driven(sprites, stars)
+        return (
+            sprites
+            if sprites is None or self.colours is None
+            else self.colours.driven(sprites, stars)
+        )
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
@@ -322,7 +363,11 @@ class Bench:
         if lights:
             sprites = replace(self.sprites(WARM_UP_ATTITUDE), extended=lights)
             self.renderer.draw(self._driven(sprites, self.shown_stars))
-        for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
+        for q, rate in (
+            (WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S),
+            (WARM_UP_ATTITUDE, None),
+            (None, None),
+        ):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
 
@@ -346,7 +391,9 @@ class Bench:
         self.renderer.begin_anew()
         self.renderer.draw(self._driven(shown, self.shown_stars), number)
         levels = Levels(self.renderer.levels().copy())
-        drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
+        drawn = len(sprites) == len(shown) and not (
+            len(self.faint_stars) or self.renderer.target.sides
+        )
         drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
         driven = sprites if self.colours is None else self.colours.driven(sprites, self.stars)
@@ -354,7 +401,9 @@ class Bench:
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
-            middles = np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
+            middles = (
+                np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
+            )
             rows = truth_table(self.stars, found, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth, star = np.append(truth, rows), np.append(star, found)
@@ -365,7 +414,16 @@ class Bench:
         truth["drawn"] = truth["electrons_per_s"] * drive >= self.faintest_shown_e_per_s
         order = np.argsort(truth["v_mag"], kind="stable")
         codes = self.code_values(levels)
-        return Frame(view.q_icrs_to_cam, light, levels, codes, truth[order], star[order], t_ns, self._with_errors)
+        return Frame(
+            view.q_icrs_to_cam,
+            light,
+            levels,
+            codes,
+            truth[order],
+            star[order],
+            t_ns,
+            self._with_errors,
+        )
 
     def _with_errors(self, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
         return with_errors(rows, self.stars.catalog, self.config.sky.epoch_jyear)
@@ -393,7 +451,9 @@ class Bench:
                 self.renderer.draw_linear(replace(without_stars(sprites), extended=alone))
                 own = self.renderer.linear() > MOST * wanted
                 if own.any():
-                    losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))
+                    losses[disc.name] = float(
+                        magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64))
+                    )
         return {name: losses[name] for name in clipped if name in losses}
 
     def code_values(self, levels: Levels) -> Codes:
@@ -411,20 +471,36 @@ class Bench:
         # as bright as the mean PSF's stars with the same peaks
         if isinstance(psf, GlassPsf) and spectra is not None:
             data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
-            bright = np.flatnonzero(data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white)
-            x_px, y_px, rate = sprites.x_px[bright], sprites.y_px[bright], data["electrons_per_s"][bright]
-            stamps = psf.of_stars(x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate)
-            data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(np.rint(x_px) - x_px, np.rint(y_px) - y_px)
+            bright = np.flatnonzero(
+                data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white
+            )
+            x_px, y_px, rate = (
+                sprites.x_px[bright],
+                sprites.y_px[bright],
+                data["electrons_per_s"][bright],
+            )
+            stamps = psf.of_stars(
+                x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate
+            )
+            data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(
+                np.rint(x_px) - x_px, np.rint(y_px) - y_px
+            )
             sprites = replace(sprites, data=data)
         screen = self.camera.resolution_px, self.uniformity, self.darkest
         if sprites.primaries is None:
             return clipped_sprites(sprites, psf, self.flux_at_white_e_per_s, *screen)
         over, places_px = [np.empty(0, dtype=np.intp)], self.renderer.target.places_px
-        most_e_per_s = sprites.primaries.max(axis=0, initial=0.0) * (sprites.per_star * psf.peak_share)
+        most_e_per_s = sprites.primaries.max(axis=0, initial=0.0) * (
+            sprites.per_star * psf.peak_share
+        )
         for k, one in enumerate(self.panel.primaries):
             # as in `clipped_sprites`
             if most_e_per_s[k] > 0.5 * one.flux_at_white_e_per_s * self.darkest:
-                over.append(clipped_sprites(by_primary(sprites, places_px, k), psf, one.flux_at_white_e_per_s, *screen))
+                over.append(
+                    clipped_sprites(
+                        by_primary(sprites, places_px, k), psf, one.flux_at_white_e_per_s, *screen
+                    )
+                )
         return np.unique(np.concatenate(over))
 
     def close(self) -> None:
@@ -447,7 +523,9 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
         raise InputError(f"quaternion of shape {array.shape}: write four numbers w, x, y, z")
     norm = math.hypot(*array)  # without NumPy's warning where it overflows
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
-        raise InputError(f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+        raise InputError(
+            f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+        )
     return normalise(array)
 
 
@@ -469,7 +547,10 @@ def named(found: list[int | str], count: int) -> str:
     shown = [*bodies, *hips][:count]
     more = "" if len(found) <= count else f" and {len(found) - count} more"
     first_hip = len(bodies)
-    return ", ".join(f"HIP {one}" if k == first_hip else str(one) for k, one in enumerate(shown)) + more
+    return (
+        ", ".join(f"HIP {one}" if k == first_hip else str(one) for k, one in enumerate(shown))
+        + more
+    )
 
 
 def clipping_line(bench: Bench) -> str | None:
@@ -480,7 +561,11 @@ def clipping_line(bench: Bench) -> str | None:
     bodies = bool(bench.stars.bodies)
     one, many = ("star or body", "stars and bodies") if bodies else ("star", "stars")
     stars = f"1 {one} of the sky is" if len(found) == 1 else f"{len(found)} {many} of the sky are"
-    key = "flux_at_white_e_per_s" if render.brightest_v_mag is None else f"brightest_v_mag = {render.brightest_v_mag:g}"
+    key = (
+        "flux_at_white_e_per_s"
+        if render.brightest_v_mag is None
+        else f"brightest_v_mag = {render.brightest_v_mag:g}"
+    )
     return f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render] {key})"
 
 
@@ -496,7 +581,11 @@ def shares_line(bench: Bench) -> str | None:
     tracker's; otherwise None.
     """
     calibration = bench.calibration
-    if not bench.config.render.bit_stealing or not calibration.is_formula or calibration.weights is None:
+    if (
+        not bench.config.render.bit_stealing
+        or not calibration.is_formula
+        or calibration.weights is None
+    ):
         return None
     shares = ", ".join(f"{share:g}" for share in calibration.weights)
     return (

@@ -76,23 +76,41 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
         tan = _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
         x_px, y_px = camera.grid_px(HELD_OUT)
         tan_x, tan_y = replace(camera, lens=None).places_px(*camera.tangents(x_px, y_px))
-        return tan | {"LENS": True, "LENSERR": round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4)}
+        return tan | {
+            "LENS": True,
+            "LENSERR": round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4),
+        }
     keywords = _tangent_plane(camera, q_icrs_to_cam, sip.origin_px, sip.linear)
-    keywords |= {"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "LENS": True, "LENSERR": round(sip.error_px, 6)}
+    keywords |= {
+        "CTYPE1": "RA---TAN-SIP",
+        "CTYPE2": "DEC--TAN-SIP",
+        "LENS": True,
+        "LENSERR": round(sip.error_px, 6),
+    }
     for names, terms, first in ((("A", "B"), sip.forward, 2), (("AP", "BP"), sip.back, 1)):
         for name, column in zip(names, terms.T, strict=True):
             keywords[f"{name}_ORDER"] = sip.degree
-            keywords |= {f"{name}_{p}_{q}": float(c) for p, q, c in zip(*_powers(sip.degree, first), column, strict=True)}
+            keywords |= {
+                f"{name}_{p}_{q}": float(c)
+                for p, q, c in zip(*_powers(sip.degree, first), column, strict=True)
+            }
     return keywords
 
 
-def _tangent_plane(camera: Camera, q_icrs_to_cam: FloatArray, origin_px: tuple[float, float], linear: FloatArray) -> Keywords:
+def _tangent_plane(
+    camera: Camera, q_icrs_to_cam: FloatArray, origin_px: tuple[float, float], linear: FloatArray
+) -> Keywords:
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
+    ra, dec = (
+        np.arctan2(normal[1], normal[0]),
+        np.arctan2(normal[2], np.hypot(normal[0], normal[1])),
+    )
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     deg_per_px = np.degrees(1.0 / camera.focal_length_px)
-    cd = np.array([[right @ east, down @ east], [right @ north, down @ north]]) @ linear * deg_per_px
+    cd = (
+        np.array([[right @ east, down @ east], [right @ north, down @ north]]) @ linear * deg_per_px
+    )
     return {
         "CTYPE1": "RA---TAN",
         "CTYPE2": "DEC--TAN",
@@ -137,10 +155,14 @@ def fit_sip(camera: Camera) -> Sip | None:
     there = pixel + _terms(pixel, degree, 2) @ forward - flat
     again = flat + _terms(flat, degree, 1) @ back - pixel
     error_px = max(float(np.hypot(*off.T).max()) for off in (there, again))
-    return Sip(degree, origin_px, linear, forward, back, error_px) if error_px <= MAX_SIP_PX else None
+    return (
+        Sip(degree, origin_px, linear, forward, back, error_px) if error_px <= MAX_SIP_PX else None
+    )
 
 
-def _pairs(camera: Camera, origin_px: tuple[float, float], count: int) -> tuple[FloatArray, FloatArray]:
+def _pairs(
+    camera: Camera, origin_px: tuple[float, float], count: int
+) -> tuple[FloatArray, FloatArray]:
     """Pixels and their places on the ideal image, both (n, 2) px from the origin; those that the
     lens knows.
     """
@@ -182,7 +204,9 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     """
     from astropy.io import fits
 
-    header = sky_header(bench.file.sha256, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
+    header = sky_header(
+        bench.file.sha256, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera
+    )
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
     header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
     header["NSTARS"] = (len(frame.rows), "stars in view")
@@ -192,7 +216,12 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
         header["CERTIF"] = (number, "certificate of the bench")
     if len(frame.light) > 1:
         header.update({"CTYPE3": "CHANNEL", "CRPIX3": 1.0, "CRVAL3": 1.0, "CD3_3": 1.0})
-        header.update({f"CHANNEL{k}": key for k, key in enumerate(bench.config.tracker.quantum_efficiencies, 1)})
+        header.update(
+            {
+                f"CHANNEL{k}": key
+                for k, key in enumerate(bench.config.tracker.quantum_efficiencies, 1)
+            }
+        )
     write_fits(path, fits.PrimaryHDU(frame.light if len(frame.light) > 1 else frame.linear, header))
 
 
@@ -207,7 +236,9 @@ def write_fits(path: Path, hdus: Any) -> None:
         file.write(gzip.compress(data.getbuffer()))
 
 
-def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
+def sky_header(
+    bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera
+) -> Any:
     """A FITS header with the attitude, the epoch, the bench's hash and a world coordinate
     system.
     """
@@ -249,7 +280,9 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
     Codes of three channels (height, width, 3) become an RGB picture.
     """
     image = (
-        np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
+        np.asarray(codes, dtype=np.uint8)
+        if bits <= 8
+        else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
     )
     written(path, lambda file: file.write(png_of(image)))
 
@@ -266,7 +299,9 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image, f">u{image.itemsize}").view(np.uint8).reshape(height, -1)
     data, about = io.BytesIO(), io.BytesIO()
-    png.Writer(width, height, bitdepth=8 * image.itemsize, greyscale=image.ndim == 2, compression=1).write_packed(data, rows)
+    png.Writer(
+        width, height, bitdepth=8 * image.itemsize, greyscale=image.ndim == 2, compression=1
+    ).write_packed(data, rows)
     if meant_bits is not None:
         png.write_chunk(about, b"sBIT", bytes([meant_bits] * (1 if image.ndim == 2 else 3)))
     whole = data.getvalue()
@@ -313,5 +348,7 @@ def _discs(signal: Float32Array) -> Float32Array:
             radius = max(1, math.ceil(math.hypot(down, right)))
             if radius <= PREVIEW_RADIUS_PX:
                 seen = value >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
-                np.maximum.at(picture, (row[seen] + edge + down, column[seen] + edge + right), value[seen])
+                np.maximum.at(
+                    picture, (row[seen] + edge + down, column[seen] + edge + right), value[seen]
+                )
     return picture[edge:-edge, edge:-edge]

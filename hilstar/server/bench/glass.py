@@ -16,7 +16,13 @@ from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline, glass_psf, regr
 from hilstar.optics.glass.psf_file import Glass, read_glass
 from hilstar.server.bench.config import GAUSSIAN, Tracker
 from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import QUANTUM_EFFICIENCIES, TRANSMISSIONS, Curve, integration_nodes, load_curve
+from hilstar.sky.spectrum import (
+    QUANTUM_EFFICIENCIES,
+    TRANSMISSIONS,
+    Curve,
+    integration_nodes,
+    load_curve,
+)
 
 log = logging.getLogger(__name__)
 MAX_UNSAID = 0.01  # share of a tracker's light beyond a file's wavelengths that is not worth a word
@@ -43,7 +49,10 @@ class Onto:
 
     def places_px(self, places_px: FloatArray) -> FloatArray:
         """Display pixels (n, 2) of tracker pixels (n, 2), without a mirror."""
-        return np.stack(self.display.project(self.tracker.rays(*places_px.T) @ self.display.cam_to_image.T), axis=1)
+        return np.stack(
+            self.display.project(self.tracker.rays(*places_px.T) @ self.display.cam_to_image.T),
+            axis=1,
+        )
 
     @property
     def matrix(self) -> FloatArray:
@@ -55,19 +64,26 @@ class Onto:
         return np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1)
 
 
-def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path, onto: Onto | None = None) -> GlassPsf:
+def bench_glass_psf(
+    glass: Glass, tracker: Tracker, folder: Path, onto: Onto | None = None
+) -> GlassPsf:
     """A tracker's glass at its focus, or as a display draws it; the same again is the same
     object. Says what is not covered.
     """
     shares = _mean_shares(glass, tracker, folder)
     optics = tracker.optics
     focus_um = optics.focus_um + optics.focus_um_per_k * optics.warmer_k
-    return _glass_psf(glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px, onto)
+    return _glass_psf(
+        glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px, onto
+    )
 
 
 def decentre_px(tracker: Tracker) -> tuple[float, float]:
     """How far a tracker's lens stands beside its place, px."""
-    return tracker.optics.decentre_x_um / tracker.pixel_pitch_um, tracker.optics.decentre_y_um / tracker.pixel_pitch_um
+    return (
+        tracker.optics.decentre_x_um / tracker.pixel_pitch_um,
+        tracker.optics.decentre_y_um / tracker.pixel_pitch_um,
+    )
 
 
 @lru_cache(maxsize=4)
@@ -84,7 +100,10 @@ def _glass_psf(
     if onto is not None:
         basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
         weights = glass.weights / (glass.weights @ basis.sum(axis=(1, 2)))[..., None]
-        places_px, lateral_px = np.round(onto.places_px(glass.places_px), 6), glass.lateral_px @ onto.matrix.T
+        places_px, lateral_px = (
+            np.round(onto.places_px(glass.places_px), 6),
+            glass.lateral_px @ onto.matrix.T,
+        )
         each = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
         each |= {"illumination": glass.illumination, "outside": glass.outside}
         # points far beyond the detector may lie beyond either lens
@@ -92,16 +111,24 @@ def _glass_psf(
         if not known.any():
             raise InputError("none of its points lies before the display's lens")
         fine = {name: values[known] for name, values in each.items()}
-        return glass_psf(replace(glass, basis=basis.astype(np.float32), per_px=per_px, **fine), focus_um, np.array(shares))
+        return glass_psf(
+            replace(glass, basis=basis.astype(np.float32), per_px=per_px, **fine),
+            focus_um,
+            np.array(shares),
+        )
     found = glass_psf(glass, focus_um, np.array(shares))
     width, height = resolution_px
     corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
     beyond_px = float(found.field.within(*corners.T)[1].max())
     if len(glass.places_px) > 1 and beyond_px > SAID_PX:
-        say_once(f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest PSF is taken")
+        say_once(
+            f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest PSF is taken"
+        )
     first, last = glass.focuses_um[[0, -1]]
     if not first <= focus_um <= last:
-        say_once(f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is taken")
+        say_once(
+            f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is taken"
+        )
     return found
 
 
@@ -119,19 +146,25 @@ def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
     """
     if len(glass.wavelengths_nm) == 1:
         return np.ones(1)
-    nm, weight = np.concatenate([_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1)
+    nm, weight = np.concatenate(
+        [_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1
+    )
     shares = weight @ NodeSpline(glass.wavelengths_nm)(nm) / weight.sum()
     first, last = glass.wavelengths_nm[[0, -1]]
     for side, share in (("under", weight[nm < first].sum()), ("over", weight[nm > last].sum())):
         if share > MAX_UNSAID * weight.sum():
             limit = first if side == "under" else last
-            say_once(f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose PSF it is given")
+            say_once(
+                f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose PSF it is given"
+            )
     return np.asarray(shares)
 
 
 def _detected(tracker: Tracker, key: str, folder: Path) -> FloatArray:
     """Wavelengths and the tracker's relative response there, by the integration's nodes: (2, n)."""
-    efficiency = load_curve(tracker.quantum_efficiencies[key], f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES)
+    efficiency = load_curve(
+        tracker.quantum_efficiencies[key], f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES
+    )
     optics = Optics(tracker.aperture_mm, efficiency, glass_transmission(tracker, folder))
     nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     return np.stack([nm, optics.quantum_efficiency(nm) * optics.transmission(nm) * weight_m])
@@ -164,5 +197,7 @@ def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:
     off = [a - b for a, b in zip(camera.places_px(*places), bent.places_px(*places), strict=True)]
     off_px = float(np.nanmax(np.hypot(*off)))
     if off_px > SAID_PX:
-        say_once(f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is taken")
+        say_once(
+            f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is taken"
+        )
     return camera

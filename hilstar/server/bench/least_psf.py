@@ -20,7 +20,11 @@ from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 
 MAG_PER_SHARE = 2.5 / math.log(10)
 SPECTRA_K = (3000.0, 20_000.0)
-GAUSSIAN_PSF, ONE_PSF, WHOLE = "a Gaussian", "one PSF for all stars", "each star by its place and spectrum"
+GAUSSIAN_PSF, ONE_PSF, WHOLE = (
+    "a Gaussian",
+    "one PSF for all stars",
+    "each star by its place and spectrum",
+)
 COMPONENTS = (3, 6, 12)
 
 
@@ -75,7 +79,9 @@ def candidates(psf: SampledPsf) -> Iterator[tuple[str, Callable[[], Psf]]]:
     yield WHOLE if isinstance(psf, GlassPsf) else ONE_PSF, lambda: psf
 
 
-def psf_choices(psf: SampledPsf, places_px: FloatArray, among: frozenset[str] | None = None) -> Iterator[tuple[Psf, Choice]]:
+def psf_choices(
+    psf: SampledPsf, places_px: FloatArray, among: frozenset[str] | None = None
+) -> Iterator[tuple[Psf, Choice]]:
     """Each of `candidates` (by name those `among` them) with its errors at places (n, 2) of the
     field, itself at last.
 
@@ -96,7 +102,10 @@ def psf_choices(psf: SampledPsf, places_px: FloatArray, among: frozenset[str] | 
 
 
 def least_psf(
-    psf: SampledPsf, places_px: FloatArray, tolerance: tuple[float, float], among: frozenset[str] | None = None
+    psf: SampledPsf,
+    places_px: FloatArray,
+    tolerance: tuple[float, float],
+    among: frozenset[str] | None = None,
 ) -> tuple[Psf, Choice]:
     """The first of `psf_choices` within a tolerance, mag and px; the last where none is."""
     found, choice = first_within(psf_choices(psf, places_px, among), tolerance)
@@ -106,7 +115,8 @@ def least_psf(
 
 
 def first_within(
-    found: Iterator[tuple[Psf, Choice]] | Iterator[tuple[Psf, Choice | None]], tolerance: tuple[float, float]
+    found: Iterator[tuple[Psf, Choice]] | Iterator[tuple[Psf, Choice | None]],
+    tolerance: tuple[float, float],
 ) -> tuple[Psf, Choice | None]:
     """The first PSF whose own errors are within a tolerance, mag and px, or that is no choice;
     the last where none is.
@@ -127,7 +137,9 @@ def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:
     with np.errstate(divide="ignore", invalid="ignore"):
         wanted, found = (_measured(one, psf, places_px) for one in (psf, other))
         mag = MAG_PER_SHARE * float(np.abs(found[..., 0] / wanted[..., 0] - 1).max())
-    return PsfErrors(mag, float(np.hypot(*np.moveaxis(found[..., 1:] - wanted[..., 1:], 2, 0)).max()))
+    return PsfErrors(
+        mag, float(np.hypot(*np.moveaxis(found[..., 1:] - wanted[..., 1:], 2, 0)).max())
+    )
 
 
 def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
@@ -139,12 +151,16 @@ def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
     if isinstance(one, GlassPsf):
         stamps = one.of_stars(x, y, np.tile(_spectra(one), (len(places_px), 1)), np.ones(len(x)))
         cut, more = max(0, (one.footprint_px - side) // 2), max(0, (side - one.footprint_px) // 2)
-        stamps = np.pad(stamps[:, cut : cut + side, cut : cut + side], ((0, 0), (more, more), (more, more)))
+        stamps = np.pad(
+            stamps[:, cut : cut + side, cut : cut + side], ((0, 0), (more, more), (more, more))
+        )
     else:
         stamps = np.moveaxis(one.stamps(fraction, np.ones(len(x)), side), 2, 0)
     light, pixel = stamps.astype(np.float64), np.arange(side) - side // 2
     across, down = pixel - fraction[0][:, None], pixel - fraction[1][:, None]
-    far = across[:, None, :] ** 2 / psf.variance_px2[0] + down[:, :, None] ** 2 / psf.variance_px2[1]
+    far = (
+        across[:, None, :] ** 2 / psf.variance_px2[0] + down[:, :, None] ** 2 / psf.variance_px2[1]
+    )
     found = []
     for window in (np.ones_like(far), np.exp(-far / 2)):
         inside = light * window

@@ -37,7 +37,9 @@ class MeasuredOn:
         """What it does not say; "" where it says both."""
         if self.built_in:
             return f'[monitor] calibration = "{self.name}" is built in'
-        lacking = [what for what, said in (("monitor", self.identity), ("date", self.date)) if said is None]
+        lacking = [
+            what for what, said in (("monitor", self.identity), ("date", self.date)) if said is None
+        ]
         return f"{self.name} names no {' and no '.join(lacking)}" if lacking else ""
 
 
@@ -70,7 +72,11 @@ def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
     certificate = bench_certificate(file)
     # Whoever certified it by readings looked at that monitor; one made from the files alone would
     # make old files fresh.
-    if certificate is not None and certificate.reference_sha256 and certificate.monitor.get("identity"):
+    if (
+        certificate is not None
+        and certificate.reference_sha256
+        and certificate.monitor.get("identity")
+    ):
         identity = msgspec.convert(certificate.monitor["identity"], MonitorIdentity)
         yield MeasuredOn(f"certificate {certificate.number}", identity, _date(certificate.made))
         return
@@ -85,7 +91,9 @@ def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
         yield MeasuredOn(geometry, notes.identity, _date(notes.made.when))
 
 
-def check_monitor(file: BenchFile, now: MonitorIdentity | None, today: datetime.date) -> MonitorCheck:
+def check_monitor(
+    file: BenchFile, now: MonitorIdentity | None, today: datetime.date
+) -> MonitorCheck:
     """Compare a bench's files with the monitor that is there (None: not known), and their dates
     with `today`.
 
@@ -100,12 +108,20 @@ def check_monitor(file: BenchFile, now: MonitorIdentity | None, today: datetime.
             if one.identity.brightness is not None and now.brightness is None:
                 doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
             if found := ", ".join(differences(one.identity, now)):
-                faults.append(f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}: {found}")
+                faults.append(
+                    f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}: {found}"
+                )
         if one.date is not None and (age := (today - one.date).days) > days:
-            faults.append(f"{one.name} was measured {age} days ago, on {one.date}: [monitor] calibration_valid_days = {days:g}")
+            faults.append(
+                f"{one.name} was measured {age} days ago, on {one.date}: [monitor] calibration_valid_days = {days:g}"
+            )
     if now is None:
         unknown = ["this display does not say which monitor it is"]
-    notice = [f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known"] if unknown else []
+    notice = (
+        [f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known"]
+        if unknown
+        else []
+    )
     return MonitorCheck(now, "; ".join(faults), "; ".join(filter(None, (*notice, *doubts))))
 
 

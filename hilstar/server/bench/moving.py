@@ -54,22 +54,41 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
     elif orbit not in {GEOCENTRE, SOURCE}:
         observer = orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
     sky, shown = config.sky, config.sky.bodies
-    asked = (("Sun", shown.sun), (EARTH, shown.earth), ("Moon", shown.moon), *((planet, shown.planets) for planet in PLANETS))
+    asked = (
+        ("Sun", shown.sun),
+        (EARTH, shown.earth),
+        ("Moon", shown.moon),
+        *((planet, shown.planets) for planet in PLANETS),
+    )
     names = tuple(name for name, wanted in asked if wanted)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     lit = (*names, "Sun")  # and whatever sunlight falls on
     rates, colours = total_and_colours(
-        np.stack([bodies_electrons_per_s(lit, sky.brightness, optics, photometry) for optics in channels], axis=1)
+        np.stack(
+            [
+                bodies_electrons_per_s(lit, sky.brightness, optics, photometry)
+                for optics in channels
+            ],
+            axis=1,
+        )
     )
     shares = (None, None) if colours is None else (colours[:-1], colours[-1])
     bodies = BodyLight(names, bodies_bv_mag(names), rates[:-1], *shares)
     moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
     if shown.satellites is not None:
         from hilstar.sky.bodies.passes import Satellites
-        from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
+        from hilstar.sky.bodies.satellites import (
+            LIST_FORM,
+            TABLE_FORM,
+            brightness_of,
+            read_satellites,
+            read_table,
+        )
 
         path, v0_e_per_s, rows = folder / shown.satellites, float(rates[-1]), {}
-        found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns)
+        found = read_satellites(
+            read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns
+        )
         if shown.satellite_magnitudes is not None:
             table = folder / shown.satellite_magnitudes
             rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
@@ -111,7 +130,9 @@ def observer_lines(config: BenchConfig) -> list[str]:
     if not from_source(config):
         return []
     where = "the sky is seen from the Earth's centre, without the Earth"
-    return [f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is, {where}']
+    return [
+        f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is, {where}'
+    ]
 
 
 def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = None) -> list[str]:
@@ -135,4 +156,6 @@ def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
     if sky is None or sky.satellites is None:
         return []
     placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
-    return [f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"]
+    return [
+        f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"
+    ]

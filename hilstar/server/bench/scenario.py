@@ -65,7 +65,10 @@ class Scenario:
         """When the last fault with a beginning and an end of its own is over; 0 where there is
         none.
         """
-        return max((f.at_s + f.for_s for f in self.faults if f.at_s is not None and f.for_s is not None), default=0.0)
+        return max(
+            (f.at_s + f.for_s for f in self.faults if f.at_s is not None and f.for_s is not None),
+            default=0.0,
+        )
 
     def prepared(self, prepare: Callable[[Fault], Fault]) -> list[Fault]:
         """The faults as `prepare` returns them. Raises InputError with the file and the fault
@@ -97,8 +100,12 @@ def parse_scenario(path: Path, text: str) -> Scenario:
         head = msgspec.convert(tables, Head)
     except (msgspec.ValidationError, RecursionError) as error:
         if isinstance(tables.get("fault"), dict):
-            raise InputError(f"{path}: [fault] is one table; write [[fault]] above each fault") from error
-        raise InputError(f"{path}: {explained(str(error), tables, Kind(Head, REFERENCE, TYPE_WORDS))}") from error
+            raise InputError(
+                f"{path}: [fault] is one table; write [[fault]] above each fault"
+            ) from error
+        raise InputError(
+            f"{path}: {explained(str(error), tables, Kind(Head, REFERENCE, TYPE_WORDS))}"
+        ) from error
     if len(head.fault) > MAX_FAULTS:
         raise InputError(f"{path}: has {len(head.fault)} faults; write at most {MAX_FAULTS}")
     faults: list[Fault] = []
@@ -114,16 +121,24 @@ def parse_scenario(path: Path, text: str) -> Scenario:
         faults.append(fault)
     wide = sum(isinstance(fault, Gradient | MeasuredMap) for fault in faults)
     if wide > MAX_SURFACES:
-        raise InputError(f"{path}: has {wide} gradients and maps, each an image of its own; write at most {MAX_SURFACES}")
+        raise InputError(
+            f"{path}: has {wide} gradients and maps, each an image of its own; write at most {MAX_SURFACES}"
+        )
     if not faults:
-        raise InputError(f"{path}: has no fault; write [[fault]] tables, with kind = one of {', '.join(KINDS)}")
+        raise InputError(
+            f"{path}: has no fault; write [[fault]] tables, with kind = one of {', '.join(KINDS)}"
+        )
     return Scenario(path, text, head.seed, tuple(faults), path.parent)
 
 
 def _place(number: int, table: Any) -> str:
     """The number of a fault in its file, with its name if it has one."""
     name = table.get("name") if isinstance(table, dict) else None
-    return f"[[fault]] {number} ({shortened(name, 40)}):" if isinstance(name, str) and name else f"[[fault]] {number}:"
+    return (
+        f"[[fault]] {number} ({shortened(name, 40)}):"
+        if isinstance(name, str) and name
+        else f"[[fault]] {number}:"
+    )
 
 
 def lasts_ns(fault: Fault) -> int | None:
@@ -148,14 +163,18 @@ class Timetable:
     `prepare` is called with each fault. Raises InputError where that does.
     """
 
-    def __init__(self, scenario: Scenario, prepare: Callable[[Fault], Fault], exposure_s: float) -> None:
+    def __init__(
+        self, scenario: Scenario, prepare: Callable[[Fault], Fault], exposure_s: float
+    ) -> None:
         self._exposure_ns = round(exposure_s * NS_PER_S)
         self._entries = []
         for number, fault in enumerate(scenario.prepared(prepare), start=1):
             if fault.at_s is not None:
                 begin_ns, length_ns = round(fault.at_s * NS_PER_S), lasts_ns(fault)
                 self._entries.append(
-                    ScheduledFault(number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns)
+                    ScheduledFault(
+                        number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns
+                    )
                 )
 
     def on(self, t_ns: int, since_ns: int | None = None) -> tuple[Now, ...]:
@@ -163,7 +182,9 @@ class Timetable:
         default then).
         """
         at_ns = t_ns if since_ns is None else since_ns
-        there = [e for e in self._entries if e.begin_ns <= t_ns and (e.end_ns is None or t_ns < e.end_ns)]
+        there = [
+            e for e in self._entries if e.begin_ns <= t_ns and (e.end_ns is None or t_ns < e.end_ns)
+        ]
         return tuple(Now(e.number, e.fault, at_ns - e.begin_ns) for e in there)
 
     def edges_ns(self, begin_ns: int, end_ns: int) -> list[int]:
@@ -189,7 +210,8 @@ class Timetable:
             stuck = [
                 one
                 for one in self.on(at_ns)
-                if isinstance(one.fault, Freeze) or (isinstance(one.fault, Drop) and one.fault.share == 1)
+                if isinstance(one.fault, Freeze)
+                or (isinstance(one.fault, Drop) and one.fault.share == 1)
             ]
             if not stuck:
                 return since_ns
@@ -278,7 +300,11 @@ class FaultSchedule:
         fault = self._listed.get(name)
         if fault is None:
             known = ", ".join(self.names())
-            advice = f"{did_you_mean(name, self.names())}known are {known}" if known else "the run has no scenario"
+            advice = (
+                f"{did_you_mean(name, self.names())}known are {known}"
+                if known
+                else "the run has no scenario"
+            )
             raise InputError(f"no fault is called {name!r}; {advice}")
         self._ask(_Planned(fault, who, None))
 
@@ -290,7 +316,9 @@ class FaultSchedule:
         with self._lock:
             self._check_room(fault)  # before what takes time
         fault = self._prepare(fault)
-        self._ask(_Planned(fault, who, None if fault.at_s is None else round(fault.at_s * NS_PER_S)))
+        self._ask(
+            _Planned(fault, who, None if fault.at_s is None else round(fault.at_s * NS_PER_S))
+        )
 
     def stop(self, name: str, who: str = "") -> None:
         """End a fault with the next frame, whoever began it. Raises InputError for one that is
@@ -304,7 +332,9 @@ class FaultSchedule:
                 self._stops[name] = who
             elif not waiting:
                 names = ", ".join(planned.fault.name for planned in self._on)
-                raise InputError(f"the fault {name!r} is not on; " + (f"on are {names}" if names else "none is"))
+                raise InputError(
+                    f"the fault {name!r} is not on; " + (f"on are {names}" if names else "none is")
+                )
 
     def _ask(self, wanted: _Planned) -> None:
         with self._lock:
@@ -317,12 +347,16 @@ class FaultSchedule:
         """
         there = [planned.fault for planned in (*self._on, *self._asked)]
         if any(other.name == fault.name for other in there) and fault.name not in self._stops:
-            raise InputError(f"the fault {fault.name!r} is on already; stop it first, or give another name")
+            raise InputError(
+                f"the fault {fault.name!r} is on already; stop it first, or give another name"
+            )
         surfaces = sum(isinstance(other, SURFACES) for other in there)
         if isinstance(fault, SURFACES) and surfaces >= MAX_SURFACES_ON:
             raise InputError(f"{surfaces} gradients, glows and maps are on or wait; stop one first")
         if len(self._on) >= MAX_ON or len(self._asked) >= MAX_ASKED:
-            raise InputError(f"{len(self._on)} faults are on and {len(self._asked)} wait; stop one first")
+            raise InputError(
+                f"{len(self._on)} faults are on and {len(self._asked)} wait; stop one first"
+            )
 
     # Called by the frames' thread
 
@@ -362,7 +396,9 @@ class FaultSchedule:
             if share and not planned.number:
                 self._count += 1
                 planned.number = self._count
-                changes.append(FaultChange("start", planned.number, planned.fault, run_ns, planned.who))
+                changes.append(
+                    FaultChange("start", planned.number, planned.fault, run_ns, planned.who)
+                )
             if share:
                 found.append(Now(planned.number, planned.fault, since_ns, share))
             elif since_ns > 0:
@@ -379,13 +415,19 @@ class FaultSchedule:
 
     def _admit(self, run_ns: int) -> None:
         """Let in what may be on within this frame."""
-        soon = [p for p in (*self._asked, *self._planned) if p.start_ns is None or p.start_ns < run_ns + 2 * self._frame_ns]
+        soon = [
+            p
+            for p in (*self._asked, *self._planned)
+            if p.start_ns is None or p.start_ns < run_ns + 2 * self._frame_ns
+        ]
         names = {planned.fault.name for planned in self._on}
         for planned in soon:
             (self._asked if planned in self._asked else self._planned).remove(planned)
             if planned.fault.name in names or len(self._on) >= MAX_ON:
                 continue  # the console was faster than the file
-            late = planned.start_ns is not None and planned.who != FILE and planned.start_ns < run_ns
+            late = (
+                planned.start_ns is not None and planned.who != FILE and planned.start_ns < run_ns
+            )
             if planned.start_ns is None or late:
                 planned.start_ns = run_ns
             names.add(planned.fault.name)
@@ -402,6 +444,11 @@ def share_on(fault: Fault, since_ns: int, frame_ns: int) -> float:
     length_ns = lasts_ns(fault)
     if not fault.OF_LIGHT:
         begun = since_ns + frame_ns // 2 >= 0
-        return float(begun and (length_ns is None or since_ns + frame_ns // 2 < max(length_ns, frame_ns)))
-    begin_ns, end_ns = max(0, -since_ns), frame_ns if length_ns is None else min(frame_ns, length_ns - since_ns)
+        return float(
+            begun and (length_ns is None or since_ns + frame_ns // 2 < max(length_ns, frame_ns))
+        )
+    begin_ns, end_ns = (
+        max(0, -since_ns),
+        frame_ns if length_ns is None else min(frame_ns, length_ns - since_ns),
+    )
     return max(0, end_ns - begin_ns) / frame_ns

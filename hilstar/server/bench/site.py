@@ -14,7 +14,13 @@ from hilstar.basics.rotation import conjugate, rotate
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.config.sky import SiteSettings
-from hilstar.sky.air import NIGHT_SKY, extinction_curve, extinction_names, glow_e_per_s_arcsec2, standard_pressure_hpa
+from hilstar.sky.air import (
+    NIGHT_SKY,
+    extinction_curve,
+    extinction_names,
+    glow_e_per_s_arcsec2,
+    standard_pressure_hpa,
+)
 from hilstar.sky.electrons import Optics, Photometry, electron_response
 from hilstar.sky.spectrum import Curve, constant_curve, read_curve_csv
 
@@ -29,9 +35,13 @@ class Ground:
 
     def __init__(self, site: SiteSettings) -> None:
         self.longitude, self.latitude = np.radians((site.longitude_deg, site.latitude_deg))
-        self._place_km = np.asarray(erfa.gd2gc(1, self.longitude, self.latitude, site.height_m)) * 1e-3
+        self._place_km = (
+            np.asarray(erfa.gd2gc(1, self.longitude, self.latitude, site.height_m)) * 1e-3
+        )
         flat = np.cos(self.latitude)
-        self._up = np.array([flat * np.cos(self.longitude), flat * np.sin(self.longitude), np.sin(self.latitude)])
+        self._up = np.array(
+            [flat * np.cos(self.longitude), flat * np.sin(self.longitude), np.sin(self.latitude)]
+        )
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place and velocity about the Earth's centre, ICRS axes."""
@@ -54,7 +64,9 @@ def site_extinction(site: SiteSettings, folder: Path) -> Curve:
     """Extinction by wavelength, mag an air mass. Raises InputError."""
     if isinstance(site.extinction, int | float):
         if not 0 <= site.extinction <= MAX_EXTINCTION:
-            raise InputError(f"[site] extinction = {site.extinction:g}: write magnitudes an air mass, 0 to {MAX_EXTINCTION:g}")
+            raise InputError(
+                f"[site] extinction = {site.extinction:g}: write magnitudes an air mass, 0 to {MAX_EXTINCTION:g}"
+            )
         return constant_curve(float(site.extinction))
     found = extinction_curve(site.extinction)
     if found is None:
@@ -73,7 +85,9 @@ def site_refraction(site: SiteSettings, optics: Optics) -> tuple[float, float]:
     """The constants of refraction for the colour in which a tracker sees sunlight."""
     nm, response = electron_response(optics)
     mean_nm = float(nm @ response / response.sum())
-    pressure = standard_pressure_hpa(site.height_m) if site.pressure_hpa is None else site.pressure_hpa
+    pressure = (
+        standard_pressure_hpa(site.height_m) if site.pressure_hpa is None else site.pressure_hpa
+    )
     a, b = erfa.refco(pressure, site.temperature_c, site.humidity, mean_nm * 1e-3)
     return float(a), float(b)
 
@@ -87,5 +101,7 @@ def site_glow_e_per_s_sr(config: BenchConfig, folder: Path, optics: Optics) -> f
         return 0.0
     source = NIGHT_SKY if site.sky_spectrum == "paranal" else folder / site.sky_spectrum
     photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
-    rate = glow_e_per_s_arcsec2(read_curve_csv(source, 1e30), site.sky_v_mag_arcsec2, optics, photometry)
+    rate = glow_e_per_s_arcsec2(
+        read_curve_csv(source, 1e30), site.sky_v_mag_arcsec2, optics, photometry
+    )
     return rate * ARCSEC_PER_RAD**2

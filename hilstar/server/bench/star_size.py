@@ -19,7 +19,13 @@ from hilstar.basics.units import magnitude
 from hilstar.optics.camera import Camera
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import PIXEL_VARIANCE, GaussianPsf, Psf, SampledPsf, square_points
-from hilstar.server.bench.cameras import before_detector, display_psf, figure, tracker_camera, tracker_psf
+from hilstar.server.bench.cameras import (
+    before_detector,
+    display_psf,
+    figure,
+    tracker_camera,
+    tracker_psf,
+)
 from hilstar.server.bench.config import GAUSSIAN, BenchConfig
 
 MM_PER_INCH, UM_PER_MM = 25.4, 1e3
@@ -83,7 +89,9 @@ class StarRemedy:
     def text(self) -> str:
         """What would do, for a person."""
         if self.collimator_mm is None or self.resolution_px is None:
-            return "no collimator and no panel would do: the lens alone makes a point wider than that"
+            return (
+                "no collimator and no panel would do: the lens alone makes a point wider than that"
+            )
         width, height = self.resolution_px
         panel = f"a panel of {self.pixel_pitch_um:.4g} um and {width} x {height} px or more"
         collimator = f"a collimator of {self.collimator_mm:.4g} mm"
@@ -179,7 +187,10 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     tracker, limit = tracker_camera(config.tracker, folder), config.verify.star_sigma_ratio
     ratio = tracker.focal_length_px / display.focal_length_px
     sprite = display_psf(config, folder, display)
-    lens, sky = (_in_the_middle(psf) for psf in (before_detector(config, folder, display), tracker_psf(config.tracker, folder)))
+    lens, sky = (
+        _in_the_middle(psf)
+        for psf in (before_detector(config, folder, display), tracker_psf(config.tracker, folder))
+    )
     blur_px = config.collimator.psf_sigma_px
     # A sprite that is the tracker's own PSF is as wide on the detector whatever the ratio.
     sprite_px2 = _variance_px2(sprite)
@@ -187,7 +198,9 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     widths = _Widths(
         sky_px2=_variance_px2(sky),
         by_ratio=2 * PIXEL_VARIANCE + blur_px**2 + (sprite_px2 if goes_along else 0.0),
-        fixed_px2=_variance_px2(lens) - (blur_px * ratio) ** 2 + (0.0 if goes_along else sprite_px2 * ratio**2),
+        fixed_px2=_variance_px2(lens)
+        - (blur_px * ratio) ** 2
+        + (0.0 if goes_along else sprite_px2 * ratio**2),
     )
     shown, of_sky = _shown_shares(sprite, lens, ratio), _sky_shares(sky)
     sigma_ratio = widths.sigma_ratio(ratio)
@@ -205,7 +218,11 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
 
 def _in_the_middle(psf: Psf) -> Psf:
     """Of a glass, its mean PSF in the field's middle."""
-    return SampledPsf(psf.samples, psf.per_px, psf.pixel_integrated) if isinstance(psf, GlassPsf) else psf
+    return (
+        SampledPsf(psf.samples, psf.per_px, psf.pixel_integrated)
+        if isinstance(psf, GlassPsf)
+        else psf
+    )
 
 
 def _variance_px2(psf: Psf) -> float:
@@ -243,7 +260,9 @@ def _shown_shares(sprite: Psf, lens: Psf, ratio: float) -> _Shares:
     y_px = ratio * (pixels[rows][:, None] + down).ravel()
     light = np.repeat(weights[lit] / len(right), len(right))
     half = math.ceil(np.abs(x_px).max(initial=0.0) + narrow.footprint_px / 2) + 1
-    image = narrow.spread(x_px, y_px, light, (-half, -half, 2 * half + 1, 2 * half + 1)).astype(np.float64)
+    image = narrow.spread(x_px, y_px, light, (-half, -half, 2 * half + 1, 2 * half + 1)).astype(
+        np.float64
+    )
     image /= image.sum()
     return _Shares(float(image.max()), 1 / float((image**2).sum()))
 
@@ -256,7 +275,9 @@ def _sky_shares(sky: Psf) -> _Shares:
     return _Shares(float(image.max()), 1 / float((image**2).sum()))
 
 
-def _remedy(config: BenchConfig, display: Camera, tracker: Camera, widths: _Widths, limit: float) -> StarRemedy:
+def _remedy(
+    config: BenchConfig, display: Camera, tracker: Camera, widths: _Widths, limit: float
+) -> StarRemedy:
     """What would bring the star within the limit."""
     largest = widths.largest_ratio(limit)
     ratio = tracker.focal_length_px / display.focal_length_px
@@ -290,11 +311,18 @@ def _remedy(config: BenchConfig, display: Camera, tracker: Camera, widths: _Widt
 
 
 def _panel_option(
-    name: str, inches: float, size_px: tuple[int, int], tracker: Camera, widths: _Widths, largest: float | None
+    name: str,
+    inches: float,
+    size_px: tuple[int, int],
+    tracker: Camera,
+    widths: _Widths,
+    largest: float | None,
 ) -> PanelOption:
     pitch_mm = inches * MM_PER_INCH / math.hypot(*size_px)
     pixels_a_side = min(one / its for one, its in zip(size_px, tracker.resolution_px, strict=True))
     longest_mm = pixels_a_side * tracker.focal_length_px * pitch_mm
     shortest_mm = math.inf if largest is None else tracker.focal_length_px * pitch_mm / largest
     lengths = (shortest_mm, longest_mm) if shortest_mm <= longest_mm else None
-    return PanelOption(name, size_px, pitch_mm * UM_PER_MM, lengths, widths.sigma_ratio(1 / pixels_a_side))
+    return PanelOption(
+        name, size_px, pitch_mm * UM_PER_MM, lengths, widths.sigma_ratio(1 / pixels_a_side)
+    )

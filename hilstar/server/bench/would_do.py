@@ -117,7 +117,9 @@ def _more_bits(bench: Bench) -> Iterator[_Trial]:
         if bits <= config.monitor.bits:
             continue
         try:
-            calibration = load_calibration(bench.calibration.name, bits, bit_stealing=config.render.bit_stealing)
+            calibration = load_calibration(
+                bench.calibration.name, bits, bit_stealing=config.render.bit_stealing
+            )
         except InputError:  # bit stealing of so many bits
             continue
         light = replace(effort.light, response=calibration.response)
@@ -126,7 +128,11 @@ def _more_bits(bench: Bench) -> Iterator[_Trial]:
 
 def _stolen_bits(bench: Bench) -> Iterator[_Trial]:
     config, effort = bench.file.config, bench.effort
-    if config.render.bit_stealing or bench.colours is not None or not bench.calibration.can_steal_bits:
+    if (
+        config.render.bit_stealing
+        or bench.colours is not None
+        or not bench.calibration.can_steal_bits
+    ):
         return
     source = calibration_source(config.monitor, bench.file.folder)
     response = load_calibration(source, config.monitor.bits, bit_stealing=True).response
@@ -160,7 +166,9 @@ def _brighter(bench: Bench, sky: _Sky) -> Iterator[_Trial]:
                 return
         render = msgspec.structs.replace(effort.asked, **{key: value})
         white_e_per_s = white_of(render, sky.stars, effort.light.psf, sky.drive) * sky.darkest
-        yield _Trial(f"[render] {key}", value, render, replace(effort.light, white_e_per_s=white_e_per_s))
+        yield _Trial(
+            f"[render] {key}", value, render, replace(effort.light, white_e_per_s=white_e_per_s)
+        )
 
 
 def _wider(bench: Bench, sky: _Sky) -> Iterator[_Trial]:

@@ -18,7 +18,9 @@ BACKLOG = 512
 TOKEN_BYTES = 32
 # what a URL and a WebSocket's subprotocol carry as it is
 TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
-NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*(:\d{1,5})?")
+NAME = re.compile(
+    r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*(:\d{1,5})?"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,9 @@ def parse_address(text: str, option: str = "--console") -> ListenAddress:
         host, port = text, ""
     else:
         host, _, port = text.partition(":")
-    if port and not (port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) <= MAX_PORT):
+    if port and not (
+        port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) <= MAX_PORT
+    ):
         raise wrong
     host = host or HOST
     if NAME.fullmatch(host) is None or ":" in host or re.fullmatch(r"[\d.]+", host):
@@ -77,13 +81,21 @@ class PageListener(Closing):
     """
 
     def __init__(
-        self, address: ListenAddress, token: str | None = None, names: tuple[str, ...] = (), option: str = "--console"
+        self,
+        address: ListenAddress,
+        token: str | None = None,
+        names: tuple[str, ...] = (),
+        option: str = "--console",
     ) -> None:
         if token is not None and TOKEN.fullmatch(token) is None:
-            raise InputError("--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them")
+            raise InputError(
+                "--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them"
+            )
         for name in names:
             if NAME.fullmatch(name) is None:
-                raise InputError(f"--console-name {shortened(name)}: write a name as browsers have it, such as stars.lab:8443")
+                raise InputError(
+                    f"--console-name {shortened(name)}: write a name as browsers have it, such as stars.lab:8443"
+                )
         self.names = names
         self.made = token is None and not address.is_loopback
         self.token = secrets.token_urlsafe(TOKEN_BYTES) if self.made else token or ""
@@ -113,10 +125,15 @@ class PageListener(Closing):
                 is_v6 = self.socket.family == socket.AF_INET6
                 # documentation: RFC 3849, RFC 5737
                 beyond, host = ("2001:db8::1", "::1") if is_v6 else ("192.0.2.1", HOST)
-                with contextlib.suppress(OSError), socket.socket(self.socket.family, socket.SOCK_DGRAM) as probe:
+                with (
+                    contextlib.suppress(OSError),
+                    socket.socket(self.socket.family, socket.SOCK_DGRAM) as probe,
+                ):
                     probe.connect((beyond, 9))
                     host = str(probe.getsockname()[0])
-        return f"http://{_bracketed(host)}:{self.port}/" + (f"#token={self.token}" if self.made else "")
+        return f"http://{_bracketed(host)}:{self.port}/" + (
+            f"#token={self.token}" if self.made else ""
+        )
 
     def close(self) -> None:
         """Stop listening."""
@@ -130,9 +147,13 @@ def _bracketed(host: str) -> str:
 def _listen(address: ListenAddress, option: str) -> socket.socket:
     where = f"{_bracketed(address.host)}:{address.port}"
     try:
-        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        found = socket.getaddrinfo(
+            address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
     except (OSError, UnicodeError) as error:
-        raise InputError(f"{option} {where}: no such host ({getattr(error, 'strerror', error)}); {_form(option)}") from error
+        raise InputError(
+            f"{option} {where}: no such host ({getattr(error, 'strerror', error)}); {_form(option)}"
+        ) from error
     family, kind, protocol, _, place = found[0]
     listener = socket.socket(family, kind, protocol)
     try:
@@ -142,6 +163,8 @@ def _listen(address: ListenAddress, option: str) -> socket.socket:
     except OSError as error:
         listener.close()
         reason = str(error.strerror or error)
-        raise InputError(f"{option} {where}: cannot listen there ({reason}); choose another port, or 0 for any") from error
+        raise InputError(
+            f"{option} {where}: cannot listen there ({reason}); choose another port, or 0 for any"
+        ) from error
     listener.setblocking(False)
     return listener

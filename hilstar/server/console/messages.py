@@ -278,7 +278,9 @@ class SharedMemory:
         if os.fstat(fd).st_size == 0:
             os.ftruncate(fd, starts[-1])
         self._memory = memoryview(mmap.mmap(fd, starts[-1]))
-        rings = [Ring(self._memory[start:], *shape) for start, shape in zip(starts, shapes, strict=False)]
+        rings = [
+            Ring(self._memory[start:], *shape) for start, shape in zip(starts, shapes, strict=False)
+        ]
         self.frames, self.states, self.events, self.answers, self.pictures = rings
 
     @classmethod
@@ -286,7 +288,9 @@ class SharedMemory:
         """New memory for pictures of at most `picture_bytes`."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 
-    def put_picture(self, head: PictureHead, levels: np.ndarray, sprites: Sequence[np.ndarray] = ()) -> None:
+    def put_picture(
+        self, head: PictureHead, levels: np.ndarray, sprites: Sequence[np.ndarray] = ()
+    ) -> None:
         """Write a picture: its levels (h, w), and the star, x and y of its sprites, (n,) each.
         Raises ValueError (size).
         """
@@ -295,7 +299,10 @@ class SharedMemory:
         self.pictures.begin()
         room = self.pictures.room(whole)
         room[: PICTURE.size] = PICTURE.pack(*head)
-        np.copyto(np.frombuffer(room[PICTURE_HEAD_BYTES:end], dtype=levels.dtype).reshape(levels.shape), levels)
+        np.copyto(
+            np.frombuffer(room[PICTURE_HEAD_BYTES:end], dtype=levels.dtype).reshape(levels.shape),
+            levels,
+        )
         if head.sprites:
             target = np.frombuffer(room[end:], dtype=SPRITE)
             target["star"], target["x_px"], target["y_px"] = sprites

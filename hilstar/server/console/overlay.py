@@ -52,23 +52,37 @@ class CameraMarks:
     monitor: Camera
     tracker: Camera
 
-    def truth(self, frame: int, stars: list[StarMark], q_icrs_to_cam: FloatArray | None, grid: bool = False) -> Truth:
+    def truth(
+        self,
+        frame: int,
+        stars: list[StarMark],
+        q_icrs_to_cam: FloatArray | None,
+        grid: bool = False,
+    ) -> Truth:
         """The truth of a picture: its stars, the marks, and with `grid` and an attitude the
         lines of RA and Dec.
         """
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
-            lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
+            lines = list(
+                self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam))
+            )
         return Truth(
             frame=frame,
             stars=stars,
             boresight_px=[round(at, PX_DIGITS) for at in self.monitor.boresight_px],
-            tracker_px=self._on_monitor(self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))),
+            tracker_px=self._on_monitor(
+                self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
+            ),
             grid=lines if grid else UNSET,
         )
 
     def answer(
-        self, residual_arcsec: list[float] | None, lit: FloatArray, shown: FloatArray, centroids: list[tuple[float, float]]
+        self,
+        residual_arcsec: list[float] | None,
+        lit: FloatArray,
+        shown: FloatArray,
+        centroids: list[tuple[float, float]],
     ) -> AnswerMarks:
         """Where a tracker takes its field to be, and its centroids, in a picture of the attitude
         `shown`.
@@ -80,10 +94,14 @@ class CameraMarks:
             # The reported attitude is E C: the field's rays, taken back by E, stand where the
             # tracker says in the shown sky.
             error = to_matrix(from_rotation_vector(np.array(residual_arcsec) / ARCSEC_PER_RAD))
-            field_px = self._on_monitor(self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES)) @ error)
+            field_px = self._on_monitor(
+                self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES)) @ error
+            )
         places = np.array(centroids).reshape(-1, 2)
         moved = to_matrix(shown) @ to_matrix(lit).T
-        return AnswerMarks(field_px, self._on_monitor(self.tracker.rays(places[:, 0], places[:, 1]) @ moved.T))
+        return AnswerMarks(
+            field_px, self._on_monitor(self.tracker.rays(places[:, 0], places[:, 1]) @ moved.T)
+        )
 
     def _on_monitor(self, rays: FloatArray) -> list[list[float]]:
         """The places (x, y) on the monitor of those rays (n, 3), cam, that have one."""
@@ -115,13 +133,22 @@ class CameraMarks:
             yield from self._line(label, ra_deg + reach, np.full_like(reach, dec), turn)
         up = np.linspace(low_deg, high_deg, LINE_PLACES)
         for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
-            yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
+            yield from self._line(
+                f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}",
+                np.full_like(up, ra),
+                up,
+                turn,
+            )
 
-    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
+    def _line(
+        self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray
+    ) -> Iterator[GridLine]:
         x_px, y_px = self.monitor.project(direction_of(ra_deg, dec_deg) @ turn.T)
         inside = self.on_screen(x_px, y_px, BEYOND)
         # A piece extends one point beyond the image's edge on each side; a single point is no line.
-        near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))
+        near = np.isfinite(x_px) & (
+            inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
+        )
         bounds = np.flatnonzero(np.diff(np.concatenate(([False], near, [False])).astype(np.int8)))
         for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
             if end - begin > 1:
@@ -150,11 +177,18 @@ class Overlay:
         rays = self.monitor.rays(*_border(self.monitor.resolution_px, 2))
         known = np.isfinite(rays).all()
         corners = rays / np.linalg.norm(rays, axis=1, keepdims=True) if known else rays[:0]
-        return SkyMap(self._places(bright[~is_body]), self._places(bright[is_body]), np.round(corners, 6).tolist())
+        return SkyMap(
+            self._places(bright[~is_body]),
+            self._places(bright[is_body]),
+            np.round(corners, 6).tolist(),
+        )
 
     def _places(self, which: np.ndarray[Any, Any]) -> list[SkyPlace]:
         x, y, z = self.stars.directions(which).T
-        ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+        ra_deg, dec_deg = (
+            np.degrees(np.arctan2(y, x)) % 360.0,
+            np.degrees(np.arctan2(z, np.hypot(x, y))),
+        )
         v_mag = self.stars.v_mag[which].round(2).tolist()
         places = ra_deg.round(SKY_DIGITS).tolist(), dec_deg.round(SKY_DIGITS).tolist()
         return [SkyPlace(*row) for row in zip(*places, v_mag, self._labels(which, ""), strict=True)]
@@ -165,9 +199,15 @@ class Overlay:
         """
         found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
         labels = [name or label_of(hip) for name, hip in found]
-        return labels if none is None else [none if label.startswith("HIP ") else label for label in labels]
+        return (
+            labels
+            if none is None
+            else [none if label.startswith("HIP ") else label for label in labels]
+        )
 
-    def truth(self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()) -> Truth:
+    def truth(
+        self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()
+    ) -> Truth:
         """What is where in a picture at an attitude, with the grid; `clipped` are HIP numbers,
         and names of what has none.
         """
@@ -193,7 +233,10 @@ class Overlay:
 
 def overlay_of(bench: "Bench") -> Overlay:
     """The overlay of an assembled bench."""
-    return Overlay(CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
+    return Overlay(
+        CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)),
+        bench.shown_stars,
+    )
 
 
 def catalogue_sky() -> SkyMap:
@@ -202,8 +245,17 @@ def catalogue_sky() -> SkyMap:
     bright = np.argsort(catalog.v_mag, kind="stable")
     bright = bright[catalog.v_mag[bright] < SKY_FAINTEST_MAG]
     columns = (catalog.ra_deg[bright], catalog.dec_deg[bright], catalog.v_mag[bright])
-    rows = zip(*(column.round(SKY_DIGITS).tolist() for column in columns), catalog.hip[bright].tolist(), strict=True)
-    return SkyMap([SkyPlace(ra, dec, v_mag, star_names().get(hip, ("", ""))[0]) for ra, dec, v_mag, hip in rows])
+    rows = zip(
+        *(column.round(SKY_DIGITS).tolist() for column in columns),
+        catalog.hip[bright].tolist(),
+        strict=True,
+    )
+    return SkyMap(
+        [
+            SkyPlace(ra, dec, v_mag, star_names().get(hip, ("", ""))[0])
+            for ra, dec, v_mag, hip in rows
+        ]
+    )
 
 
 def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:
@@ -220,7 +272,9 @@ def _step(steps: tuple[float, ...], most: float) -> float:
 
 
 def _multiples(low: float, high: float, step: float) -> list[float]:
-    return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    return [
+        k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
 
 
 def _digits(step_deg: float) -> int:
@@ -263,9 +317,17 @@ def colour_notes(bench: "Bench") -> dict[int, str]:
     notes = []
     for own, shown in zip(wanted.tolist(), colours.shown(shares).tolist(), strict=True):
         if colours.mono:
-            notes.append(f"{own[0]:.0f} nm" + ("" if abs(own[0] - shown[0]) < 1 else f", shown {shown[0]:.0f} nm"))
+            notes.append(
+                f"{own[0]:.0f} nm"
+                + ("" if abs(own[0] - shown[0]) < 1 else f", shown {shown[0]:.0f} nm")
+            )
         else:
-            notes.append(" ".join(f"{name} {share:.0%}" for name, share in zip(PRIMARIES, own, strict=True)))
+            notes.append(
+                " ".join(f"{name} {share:.0%}" for name, share in zip(PRIMARIES, own, strict=True))
+            )
     reached = colours.in_gamut(colours.off(wanted, shares)).tolist()
-    said = (note if inside else f"{note}, out of gamut" for note, inside in zip(notes, reached, strict=True))
+    said = (
+        note if inside else f"{note}, out of gamut"
+        for note, inside in zip(notes, reached, strict=True)
+    )
     return dict(zip(which.tolist(), said, strict=True))

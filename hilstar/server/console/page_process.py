@@ -25,7 +25,14 @@ from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff
 from hilstar.server.console.listener import PageListener
-from hilstar.server.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup, SharedMemory
+from hilstar.server.console.messages import (
+    Order,
+    OrderAnswer,
+    RunEvent,
+    RunState,
+    Setup,
+    SharedMemory,
+)
 
 TICK_S = 0.1
 FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
@@ -60,7 +67,13 @@ class PageProcess(Closing):
     """
 
     def __init__(
-        self, setup: Setup, memory: SharedMemory, listeners: Listeners, now: Callable[[], RunState], notices: Notices, do: Do
+        self,
+        setup: Setup,
+        memory: SharedMemory,
+        listeners: Listeners,
+        now: Callable[[], RunState],
+        notices: Notices,
+        do: Do,
     ) -> None:
         self._memory, self._now, self._notices, self._do = memory, now, notices, do
         self._listener_fds = [-1 if each is None else each.socket.fileno() for each in listeners]
@@ -112,11 +125,17 @@ class PageProcess(Closing):
             ahead_s = time.time() - time.monotonic_ns() * 1e-9
             while self._events:
                 notice = self._events.popleft()
-                event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
+                event = RunEvent(
+                    round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail
+                )
                 self._memory.events.put(msgspec.json.encode(event))
         except Exception as error:
             # such as a container that changed while it was read: the next tick reads it again
-            self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
+            self._memory.states.put(
+                msgspec.json.encode(
+                    RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))
+                )
+            )
         page = self._page
         if page is None:
             if self._again.over:
@@ -137,7 +156,8 @@ class PageProcess(Closing):
                 pass_fds=[fd for fd in given if fd >= 0],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                env=environment | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},
+                env=environment
+                | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},
             )
         except OSError as error:
             channel.close()

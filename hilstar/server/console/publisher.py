@@ -72,7 +72,9 @@ class FramePublisher:
         lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
         stars = () if newest is None else newest.answer.centroids[:MAX_CENTROIDS]
         places = [(round(star.x_px, 2), round(star.y_px, 2)) for star in stars]
-        self._memory.answers.put(msgspec.json.encode(messages.NewAnswer(answers.figures, lit, places)))
+        self._memory.answers.put(
+            msgspec.json.encode(messages.NewAnswer(answers.figures, lit, places))
+        )
 
     def see(self, shown: "Shown") -> None:
         """Publish a frame. Called by the frame loop."""
@@ -119,10 +121,15 @@ class FramePublisher:
         places: list[np.ndarray] = []
         if sprites is not None:
             kept = brightest(sprites.data["electrons_per_s"], messages.MAX_SPRITES)
-            places = [part if kept is None else part[kept] for part in (sprites.star, sprites.x_px, sprites.y_px)]
+            places = [
+                part if kept is None else part[kept]
+                for part in (sprites.star, sprites.x_px, sprites.y_px)
+            ]
         count = len(places[0]) if places else 0
         q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
-        head = messages.PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q)
+        head = messages.PictureHead(
+            shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q
+        )
         self._memory.put_picture(head, levels, places)
 
 
@@ -198,7 +205,9 @@ class WatchedRun:
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
             pointing=self._notices.lasting.get(POINTING, ""),
-            wrong_sky=[protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()],
+            wrong_sky=[
+                protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()
+            ],
             wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
             tracker=None if running.answers is None else running.answers.figures,
         )
@@ -213,8 +222,12 @@ class WatchedRun:
         ledger = self._parts.ledger.current
         if ledger is None:
             return None
-        troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active]
-        return protocol.LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
+        troubles = [
+            words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active
+        ]
+        return protocol.LedgerState(
+            printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles)
+        )
 
 
 def _attitude(shown: "Shown | None") -> protocol.ShownAttitude | None:
@@ -265,15 +278,21 @@ class OrderHandler:
 
     def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
         self._requests, self._feed, self._faults = requests, feed, parts.faults
-        self._ledger, self._notices, self._make_ledger = parts.ledger, parts.notices, parts.make_ledger
+        self._ledger, self._notices, self._make_ledger = (
+            parts.ledger,
+            parts.notices,
+            parts.make_ledger,
+        )
         self._ledger_lock = threading.Lock()
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
         """Carry out an order; the answer says what went wrong."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
-        doers = {"ledger": self._switch_ledger, "mark": self._mark, "fault": self._fault} | dict.fromkeys(
-            protocol.SWITCHES, self._switch
-        )
+        doers = {
+            "ledger": self._switch_ledger,
+            "mark": self._mark,
+            "fault": self._fault,
+        } | dict.fromkeys(protocol.SWITCHES, self._switch)
         try:
             status, line = doers[order.name](order, who)
         except HilstarError as error:
@@ -362,7 +381,11 @@ class RunDescription:
 
 
 def setup_for(
-    listeners: Listeners, control: bool, description: RunDescription, file: "BenchFile", picture_bytes: int
+    listeners: Listeners,
+    control: bool,
+    description: RunDescription,
+    file: "BenchFile",
+    picture_bytes: int,
 ) -> messages.Setup:
     """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
     monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
@@ -389,7 +412,12 @@ def setup_for(
         pace=description.pace,
         scpi=None
         if scpi is None
-        else messages.ScpiSetup(scpi.token, description.kind, description.steer_port, file.config.attitude.max_rate_deg_s),
+        else messages.ScpiSetup(
+            scpi.token,
+            description.kind,
+            description.steer_port,
+            file.config.attitude.max_rate_deg_s,
+        ),
     )
 
 
@@ -407,7 +435,11 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
         marks=overlay.marks,
         hip=stars.hip.copy(),
         v_mag=stars.v_mag.astype(np.float32),
-        names={star: name for star, name in zip(unnamed.tolist(), stars.names(unnamed), strict=True) if name},
+        names={
+            star: name
+            for star, name in zip(unnamed.tolist(), stars.names(unnamed), strict=True)
+            if name
+        },
         sky=overlay.sky(),
         aids=aid_levels_of(bench),
         aids_in_levels=aids_in_levels,
@@ -428,13 +460,18 @@ def opened_page(
     feed, requests = FramePublisher(memory), SwitchRequests()
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listeners, control, description, bench.file, picture_bytes)
-    setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
+    setup.hello.renderer, setup.hello.white_level = (
+        bench.renderer.gl_renderer,
+        bench.calibration.response.white,
+    )
     setup.hello.certificate = certificate_number(bench.file)
     setup.hello.answers = parts.answers is not None
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     if listeners.page is not None:
         setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
-    with PageProcess(setup, memory, listeners, WatchedRun(feed, parts).now, parts.notices, orders.do):
+    with PageProcess(
+        setup, memory, listeners, WatchedRun(feed, parts).now, parts.notices, orders.do
+    ):
         yield feed, requests
 
 
@@ -479,7 +516,9 @@ class SessionPublisher:
         if messages.PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
             return
         self._patterns += 1
-        head = messages.PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0)
+        head = messages.PictureHead(
+            self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0
+        )
         self._memory.put_picture(head, codes)
         self.notices.tell("pattern", f"shows {pattern.name}")
 
@@ -495,7 +534,10 @@ class SessionPublisher:
     def now(self) -> messages.RunState:
         """The session's current state."""
         now_ns = time.monotonic_ns()
-        failed, shown = list(self._failed.values()), protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
+        failed, shown = (
+            list(self._failed.values()),
+            protocol.NewestFrame(number=self._patterns, missing=False, blank=False),
+        )
         return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
@@ -504,11 +546,15 @@ class SessionPublisher:
             line = "a session of first light takes marks with a text, and no other order"
             return messages.OrderAnswer(id=order.id, status=409, line=line)
         self.notices.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
-        return messages.OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
+        return messages.OrderAnswer(
+            id=order.id, status=200, line="mark told; a session has no ledger"
+        )
 
 
 @contextmanager
-def session_page(listener: PageListener, control: bool, file: "BenchFile") -> Iterator[SessionPublisher]:
+def session_page(
+    listener: PageListener, control: bool, file: "BenchFile"
+) -> Iterator[SessionPublisher]:
     """The page of a session while this is open."""
     monitor = file.config.monitor
     width, height = monitor.resolution_px
@@ -516,7 +562,13 @@ def session_page(listener: PageListener, control: bool, file: "BenchFile") -> It
     memory = messages.SharedMemory.make(picture_bytes)
     feed = SessionPublisher(memory)
     listeners = Listeners(listener)
-    setup = setup_for(listeners, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
+    setup = setup_for(
+        listeners,
+        control,
+        RunDescription("first-light", "session", "", "session"),
+        file,
+        picture_bytes,
+    )
     setup.hello.session = True
     with PageProcess(setup, memory, listeners, feed.now, feed.notices, feed.do):
         yield feed

@@ -30,7 +30,15 @@ from hilstar.server.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.server.faults import read_recording
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
-from hilstar.server.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
+from hilstar.server.record.report import (
+    COUNTS,
+    METRICS,
+    RunFigures,
+    RunReport,
+    figures_of,
+    summarise,
+    table_rows,
+)
 from hilstar.server.replay import played_again, replay
 from hilstar.server.serve import Outlet
 
@@ -62,11 +70,16 @@ def _take(name: str, folder: Path, done: dict[str, str]) -> None:
     body, names = _import.sub("", text), _export.findall(text)
     body = _export.sub("", body)
     if re.search(r"^(?:import|export)\b", body, re.MULTILINE):
-        raise ValueError(f"{name}.js: an import or export that is not in one line with names in braces")
+        raise ValueError(
+            f"{name}.js: an import or export that is not in one line with names in braces"
+        )
     takes = "".join(
-        f"const {{ {', '.join(part.replace(' as ', ': ').split(', '))} }} = of_{other};\n" for part, other in wanted
+        f"const {{ {', '.join(part.replace(' as ', ': ').split(', '))} }} = of_{other};\n"
+        for part, other in wanted
     )
-    done[name] = f"const of_{name} = (() => {{\n{takes}{body}return {{ {', '.join(names)} }};\n}})();\n"
+    done[name] = (
+        f"const of_{name} = (() => {{\n{takes}{body}return {{ {', '.join(names)} }};\n}})();\n"
+    )
 
 
 def _hash(text: str) -> str:
@@ -142,12 +155,18 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
     return next((file for file in files if file.sha256 == head.get("bench_sha256")), files[0])
 
 
-def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
+def _pictures(
+    bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path
+) -> list[dict[str, Any]]:
     recording = read_recording(ledger, run.faults)
     frames = run.keyframes.chosen(run.last)
     # Where a fault froze the sky, the picture is an earlier frame's.
     frozen = {number for number, fault in recording.faults.items() if isinstance(fault, Freeze)}
-    chosen = [(record, why) for record, why in frames if not (frozen & set(record.faults) or wrong_in_frame(record))]
+    chosen = [
+        (record, why)
+        for record, why in frames
+        if not (frozen & set(record.faults) or wrong_in_frame(record))
+    ]
     found: list[dict[str, Any]] = []
 
     def take(shown: Shown) -> None:
@@ -158,7 +177,9 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
         found.append(picture | told | {"t_s": round(t_s, 3)})
 
     if chosen:
-        play = played_again(lambda: (record for record, _ in chosen), len(chosen), 0, False, recording)
+        play = played_again(
+            lambda: (record for record, _ in chosen), len(chosen), 0, False, recording
+        )
         replay(bench, play, take, Outlet(notices=_Unreported()))
     # As many pictures, evenly over the run, as fit.
     while len(found) > 1 and sum(len(picture["data"]) for picture in found) > MAX_BYTES:
@@ -170,7 +191,11 @@ def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
     shown_levels = shown.drawn.levels
     levels = shown_levels if shown_levels.ndim == 2 else shown_levels.max(axis=2)
     attitude = shown.attitude
-    truth = None if attitude is None else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
+    truth = (
+        None
+        if attitude is None
+        else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
+    )
     wide = levels.dtype.itemsize == 2
     data = np.ascontiguousarray(levels, dtype="<u2" if wide else "u1").tobytes()
     return {
@@ -234,7 +259,9 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
             "histograms": _histograms(run),
             "stride": run.samples.stride,
             "answers": _answers(run, summary),
-            "refused": {reason: count for reason, count in summary.packets.items() if reason != "accepted"},
+            "refused": {
+                reason: count for reason, count in summary.packets.items() if reason != "accepted"
+            },
             "events": [_event(each, run) for each in (*run.first_events, *run.last_events)],
             "events_total": sum(run.events.values()),
         }
@@ -254,7 +281,11 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
     reasons = [f"{number} of {found.frames} frames {what}" for number, what in counted if number]
     if found.missed_frames:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
-    reasons += [f"{one.seconds:.1f} s of {one.kind}: {one.text}" for one in found.wrong_sky.conditions if one.seconds]
+    reasons += [
+        f"{one.seconds:.1f} s of {one.kind}: {one.text}"
+        for one in found.wrong_sky.conditions
+        if one.seconds
+    ]
     headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
     due = found.frames + found.missed_frames  # refresh periods in which a frame was due
     percent = 100 * found.right_frames / max(due, 1)
@@ -267,7 +298,9 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
 def _utc(run: RunFigures, host_ns: int) -> str | None:
     try:
         unix_ns = int(run.head["unix_ns"]) + host_ns - int(run.head["monotonic_ns"])
-        return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=unix_ns // 1000)).isoformat(timespec="milliseconds")
+        return (
+            datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=unix_ns // 1000)
+        ).isoformat(timespec="milliseconds")
     except (KeyError, ValueError, OverflowError):
         return None
 
@@ -293,7 +326,12 @@ def _packets(run: RunFigures) -> dict[str, Any]:
     width_s = run.packet_times.width_ns / NS_PER_S
     if len(begin_s) and begin_s[-1] + width_s > run.duration_s:
         accepted[-1] = None  # the run ended before this bin did
-    return {"t_s": _numbers(begin_s, S_DIGITS), "width_s": width_s, "accepted_hz": accepted, "refused_hz": refused}
+    return {
+        "t_s": _numbers(begin_s, S_DIGITS),
+        "width_s": width_s,
+        "accepted_hz": accepted,
+        "refused_hz": refused,
+    }
 
 
 def _process(run: RunFigures) -> dict[str, Any]:
@@ -301,7 +339,11 @@ def _process(run: RunFigures) -> dict[str, Any]:
     t_s = host_s - run.first_swap_ns / NS_PER_S
     step_s = np.diff(host_s, prepend=np.nan)
     share = np.where(step_s > 0, 100 * np.diff(cpu_s, prepend=np.nan) / step_s, np.nan)
-    return {"t_s": _numbers(t_s, S_DIGITS), "resident_mb": _numbers(resident_mb, 2), "cpu_percent": _numbers(share, 1)}
+    return {
+        "t_s": _numbers(t_s, S_DIGITS),
+        "resident_mb": _numbers(resident_mb, 2),
+        "cpu_percent": _numbers(share, 1),
+    }
 
 
 def _histograms(run: RunFigures) -> list[dict[str, Any]]:
@@ -327,7 +369,11 @@ def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
         return None
     zero_s = run.first_swap_ns / NS_PER_S
     rows, faults = run.residuals.rows, summary.answers.faults
-    edges = sorted((at_s, step) for f in faults for at_s, step in ((f.start_s, 1), (f.end_s or summary.duration_s, -1)))
+    edges = sorted(
+        (at_s, step)
+        for f in faults
+        for at_s, step in ((f.start_s, 1), (f.end_s or summary.duration_s, -1))
+    )
     return {
         "t_s": _numbers(rows[:, 0] - zero_s, S_DIGITS),
         "xyz_arcsec": [_numbers(axis, MS_DIGITS) for axis in rows[:, 1:].T],
@@ -340,7 +386,11 @@ def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
 
 def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:
     t_s = (record.host_ns - run.first_swap_ns) / NS_PER_S
-    who = f" ({record.who[:MAX_WHO_CHARACTERS]})" if record.who and record.who not in record.detail else ""
+    who = (
+        f" ({record.who[:MAX_WHO_CHARACTERS]})"
+        if record.who and record.who not in record.detail
+        else ""
+    )
     return {
         "t_s": round(t_s, S_DIGITS),
         "utc": _utc(run, record.host_ns),
@@ -372,7 +422,11 @@ def _motion(rows: FloatArray) -> dict[str, Any] | None:
     spread = float((at * at).sum())
     slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
     beside = np.degrees(turned_rad - turned_rad.mean(axis=0) - at[:, None] * slope)
-    return {"t_s": _numbers(rows[:, 0], S_DIGITS), "about_mean": about, "beside_steady": _curves(beside, AXES)}
+    return {
+        "t_s": _numbers(rows[:, 0], S_DIGITS),
+        "about_mean": about,
+        "beside_steady": _curves(beside, AXES),
+    }
 
 
 def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, Any]:
@@ -380,7 +434,10 @@ def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, An
     scaled = angles_deg * (3600 if in_arcsec else 1)
     return {
         "unit": "arcsec" if in_arcsec else "\N{DEGREE SIGN}",
-        "curves": {name: _numbers(values, ANGLE_DIGITS) for name, values in zip(names, scaled.T, strict=True)},
+        "curves": {
+            name: _numbers(values, ANGLE_DIGITS)
+            for name, values in zip(names, scaled.T, strict=True)
+        },
     }
 
 
@@ -397,7 +454,9 @@ def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[st
     down = 2 * (x * y + w * z), (1 - 2 * (x * x + z * z))
     east = tuple(-np.sin(ra) * axis[0] + np.cos(ra) * axis[1] for axis in (right, down))
     ra_deg, roll_deg = (np.degrees(np.unwrap(part)) for part in (ra, np.arctan2(east[1], -east[0])))
-    return np.column_stack(((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)), NAMES
+    return np.column_stack(
+        ((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)
+    ), NAMES
 
 
 def report(path: Path, directory: Path) -> RunReport:

@@ -93,7 +93,9 @@ class RunStatus:
         attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
         wrong = "".join(f"{one.text}; " for one in running.loop.notices.wrong_sky.now())
-        return f"{wrong}attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
+        return f"{wrong}attitude {attitude.text}; {told}" + (
+            "; shown by --force" if self._source.forced else ""
+        )
 
     def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
@@ -106,15 +108,26 @@ class RunStatus:
         seconds = max(now_ns - then_ns, 1) / NS_PER_S
         total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
         text = f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s), {tally.missed_frames} missed"
-        frames_line = StatusLine("frames", f"{text}, {tally.stale_frames} stale", not tally.missed_frames)
+        frames_line = StatusLine(
+            "frames", f"{text}, {tally.stale_frames} stale", not tally.missed_frames
+        )
         still_ns = now_ns - shown.swap_ns
         if still_ns > STANDS_STILL_NS:
-            frames_line = StatusLine("frames", f"{frames_line.text}; none for {still_ns / NS_PER_S:.1f} s", False)
-        refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
+            frames_line = StatusLine(
+                "frames", f"{frames_line.text}; none for {still_ns / NS_PER_S:.1f} s", False
+            )
+        refused = ", ".join(
+            f"{reason} {count}" for reason, count in packets.refused_by.items() if count
+        )
         told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
-        refused = ", ".join([refused] * bool(refused) + [f"{packets.lost} lost"] * bool(packets.lost))
+        refused = ", ".join(
+            [refused] * bool(refused) + [f"{packets.lost} lost"] * bool(packets.lost)
+        )
         return [
-            *(StatusLine("sky", f"WRONG: {one.text}", False) for one in running.loop.notices.wrong_sky.now()),
+            *(
+                StatusLine("sky", f"WRONG: {one.text}", False)
+                for one in running.loop.notices.wrong_sky.now()
+            ),
             _attitude_line(shown),
             frames_line,
             StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
@@ -137,7 +150,9 @@ class RunStatus:
 def _attitude_line(shown: "Shown") -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
-        return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
+        return StatusLine(
+            "attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False
+        )
     # with NumPy 0.1 s, which Tab and --help do not need
     from hilstar.basics.rotation import to_radec_roll_deg, turn_text
 
@@ -158,7 +173,11 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
     share = "-" if found.availability is None else f"{100 * found.availability:.1f} %"
     text = f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share} available, {late} late"
     text += f", {found.mode}" if found.mode else ""
-    text += f"; {found.wrong} of {found.answers} answers wrong" if found.wrong else f"; {found.answers} answers"
+    text += (
+        f"; {found.wrong} of {found.answers} answers wrong"
+        if found.wrong
+        else f"; {found.answers} answers"
+    )
     text += f", {found.out_of_order} out of order" if found.out_of_order else ""
     text += f", {found.unjudged} not judged" if found.unjudged else ""
     text += f"; {found.trouble}" if found.trouble else ""
@@ -175,7 +194,9 @@ def on_terminal(status: RunStatus) -> Iterator[None]:
     live = sys.stderr is not None and sys.stderr.isatty()
     if live:
         import rich.live  # noqa: F401 - takes 0.1 s, which is not to cost a frame
-    thread = threading.Thread(target=_live if live else _plain, args=(status, stop), name="hilstar-status", daemon=True)
+    thread = threading.Thread(
+        target=_live if live else _plain, args=(status, stop), name="hilstar-status", daemon=True
+    )
     thread.start()
     try:
         yield
@@ -195,7 +216,10 @@ def _live(status: RunStatus, stop: threading.Event) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, _logs_above():
+    with (
+        Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live,
+        _logs_above(),
+    ):
         while not stop.is_set():
             live.update(_table(status.lines(time.monotonic_ns())), refresh=True)
             stop.wait(LIVE_EACH_S)
@@ -208,7 +232,9 @@ def _table(lines: list[StatusLine]) -> "Table":
     table = Table.grid(padding=(0, 2))
     for line in lines:
         mark = Text("ok", style="green") if line.well else Text("!!", style="bold red")
-        table.add_row(mark, Text(line.label, style="bold"), Text(line.text, overflow="ellipsis", no_wrap=True))
+        table.add_row(
+            mark, Text(line.label, style="bold"), Text(line.text, overflow="ellipsis", no_wrap=True)
+        )
     return table
 
 

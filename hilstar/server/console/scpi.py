@@ -86,7 +86,9 @@ class ScpiError(Exception):
     @property
     def text(self) -> str:
         """As `SYST:ERR?` answers it."""
-        clean = "".join(c if " " <= c <= "~" and c != '"' else "'" if c == '"' else "?" for c in self.detail)[:MAX_DETAIL]
+        clean = "".join(
+            c if " " <= c <= "~" and c != '"' else "'" if c == '"' else "?" for c in self.detail
+        )[:MAX_DETAIL]
         return f'{self.number},"{DESCRIPTIONS[self.number]}{";" if clean else ""}{clean}"'
 
 
@@ -108,8 +110,12 @@ class Unit(NamedTuple):
 
 
 NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
-HEADER = re.compile(r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)")
-NUMBER = re.compile(r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?")
+HEADER = re.compile(
+    r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)"
+)
+NUMBER = re.compile(
+    r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?"
+)
 INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -181,7 +187,9 @@ def _split(text: str, at: str) -> Iterator[str]:
 
 def _of_header(text: str) -> tuple[int, str]:
     if text[0] in "*:" or text[0].isalpha():
-        return (-103 if re.match(r"[*:]?[A-Za-z][A-Za-z0-9_:]*\??[^A-Za-z0-9_:? \t]", text) else -110), text[:40]
+        return (
+            -103 if re.match(r"[*:]?[A-Za-z][A-Za-z0-9_:]*\??[^A-Za-z0-9_:? \t]", text) else -110
+        ), text[:40]
     return -102, text[:40]
 
 
@@ -205,7 +213,9 @@ def _by_base(text: str) -> Parameter:
     match = INTEGER.fullmatch(text)
     if match is None:
         raise ScpiError(-168, text[:40])
-    digits, base = next((each, base) for each, base in zip(match.groups(), (16, 8, 2), strict=True) if each)
+    digits, base = next(
+        (each, base) for each, base in zip(match.groups(), (16, 8, 2), strict=True) if each
+    )
     if len(digits) > MAX_DIGITS:
         raise ScpiError(-124)
     return Parameter("number", str(int(digits, base)))
@@ -249,7 +259,10 @@ def number(parameter: Parameter, suffix: str = "") -> float:
     if parameter.kind != "number":
         raise ScpiError(KINDS[parameter.kind], "write a number")
     if parameter.suffix not in {"", suffix}:
-        raise ScpiError(-131 if suffix else -138, f"{parameter.suffix}{f'; write {suffix}, or nothing' if suffix else ''}")
+        raise ScpiError(
+            -131 if suffix else -138,
+            f"{parameter.suffix}{f'; write {suffix}, or nothing' if suffix else ''}",
+        )
     value = float(parameter.text)
     if not math.isfinite(value):
         raise ScpiError(-222, "too large")

@@ -77,9 +77,13 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         return " / ".join(figure(value) for value in (times.p50, times.p99, times.max))
 
     packets, stars, clipped = summary.packets, summary.stars_drawn, summary.clipped
-    refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
+    refused = ", ".join(
+        f"{reason} {count}" for reason, count in packets.refused_by.items() if count
+    )
     flooded = summary.link["flooded"] if summary.link else 0
-    turned_away = (f" ({refused})" if refused else "") + (f"; {flooded} more passed over unread" if flooded else "")
+    turned_away = (f" ({refused})" if refused else "") + (
+        f"; {flooded} more passed over unread" if flooded else ""
+    )
     lost = f", {packets.lost} lost" if packets.lost else ""
     lines = {
         "frames": f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
@@ -87,7 +91,9 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "frame time": f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready",
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
         "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
-        + "".join(f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]),
+        + "".join(
+            f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]
+        ),
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }
     if summary.clock:
@@ -96,7 +102,9 @@ def report(summary: "RunSummary", as_json: bool) -> None:
 
         absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
         if summary.receive_latency_ms:
-            lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
+            lines["receive latency"] = (
+                f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
+            )
         lines["sender's clock"] = clock_line(summary.clock)
     if summary.sync:
         lines["pulses"] = summary.sync.line()
@@ -130,7 +138,9 @@ def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "")
         return f"no attitude came from {endpoint}; {advice}"
     reasons = [(count, reason) for reason, count in packets.refused_by.items() if count]
     shown = INSTEAD if packets.shown is UNSET else {**INSTEAD, **packets.shown}
-    told = "; ".join(f"{count} for {reason}: {shown[reason]}" for count, reason in sorted(reasons, reverse=True))
+    told = "; ".join(
+        f"{count} for {reason}: {shown[reason]}" for count, reason in sorted(reasons, reverse=True)
+    )
     return f"all {packets.refused} packets from {endpoint} were refused, {told}"
 
 
@@ -158,10 +168,21 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
         yield lambda done: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
         task = bar.add_task(what, total=None if math.isinf(total) else total)
         yield lambda done: bar.update(task, completed=done)

@@ -106,14 +106,18 @@ class SpanTally:
 
     def rms(self) -> list[float] | None:
         """The rms about zero."""
-        return _rounded(np.sqrt(self.squares / self.counts["right"])) if self.counts["right"] else None
+        return (
+            _rounded(np.sqrt(self.squares / self.counts["right"])) if self.counts["right"] else None
+        )
 
     def sigma3(self) -> list[float] | None:
         """Three standard deviations; None for fewer than two right answers."""
         count = self.counts["right"]
         if count < 2:
             return None
-        return _rounded(3 * np.sqrt(np.maximum(self.squares - self.total**2 / count, 0) / (count - 1)))
+        return _rounded(
+            3 * np.sqrt(np.maximum(self.squares - self.total**2 / count, 0) / (count - 1))
+        )
 
     def span(self, length_s: float, cycle_s: float | None) -> AnswerSpan:
         """Its figures, where an answer was due each `cycle_s`."""
@@ -134,7 +138,9 @@ class _Fault:
     record: FaultRecord
     start_ns: int
     end_ns: int | None = None
-    parts: tuple[SpanTally, SpanTally, SpanTally] = field(default_factory=lambda: (SpanTally(), SpanTally(), SpanTally()))
+    parts: tuple[SpanTally, SpanTally, SpanTally] = field(
+        default_factory=lambda: (SpanTally(), SpanTally(), SpanTally())
+    )
     first_wrong_ns: int | None = None
     recovered_ns: int | None = None
     was_right: bool = False  # the last answer of the fault
@@ -158,9 +164,15 @@ class _Fault:
 
     def over(self, at_ns: int) -> bool:
         """Whether no answer of that time can add to it."""
-        return self.end_ns is not None and self.recovered_ns is not None and at_ns > self.end_ns + AROUND_S * NS_PER_S
+        return (
+            self.end_ns is not None
+            and self.recovered_ns is not None
+            and at_ns > self.end_ns + AROUND_S * NS_PER_S
+        )
 
-    def effect(self, zero_ns: int, first_ns: int, last_ns: int, cycle_s: float | None) -> FaultEffect:
+    def effect(
+        self, zero_ns: int, first_ns: int, last_ns: int, cycle_s: float | None
+    ) -> FaultEffect:
         end_ns = last_ns if self.end_ns is None else self.end_ns
         around_ns = round(AROUND_S * NS_PER_S)
         lengths_ns = (
@@ -169,7 +181,8 @@ class _Fault:
             0 if self.end_ns is None else min(around_ns, last_ns - self.end_ns),
         )
         before, during, after = (
-            part.span(max(length_ns, 0) / NS_PER_S, cycle_s) for part, length_ns in zip(self.parts, lengths_ns, strict=True)
+            part.span(max(length_ns, 0) / NS_PER_S, cycle_s)
+            for part, length_ns in zip(self.parts, lengths_ns, strict=True)
         )
         recovered_s = None if self.recovered_ns is None else _s(self.recovered_ns, end_ns)
         return FaultEffect(
@@ -180,7 +193,9 @@ class _Fault:
             before=before,
             during=during,
             after=after,
-            first_wrong_s=None if self.first_wrong_ns is None else _s(self.first_wrong_ns, self.start_ns),
+            first_wrong_s=None
+            if self.first_wrong_ns is None
+            else _s(self.first_wrong_ns, self.start_ns),
             recovered_s=0.0 if self.was_right and recovered_s is not None else recovered_s,
         )
 
@@ -270,7 +285,13 @@ class AnswerTally:
         if not answers:
             return None
         cycle_s = self._interval_s.percentile(50)
-        due = 0 if not cycle_s else round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s) + 1 - counts["unpaired"]
+        due = (
+            0
+            if not cycle_s
+            else round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s)
+            + 1
+            - counts["unpaired"]
+        )
         # the last answer stands for the time to the next
         end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)
         return AnswerReport(
@@ -283,7 +304,9 @@ class AnswerTally:
             rms_arcsec=self.whole.rms(),
             sigma3_arcsec=self.whole.sigma3(),
             latency_ms=self._latency_ms.percentiles(),
-            faults=[fault.effect(zero_ns, self._first_ns, end_ns, cycle_s) for fault in self.faults],
+            faults=[
+                fault.effect(zero_ns, self._first_ns, end_ns, cycle_s) for fault in self.faults
+            ],
         )
 
 
@@ -297,19 +320,36 @@ def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
     if found.out_of_order:
         refused += f"; {found.out_of_order} came out of order"
     late = found.latency_ms
-    times = "" if late.p50 is None else f", {late.p50:.1f} / {late.p99 or 0:.1f} ms late (p50 / p99)"
+    times = (
+        "" if late.p50 is None else f", {late.p50:.1f} / {late.p99 or 0:.1f} ms late (p50 / p99)"
+    )
     rows = [
         ("tracker's answers", f"{found.answers}: {refused}"),
         ("tracker's availability", f"{_share(found.availability)}{times}"),
-        ("residual x, y, z, rms", f"{_three(found.rms_arcsec)} arcsec; mean {_three(found.mean_arcsec)}"),
+        (
+            "residual x, y, z, rms",
+            f"{_three(found.rms_arcsec)} arcsec; mean {_three(found.mean_arcsec)}",
+        ),
     ]
     for fault in found.faults:
         parts = [
             f"{name} {_share(span.availability)}, {_three(span.rms_arcsec)} arcsec"
-            for name, span in (("before", fault.before), ("during", fault.during), ("after", fault.after))
+            for name, span in (
+                ("before", fault.before),
+                ("during", fault.during),
+                ("after", fault.after),
+            )
         ]
-        wrong = "none wrong" if fault.first_wrong_s is None else f"first wrong after {fault.first_wrong_s:.2f} s"
-        again = "not recovered" if fault.recovered_s is None else f"recovered in {fault.recovered_s:.2f} s"
+        wrong = (
+            "none wrong"
+            if fault.first_wrong_s is None
+            else f"first wrong after {fault.first_wrong_s:.2f} s"
+        )
+        again = (
+            "not recovered"
+            if fault.recovered_s is None
+            else f"recovered in {fault.recovered_s:.2f} s"
+        )
         rows.append((f"fault {fault.name}", "; ".join([*parts, wrong, again])))
     return rows
 

@@ -9,7 +9,13 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vectors,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.record.ledger_records import NO_FRAMES, frame_records
 
@@ -52,7 +58,13 @@ class Commanded:
     stood.
     """
 
-    def __init__(self, t_s: FloatArray, q: FloatArray, held_s: FloatArray = NO_SPANS, hold_s: FloatArray | None = None) -> None:
+    def __init__(
+        self,
+        t_s: FloatArray,
+        q: FloatArray,
+        held_s: FloatArray = NO_SPANS,
+        hold_s: FloatArray | None = None,
+    ) -> None:
         self.t_s, self.q, self.held_s = t_s, q, held_s
         self.hold_s = np.diff(held_s, axis=1)[:, 0] if hold_s is None else hold_s
         gap_s = np.diff(t_s)
@@ -65,7 +77,11 @@ class Commanded:
         before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
         jumps = (np.nan_to_num(turned) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after))
         with np.errstate(invalid="ignore"):
-            self.joined = np.isfinite(turned) & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD)) & ~jumps
+            self.joined = (
+                np.isfinite(turned)
+                & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD))
+                & ~jumps
+            )
         self._gap_s = gap_s
 
     @property
@@ -88,12 +104,27 @@ class Commanded:
         # (step + bend) per interval.
         start, end = step + self._bend(before, -1), step + self._bend(before, 1)
         squared, cubed = share**2, share**3
-        moved = (cubed - 2 * squared + share) * start + (3 * squared - 2 * cubed) * step + (cubed - squared) * end
-        speed = (3 * squared - 4 * share + 1) * start + (6 * share - 6 * squared) * step + (3 * squared - 2 * share) * end
+        moved = (
+            (cubed - 2 * squared + share) * start
+            + (3 * squared - 2 * cubed) * step
+            + (cubed - squared) * end
+        )
+        speed = (
+            (3 * squared - 4 * share + 1) * start
+            + (6 * share - 6 * squared) * step
+            + (3 * squared - 2 * share) * end
+        )
         rate = -speed / gap_s  # v_cam' = -omega x v_cam
-        q = normalise(multiply(from_rotation_vectors(np.where(known[:, None], moved, 0.0)), self.q[before]))
+        q = normalise(
+            multiply(from_rotation_vectors(np.where(known[:, None], moved, 0.0)), self.q[before])
+        )
         held_s = self._held_about(t_s)
-        return Moments(np.where(known[:, None], q, np.nan), np.where(known[:, None], rate, np.nan), known, held_s)
+        return Moments(
+            np.where(known[:, None], q, np.nan),
+            np.where(known[:, None], rate, np.nan),
+            known,
+            held_s,
+        )
 
     def over_exposures(self, reach_s: float) -> "Commanded":
         """The same, where a moment stands for what was lit up to `reach_s` before and after it."""
@@ -129,7 +160,13 @@ class Commanded:
         other = interval + side
         near = np.clip(other, 0, last)
         ratio = self._gap_s[near] / self._gap_s[interval]
-        even = (ratio < UNEVEN) & (ratio > 1 / UNEVEN) & (other >= 0) & (other <= last) & self.joined[near]
+        even = (
+            (ratio < UNEVEN)
+            & (ratio > 1 / UNEVEN)
+            & (other >= 0)
+            & (other <= last)
+            & self.joined[near]
+        )
         change = (self._step[near] / ratio[:, None] - self._step[interval]) / (1 + ratio[:, None])
         return np.where(even[:, None], change, 0.0)
 
@@ -167,7 +204,9 @@ def read_commanded(ledger: Path) -> CommandedRun:
     # Of frames of one moment the last counts.
     light_ns, last = np.unique(np.array(light, dtype=np.int64)[::-1], return_index=True)
     if len(light_ns) < 2:
-        raise InputError(f"{ledger}: {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}")
+        raise InputError(
+            f"{ledger}: {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}"
+        )
     q = np.array(shown).reshape(-1, 4)[::-1][last]
     t_s = (light_ns - light_ns[0]) / NS_PER_S
     missed_before = np.array(missed, dtype=np.int64)[::-1][last]

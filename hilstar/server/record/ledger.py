@@ -152,7 +152,13 @@ class FloodFilter:
         with self._lock:
             allowance = self._allowances.get((kind, reason))
             if allowance is None:
-                rule = "event" if kind == "event" else "accepted" if reason == "accepted" else "refused"
+                rule = (
+                    "event"
+                    if kind == "event"
+                    else "accepted"
+                    if reason == "accepted"
+                    else "refused"
+                )
                 allowance = self._allowances[kind, reason] = Allowance(*self.ALLOWED[rule])
             kept = allowance.take(now_ns)
             if not kept:
@@ -191,7 +197,11 @@ class ProcessProbe:
             return None
         used = resource.getrusage(resource.RUSAGE_SELF)
         size = os.sysconf("SC_PAGE_SIZE")
-        return ProcessRecord(host_ns=time.monotonic_ns(), resident_bytes=pages * size, cpu_s=used.ru_utime + used.ru_stime)
+        return ProcessRecord(
+            host_ns=time.monotonic_ns(),
+            resident_bytes=pages * size,
+            cpu_s=used.ru_utime + used.ru_stime,
+        )
 
     def close(self) -> None:
         """Close its file."""
@@ -229,7 +239,12 @@ class Ledger(Closing):
     """Writes a run's MCAP file. Raises InputError if it cannot be created."""
 
     def __init__(
-        self, path: Path, bench: Bench, notices: Notices | None = None, overwrite: bool = False, split: SplitLimits = NO_SPLIT
+        self,
+        path: Path,
+        bench: Bench,
+        notices: Notices | None = None,
+        overwrite: bool = False,
+        split: SplitLimits = NO_SPLIT,
     ) -> None:
         self.path = self._asked = path
         self.failure: str | None = None
@@ -269,7 +284,9 @@ class Ledger(Closing):
     def _begin(self, path: Path, overwrite: bool) -> tuple[NewFile, McapWriter]:
         file = NewFile(path, overwrite)
         try:
-            writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
+            writer = McapWriter(
+                file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)}
+            )
             file.commit()
             file.note()
         except OSError as error:
@@ -287,13 +304,22 @@ class Ledger(Closing):
 
     # Called by the run, from any thread
 
-    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+    def packet(
+        self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None
+    ) -> None:
         """Record a packet; see `attitude.receiver.Watch`."""
         raw = raw[:MAX_RAW_BYTES]
         if sample is not None and refusal is None:
-            reason, sequence, encoded = "accepted", sample.sequence, partial(attitude_message, sample, host_ns, raw)
+            reason, sequence, encoded = (
+                "accepted",
+                sample.sequence,
+                partial(attitude_message, sample, host_ns, raw),
+            )
         else:
-            refusal, sequence = refusal or Refusal("format", ""), 0 if sample is None else sample.sequence
+            refusal, sequence = (
+                refusal or Refusal("format", ""),
+                0 if sample is None else sample.sequence,
+            )
             reason, detail = refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS]
             encoded = partial(refused_message, reason, detail, host_ns, raw)
         if self._filter.keeps("packet", reason, host_ns):
@@ -301,30 +327,41 @@ class Ledger(Closing):
 
     def frame(self, record: FrameRecord) -> None:
         """Record a frame."""
-        self._queue.put(QueueEntry("frame", record.swap_ns, record.frame, partial(msgspec.json.encode, record)))
+        self._queue.put(
+            QueueEntry("frame", record.swap_ns, record.frame, partial(msgspec.json.encode, record))
+        )
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
-                "ledger-stalled", f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on"
+                "ledger-stalled",
+                f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on",
             )
 
     def notice(self, notice: Notice) -> None:
         """Record an event of the run."""
         if self._filter.keeps("event", notice.kind, notice.host_ns):
             record = event_record(notice)
-            self._queue.put(QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record)))
+            self._queue.put(
+                QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record))
+            )
 
     def stands(self, record: EventRecord) -> None:
         """Record an event from before this ledger."""
-        self._queue.put(QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record)))
+        self._queue.put(
+            QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record))
+        )
 
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
-        self._queue.put(QueueEntry("fault", record.host_ns, record.number, partial(msgspec.json.encode, record)))
+        self._queue.put(
+            QueueEntry("fault", record.host_ns, record.number, partial(msgspec.json.encode, record))
+        )
 
     def answer(self, record: AnswerRecord) -> None:
         """Record an answer of the tracker."""
         if self._filter.keeps("answer", "accepted", record.host_ns):
-            self._queue.put(QueueEntry("answer", record.host_ns, 0, partial(msgspec.json.encode, record)))
+            self._queue.put(
+                QueueEntry("answer", record.host_ns, 0, partial(msgspec.json.encode, record))
+            )
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
@@ -363,14 +400,19 @@ class Ledger(Closing):
             self._file.note()
             if last:
                 self._writer.finish()
-            elif self._writer.size_bytes >= self._split.bytes or now_s - self._begun_s >= self._split.seconds:
+            elif (
+                self._writer.size_bytes >= self._split.bytes
+                or now_s - self._begun_s >= self._split.seconds
+            ):
                 self._go_on_in_another()
         except Exception as error:  # no error ends the ledger or the run
             self._failed(error)
             if last:
                 self._lose("packet", self._writer.drop())
         self._alive_s = time.monotonic()
-        self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again")
+        self._notices.end(
+            "ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again"
+        )
 
     def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
         self._writer.add(key, log_time_ns(time_ns), data, sequence)
@@ -398,22 +440,31 @@ class Ledger(Closing):
         before, lost, part = part_path(self.path, self._part), self._writer.written, self._part
         self.failure = f"{before} was {harm} while it was written"
         self._part = 0
-        names = (self._asked.with_name(f"{self._asked.stem}.next{k}{self._asked.suffix}") for k in itertools.count(1))
+        names = (
+            self._asked.with_name(f"{self._asked.stem}.next{k}{self._asked.suffix}")
+            for k in itertools.count(1)
+        )
         path = next(name for name in names if not os.path.lexists(name))
         try:
             file, writer = self._begin(path, overwrite=False)
         except InputError as error:
             self._part = part
             self._lost += lost if last else 0
-            self._say_lost(f"{self.failure}, and no other can be begun: {error}; the display goes on")
+            self._say_lost(
+                f"{self.failure}, and no other can be begun: {error}; the display goes on"
+            )
             return
-        self._say_lost(f"{self.failure}: {lost} messages in it may be lost; the ledger goes on in {path}")
+        self._say_lost(
+            f"{self.failure}: {lost} messages in it may be lost; the ledger goes on in {path}"
+        )
         self._lost += lost
         writer.take_over(self._writer)
         old, self._file, self._writer, self.path = self._file, file, writer, path
         self._begun_s, self._moved = time.monotonic(), False
         for record in self.standing():
-            kind, number = ("fault", record.number) if isinstance(record, FaultRecord) else ("event", 0)
+            kind, number = (
+                ("fault", record.number) if isinstance(record, FaultRecord) else ("event", 0)
+            )
             self._add(kind, record.host_ns, msgspec.json.encode(record), number)
         old.close()
 
@@ -432,11 +483,16 @@ class Ledger(Closing):
         except FileNotFoundError:
             self._moved = True
         if self._moved:
-            self._notices.tell("ledger-moved", f"{place}: was moved while it is written; the ledger goes on where it is now")
+            self._notices.tell(
+                "ledger-moved",
+                f"{place}: was moved while it is written; the ledger goes on where it is now",
+            )
 
     def _lose(self, kind: Kind | str, number: int) -> None:
         self._lost += number
-        self._filter.count(kind if kind in {"frame", "packet", "answer"} else "event", NO_ROOM, number)
+        self._filter.count(
+            kind if kind in {"frame", "packet", "answer"} else "event", NO_ROOM, number
+        )
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)
@@ -450,7 +506,9 @@ class Ledger(Closing):
             self._notices.end("disk-low", "disk-well", left)
         self._thin = free < min(FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE * total)
         if self._thin:
-            self._notices.begin("ledger-thin", f"{left}: frames are no longer recorded, packets still are")
+            self._notices.begin(
+                "ledger-thin", f"{left}: frames are no longer recorded, packets still are"
+            )
         else:
             self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
 
@@ -466,11 +524,17 @@ class Ledger(Closing):
                 if self._writer.pending_bytes > MAX_CHUNK_BYTES:
                     self._lose("packet", self._writer.drop())
                 return
-        self._notices.end("ledger-failed", "ledger-back", f"{self.path}: the ledger can be written again")
+        self._notices.end(
+            "ledger-failed", "ledger-back", f"{self.path}: the ledger can be written again"
+        )
 
     def _failed(self, error: Exception) -> None:
-        self.failure = str(getattr(error, "strerror", None) or f"{type(error).__name__} {error}".strip())
-        self._notices.begin("ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on")
+        self.failure = str(
+            getattr(error, "strerror", None) or f"{type(error).__name__} {error}".strip()
+        )
+        self._notices.begin(
+            "ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on"
+        )
 
     def _go_on_in_another(self) -> None:
         self._part += 1
@@ -479,7 +543,9 @@ class Ledger(Closing):
         except InputError as error:
             self._part -= 1
             self._begun_s = time.monotonic()  # so that it is not tried at each pass
-            self._notices.tell("ledger-split-failed", f"{error}; the ledger stays in its present file")
+            self._notices.tell(
+                "ledger-split-failed", f"{error}; the ledger stays in its present file"
+            )
             return
         try:
             self._writer.finish()
@@ -497,7 +563,9 @@ class Ledger(Closing):
         patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
         self._thread.join(patience_s)
         if self._thread.is_alive():  # it still owns the file, so nothing more can be done
-            self._failed(TimeoutError(f"the disk did not take its last messages within {patience_s:g} s"))
+            self._failed(
+                TimeoutError(f"the disk did not take its last messages within {patience_s:g} s")
+            )
             return
         self._probe.close()
 
@@ -506,7 +574,11 @@ class Ledger(Closing):
         only counted.
         """
         lost = self._lost + sum(self._queue.dropped.values())
-        told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
+        told: dict[str, str | int | None] = {
+            "path": str(self.path),
+            "failure": self.failure,
+            "unrecorded": lost,
+        }
         if self._counted:
             told["only_counted"] = self._counted
         if self._part:
@@ -522,7 +594,13 @@ TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
 
 def event_record(notice: Notice) -> EventRecord:
     """The ledger's record of an event."""
-    return EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who, since_ns=notice.since_ns)
+    return EventRecord(
+        host_ns=notice.host_ns,
+        kind=notice.kind,
+        detail=notice.detail,
+        who=notice.who,
+        since_ns=notice.since_ns,
+    )
 
 
 class LedgerSwitch:
@@ -553,7 +631,9 @@ class LedgerSwitch:
         """Why the newest ledger could not be written, else None."""
         return None if self.last is None else self.last.failure
 
-    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+    def packet(
+        self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None
+    ) -> None:
         """Record a packet; see `attitude.receiver.Watch`."""
         if (ledger := self.current) is not None:
             ledger.packet(host_ns, raw, sample, refusal)

@@ -22,7 +22,13 @@ from hilstar.attitude.logs.mcap_log import (
     read_messages,
     read_metadata,
 )
-from hilstar.attitude.wire.packet import MAX_PLACE_KM, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
+from hilstar.attitude.wire.packet import (
+    MAX_PLACE_KM,
+    MIN_PLACE_KM,
+    Refusal,
+    checked_sample,
+    rate_refusal,
+)
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, cannot_read, printable
@@ -34,7 +40,13 @@ from hilstar.server.bench.config.attitude import PACKET_SOURCES
 from hilstar.server.bench.frame import Bench
 from hilstar.server.pacer import Shown
 
-FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
+FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = (
+    "/frame",
+    "/process",
+    "/event",
+    "/not_kept",
+    "/fault",
+)
 ANSWER_TOPIC = "/answer"
 # What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame
 # "skipped" too.
@@ -93,8 +105,24 @@ class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
     fault_since_ns: tuple[AnyNs, ...] = ()
 
 
-_KINDS: dict[Any, str] = {float: "number", float | None: "number", str: "string", bool: "boolean"} | dict.fromkeys(
-    (int, int | None, HostNs, HostNs | None, AnyNs, AnyNs | None, Count, Count | None, Marker | None), "integer"
+_KINDS: dict[Any, str] = {
+    float: "number",
+    float | None: "number",
+    str: "string",
+    bool: "boolean",
+} | dict.fromkeys(
+    (
+        int,
+        int | None,
+        HostNs,
+        HostNs | None,
+        AnyNs,
+        AnyNs | None,
+        Count,
+        Count | None,
+        Marker | None,
+    ),
+    "integer",
 )
 
 
@@ -103,7 +131,10 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
     `attitude.logs.mcap_log.ATTITUDE_SCHEMA`).
     """
     array = {"type": "array", "items": {"type": "number"}}
-    fields = {f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array for f in msgspec.structs.fields(record)}
+    fields = {
+        f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array
+        for f in msgspec.structs.fields(record)
+    }
     if "centroids" in fields:
         fields["centroids"] = {"type": "array", "items": {"type": "array"}}
     return msgspec.json.encode({"title": title, "type": "object", "properties": fields})
@@ -211,7 +242,15 @@ class PacketForm(msgspec.Struct, gc=False):
     receive_ns: AnyNs | None = None
 
 
-RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord | FaultRecord | AnswerRecord
+RunRecord = (
+    FrameRecord
+    | ProcessRecord
+    | PacketForm
+    | CountRecord
+    | EventRecord
+    | FaultRecord
+    | AnswerRecord
+)
 
 
 # The topic and the record of each kind that a ledger is given, beside packets.
@@ -223,7 +262,9 @@ RECORDS: dict[str, tuple[str, type[msgspec.Struct]]] = {
     "fault": (FAULT_TOPIC, FaultRecord),
     "answer": (ANSWER_TOPIC, AnswerRecord),
 }
-_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {topic: msgspec.json.Decoder(record) for topic, record in RECORDS.values()}
+_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
+    topic: msgspec.json.Decoder(record) for topic, record in RECORDS.values()
+}
 _DECODERS[ATTITUDE_TOPIC] = msgspec.json.Decoder(PacketForm)
 
 
@@ -233,7 +274,16 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
     so far, and `below_step` the stars in view that are too faint for the monitor.
     """
     attitude, drawn = shown.attitude, shown.drawn
-    names = ("t_ns", "draw_ns", "predicted_swap_ns", "swap_ns", "timestamp_source", "stale", "missed_before", "marker")
+    names = (
+        "t_ns",
+        "draw_ns",
+        "predicted_swap_ns",
+        "swap_ns",
+        "timestamp_source",
+        "stale",
+        "missed_before",
+        "marker",
+    )
     record = FrameRecord(
         frame=shown.number,
         light_ns=light_ns,
@@ -252,7 +302,10 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
     record.rate = _numbers(drawn.rate_cam_rad_s)
     if attitude is not None:
         record.q = _numbers(attitude.q_icrs_to_cam)
-        record.velocity_km_s, record.place_km = _numbers(attitude.velocity_km_s), _numbers(attitude.place_km)
+        record.velocity_km_s, record.place_km = (
+            _numbers(attitude.velocity_km_s),
+            _numbers(attitude.place_km),
+        )
         record.attitude_sequence = attitude.sequence
         record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
         record.receive_ns = attitude.received_ns
@@ -274,7 +327,9 @@ def answer_record(judged: Judged) -> AnswerRecord:
         mode=printable(answer.mode)[:MAX_REASON_CHARACTERS],
         stars=answer.star_count,
         rms_arcsec=answer.rms_arcsec,
-        centroids=tuple((star.x_px, star.y_px, star.dn, star.hip) for star in answer.centroids[:MAX_CENTROIDS]),
+        centroids=tuple(
+            (star.x_px, star.y_px, star.dn, star.hip) for star in answer.centroids[:MAX_CENTROIDS]
+        ),
         verdict=judged.verdict,
         middle_ns=_within_64_bits(judged.middle_ns),
     )
@@ -361,7 +416,10 @@ def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str
             return refusal.detail
     if math.hypot(*(record.velocity_km_s or ())) > MAX_SPEED_KM_S:
         return f"a velocity over {MAX_SPEED_KM_S:g} km/s"
-    if record.place_km is not None and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM:
+    if (
+        record.place_km is not None
+        and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM
+    ):
         return f"a place beyond {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km"
     return ""
 
@@ -381,7 +439,14 @@ def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
     try:
         for topics, messages in read_chunks(path):
             if topics is not last:
-                last, decode = topics, {k: _DECODERS[topic].decode for k, topic in topics.items() if topic in _DECODERS}
+                last, decode = (
+                    topics,
+                    {
+                        k: _DECODERS[topic].decode
+                        for k, topic in topics.items()
+                        if topic in _DECODERS
+                    },
+                )
             block += [decode[channel](data) for channel, data in messages if channel in decode]
             while len(block) >= size:
                 yield _checked(block[:size])
@@ -408,14 +473,22 @@ def _checked(records: list[RunRecord]) -> list[RunRecord]:
 
 
 def _first_fault(path: Path, error: Exception) -> InputError:
-    every = ((topics[channel], data) for topics, messages in read_chunks(path, tell=False) for channel, data in messages)
+    every = (
+        (topics[channel], data)
+        for topics, messages in read_chunks(path, tell=False)
+        for channel, data in messages
+    )
     for number, (topic, data) in enumerate(every, start=1):
         which = f"{number}, of {topic}"
         try:
             record = _DECODERS[topic].decode(data) if topic in _DECODERS else None
         except NOT_JSON as wrong:
             return _not_ours(path, f"{which},", wrong)
-        if isinstance(record, FrameRecord) and record.q is not None and abs(math.hypot(*record.q) - 1.0) > NORM_TOLERANCE:
+        if (
+            isinstance(record, FrameRecord)
+            and record.q is not None
+            and abs(math.hypot(*record.q) - 1.0) > NORM_TOLERANCE
+        ):
             return InputError(f"{path}: message {which}: {wrong_in_frame(record)}")
     return _not_ours(path, "", error)
 
@@ -429,13 +502,19 @@ class PacketTally:
     def add(self, record: RunRecord) -> None:
         """Add a recorded packet, or a count of packets."""
         if isinstance(record, PacketForm):
-            self.count("accepted" if record.accepted else (record.reason or "format").split(":")[0], 1)
+            self.count(
+                "accepted" if record.accepted else (record.reason or "format").split(":")[0], 1
+            )
         elif isinstance(record, CountRecord) and record.kind == "packet":
             self.count(record.reason, record.count)
 
     def count(self, reason: str, number: int) -> None:
         """Add packets of one kind."""
-        key = reason[:MAX_REASON_CHARACTERS] if len(self.counts) < MAX_REASONS or reason in self.counts else "others"
+        key = (
+            reason[:MAX_REASON_CHARACTERS]
+            if len(self.counts) < MAX_REASONS or reason in self.counts
+            else "others"
+        )
         self.counts[key] = self.counts.get(key, 0) + number
 
 
@@ -478,6 +557,8 @@ def config_of(head: dict[str, str]) -> BenchConfig | None:
     read.
     """
     try:
-        return msgspec.convert(parse_toml(Path("the ledger's head"), head.get("bench_text", "")), BenchConfig)
+        return msgspec.convert(
+            parse_toml(Path("the ledger's head"), head.get("bench_text", "")), BenchConfig
+        )
     except (InputError, msgspec.ValidationError, RecursionError):
         return None

@@ -88,7 +88,11 @@ class SpanTable:
 
     def __init__(self, columns: int, capacity: int = SPANS) -> None:
         shape = (capacity, columns)
-        self._low, self._high, self._sum = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
+        self._low, self._high, self._sum = (
+            np.full(shape, np.inf),
+            np.full(shape, -np.inf),
+            np.zeros(shape),
+        )
         self._begin = np.zeros(capacity)
         self._used = self._in_last = 0
         self.length = 1
@@ -102,7 +106,11 @@ class SpanTable:
                     continue
                 self._begin[self._used] = rows[0, 0]
                 self._used, self._in_last = self._used + 1, 0
-            whole = 0 if self._in_last else min(len(rows) // self.length, len(self._begin) - self._used + 1)
+            whole = (
+                0
+                if self._in_last
+                else min(len(rows) // self.length, len(self._begin) - self._used + 1)
+            )
             count = max(whole, 1) * self.length - self._in_last
             self._add(rows[:count], max(whole, 1))
             rows = rows[count:]
@@ -132,7 +140,9 @@ class SpanTable:
 
     def column(self, number: int) -> SpanColumn:
         """One column over all spans."""
-        low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
+        low, high, total = (
+            table[: self._used, number] for table in (self._low, self._high, self._sum)
+        )
         some = np.isfinite(low)
         return SpanColumn(np.where(some, low, np.nan), np.where(some, high, np.nan), total)
 
@@ -168,7 +178,9 @@ class TimeBins:
         """
         if self._first_ns is None:
             return np.zeros(0), np.zeros((0, self._counts.shape[1]))
-        begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(self._used, dtype=np.float64) * (self.width_ns / NS_PER_S)
+        begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(
+            self._used, dtype=np.float64
+        ) * (self.width_ns / NS_PER_S)
         return begin_s, self._counts[: self._used].astype(np.float64) * (NS_PER_S / self.width_ns)
 
 
@@ -211,16 +223,32 @@ class Keyframes:
 
 # Times of a frame, ms, and the keys that a report has them under.
 METRICS = {
-    **{"interval": "interval_ms", "late": "swap_late_ms", "draw": "draw_to_swap_ms", "age": "attitude_age_ms"},
+    **{
+        "interval": "interval_ms",
+        "late": "swap_late_ms",
+        "draw": "draw_to_swap_ms",
+        "age": "attitude_age_ms",
+    },
     **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
 }
-HEAD = ("bench_sha256", "calibration", "calibration_sha256", "certificate", "gl_renderer", "gl_version", "render_path")
+HEAD = (
+    "bench_sha256",
+    "calibration",
+    "calibration_sha256",
+    "certificate",
+    "gl_renderer",
+    "gl_version",
+    "render_path",
+)
 FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames", "wrong_frames")
 COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
 # The columns of the spans: METRICS, then these.
 COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
 ACCEPTED, REFUSED = range(2)
-NUMBERS, WORDS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"), ("operator", "hidden")
+NUMBERS, WORDS = (
+    ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"),
+    ("operator", "hidden"),
+)
 
 
 @dataclass(slots=True)
@@ -260,10 +288,14 @@ class RunFigures:
     # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an
     # attitude.
     counted: Counter[str] = field(default_factory=Counter)
-    most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
+    most: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0)
+    )
     last: FrameRecord | None = None
     first_swap_ns: int = 0
-    spreads: dict[str, RunningStatistics] = field(default_factory=lambda: {name: RunningStatistics() for name in METRICS})
+    spreads: dict[str, RunningStatistics] = field(
+        default_factory=lambda: {name: RunningStatistics() for name in METRICS}
+    )
     samples: ThinnedRows = field(default_factory=lambda: ThinnedRows(len(METRICS)))
     spans: SpanTable = field(default_factory=lambda: SpanTable(len(METRICS) + len(COUNTS)))
     # run_s, t_s, q, turned about x, y, z (rad)
@@ -334,13 +366,19 @@ class RunFigures:
         self.counted["wrong_frames"] += int(found.sum())
         self.counted["right_frames"] -= int((found & newest.plain).sum())
 
-    def _add_one(self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord) -> None:
+    def _add_one(
+        self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord
+    ) -> None:
         if isinstance(record, ProcessRecord):
             first = self.first_process = self.first_process or record
             if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
                 self.warm = record
             self.last_process = record
-            self.process.add(np.array([(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]))
+            self.process.add(
+                np.array(
+                    [(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]
+                )
+            )
         elif isinstance(record, EventRecord):
             self._add_event(record)
         elif isinstance(record, FaultRecord):
@@ -349,7 +387,9 @@ class RunFigures:
         elif isinstance(record, AnswerRecord):
             self.answers.answer(record)
             if record.verdict == "right" and record.residual_arcsec is not None:
-                self.residuals.add(np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)]))
+                self.residuals.add(
+                    np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)])
+                )
         elif record.kind == "pulse" and record.reason in PULSES:
             self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
             self.pulses[record.reason] += record.count
@@ -365,7 +405,9 @@ class RunFigures:
             self.events[kind] = self.events.get(kind, 0) + 1
         record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
         self.wrong_sky.see(kind, record.detail, record.host_ns, record.since_ns)
-        (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
+        (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(
+            record
+        )
 
     def _add_frames(self, frames: list[FrameRecord]) -> None:
         before, self.last = self.last, frames[-1]
@@ -379,7 +421,11 @@ class RunFigures:
         wrong = _covered(self.wrong_sky, swap_ns)
         masks = dict(zip(FAULTS, (stale > 0, blank, *words, wrong), strict=True))
         self._newest.add(swap_ns, ~np.any([*masks.values()][:-1], axis=0), wrong)
-        masks |= {"right_frames": ~np.any([*masks.values()], axis=0), "late": (stale > 0) & ~blank, "capped_frames": capped > 0}
+        masks |= {
+            "right_frames": ~np.any([*masks.values()], axis=0),
+            "late": (stale > 0) & ~blank,
+            "capped_frames": capped > 0,
+        }
         for name, mask in masks.items():
             self.counted[name] += int(mask.sum())
         for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
@@ -390,32 +436,46 @@ class RunFigures:
         self.samples.add(times)
         run_s = (swap_ns - self.first_swap_ns) / NS_PER_S
         self.spans.add(np.column_stack([run_s, times, missed, stars, clipped, below, stale, blank]))
-        self.keyframes.add(frames, {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars})
+        self.keyframes.add(
+            frames,
+            {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars},
+        )
         seen = np.flatnonzero(~blank)
         if not len(seen):
             return
         q, t_ns = attitudes_of(frames), _whole(frames, "t_ns")[0][seen]
         self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
         last_q = q[0] if self._q is None else self._q
-        turned = np.cumsum(np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0)
+        turned = np.cumsum(
+            np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0
+        )
         self._q, self._turned = q[-1], turned[-1]
-        self.path.add(np.column_stack([run_s[seen], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]]))
+        self.path.add(
+            np.column_stack([run_s[seen], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]])
+        )
 
 
 def _times_ms(
-    frames: list[FrameRecord], swap_ns: npt.NDArray[np.int64], before: FrameRecord | None, after_missed: BoolArray
+    frames: list[FrameRecord],
+    swap_ns: npt.NDArray[np.int64],
+    before: FrameRecord | None,
+    after_missed: BoolArray,
 ) -> FloatArray:
     """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames
     does not count.
     """
-    intervals_ns = np.diff(swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns).astype(np.float64)
+    intervals_ns = np.diff(
+        swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns
+    ).astype(np.float64)
     intervals_ns[after_missed] = np.nan
     if before is None:
         intervals_ns[0] = np.nan
     times_ns = [intervals_ns]
     for name in ("predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns"):
         ns, known = _whole(frames, name)
-        times_ns.append(np.where(known, ns if name in {"age_ns", "prediction_ns"} else swap_ns - ns, np.nan))
+        times_ns.append(
+            np.where(known, ns if name in {"age_ns", "prediction_ns"} else swap_ns - ns, np.nan)
+        )
     return np.column_stack(times_ns) / NS_PER_MS
 
 
@@ -439,7 +499,11 @@ def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
     z = -bw * az - bx * ay + by * ax + bz * aw
     sine = np.sqrt(x * x + y * y + z * z)
     small = sine <= SMALL_RAD
-    scale = -2.0 * np.copysign(1.0, w) * np.where(small, 1.0, np.arctan2(sine, np.abs(w)) / np.where(small, 1.0, sine))
+    scale = (
+        -2.0
+        * np.copysign(1.0, w)
+        * np.where(small, 1.0, np.arctan2(sine, np.abs(w)) / np.where(small, 1.0, sine))
+    )
     return np.asarray(scale[:, None] * np.stack([x, y, z], axis=1))
 
 
@@ -511,18 +575,26 @@ def summarise(run: RunFigures) -> RunReport:
     config, last = config_of(run.head), run.last
     refresh_hz = None if config is None else config.monitor.refresh_hz
     times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
-    found: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {name: run.head.get(name) for name in HEAD}
-    found |= {name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")}
+    found: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {
+        name: run.head.get(name) for name in HEAD
+    }
+    found |= {
+        name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")
+    }
     return RunReport(
         **(found | times | run.most),
         missed_frames=0 if last is None else last.missed,
         timestamp_source="" if last is None else last.timestamp_source,
         refresh_hz=refresh_hz,
         pacing_jitter_ms=run.spreads["interval"].deviation,
-        attitude_age_frames=None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3),
+        attitude_age_frames=None
+        if refresh_hz is None
+        else times["attitude_age_ms"].times(refresh_hz / 1e3),
         packets=run.packets.counts,
         lost_packets=run.lost,
-        wrong_sky=run.wrong_sky.total(run.first_swap_ns, run.first_swap_ns if last is None else last.swap_ns),
+        wrong_sky=run.wrong_sky.total(
+            run.first_swap_ns, run.first_swap_ns if last is None else last.swap_ns
+        ),
         answers=run.answers.report(run.first_swap_ns) or UNSET,
     )
 
@@ -533,7 +605,10 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
 
     def three(figure: Percentiles | None, unit: str = "ms") -> str:
         values = (None, None, None) if figure is None else (figure.p50, figure.p99, figure.max)
-        return " / ".join("-" if v is None else f"{v:.2f}" for v in values) + f" {unit} (p50 / p99 / max)"
+        return (
+            " / ".join("-" if v is None else f"{v:.2f}" for v in values)
+            + f" {unit} (p50 / p99 / max)"
+        )
 
     def number(value: float | None, unit: str) -> str:
         return "-" if value is None else f"{value:.2f} {unit}"
@@ -545,25 +620,46 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
     frames = f"{found.frames} in {found.duration_s:.1f} s, {found.missed_frames} missed"
     return [
         ("frames", f"{frames}, {found.stale_frames} stale, {found.blank_frames} blank"),
-        ("not the plain sky", f"{found.operator_frames} by an operator's keys, {found.hidden_frames} hidden"),
+        (
+            "not the plain sky",
+            f"{found.operator_frames} by an operator's keys, {found.hidden_frames} hidden",
+        ),
         ("coarser paths", f"{found.capped_frames} frames, because the turn was too fast"),
-        ("time stamps", f"{found.timestamp_source}; the bench file's refresh rate is {number(found.refresh_hz, 'Hz')}"),
-        ("pacing jitter", f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval between swaps)"),
+        (
+            "time stamps",
+            f"{found.timestamp_source}; the bench file's refresh rate is {number(found.refresh_hz, 'Hz')}",
+        ),
+        (
+            "pacing jitter",
+            f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval between swaps)",
+        ),
         ("interval", three(found.interval_ms)),
         ("swap later than predicted", three(found.swap_late_ms)),
         ("start of drawing to swap", three(found.draw_to_swap_ms)),
-        ("age of the attitude at light", f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}"),
+        (
+            "age of the attitude at light",
+            f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}",
+        ),
         ("predicted past the last packet", three(found.prediction_ms)),
         ("packet to swap", three(found.packet_to_swap_ms)),
         *[(one.kind, f"{one.seconds:.1f} s: {one.text}") for one in found.wrong_sky.conditions],
-        ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused, {found.lost_packets} lost"),
+        (
+            "packets",
+            f"{found.packets.get('accepted', 0)} accepted, {refused} refused, {found.lost_packets} lost",
+        ),
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
         ("pulses", pulses),
-        ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
+        (
+            "stars",
+            f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint",
+        ),
         *answer_rows(found.answers or None),
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),
         ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
         *([("certificate", found.certificate)] if found.certificate else []),
-        ("renderer", f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}"),
+        (
+            "renderer",
+            f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}",
+        ),
     ]

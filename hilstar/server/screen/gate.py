@@ -70,7 +70,9 @@ class Timing:
 
 
 @contextmanager
-def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force: bool, timed: bool) -> Iterator[Screen]:
+def open_screen(
+    file: BenchFile, today: datetime.date, *, windowed: bool, force: bool, timed: bool
+) -> Iterator[Screen]:
     """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises
     InputError or MachineError.
 
@@ -93,18 +95,24 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
 
 
 @contextmanager
-def _bench_on(window: Window, file: BenchFile, found: MonitorCheck, *, timed: bool, force: bool) -> Iterator[Screen]:
+def _bench_on(
+    window: Window, file: BenchFile, found: MonitorCheck, *, timed: bool, force: bool
+) -> Iterator[Screen]:
     """The bench of a file in a window, past the gate."""
     with open_bench(file, window_context(), timed=timed, on_screen=True) as bench:
         wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
-            log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
+            log.warning(
+                "[render] gpu = %r is for headless frames; %s draws this window", wanted, draws
+            )
         screen = Screen(window, bench)
         screen.forced += found.told(log)
         bench.warm_up()
         pass_gate(screen, force)
         bench.output.update({} if screen.output is None else screen.output.fields())
-        bench.output.update({TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced})
+        bench.output.update(
+            {TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced}
+        )
         yield screen
 
 
@@ -118,7 +126,11 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     for number in range(GATE_FRAMES + 1):
         screen.present(number)
         swaps_ns.append(screen.swap())
-    timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, 0 if window.display is None else window.display.refresh_hz)
+    timing = timing_of(
+        np.diff(swaps_ns) / NS_PER_MS,
+        monitor,
+        0 if window.display is None else window.display.refresh_hz,
+    )
     timing = replace(timing, modes_hz=window.modes_hz)
     screen.keep_time(timing.period_ms, timing.paced_by_screen, swaps_ns[-1])
     if timing.paced_by_screen and window.gone is None:
@@ -129,7 +141,10 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
         screen.keep_ahead(timing.guard_ms, timing.queued)
     if not timing.paced_by_screen:
         ms = timing.period_ms
-        log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
+        log.warning(
+            "the display has no refresh of its own (swaps take %.2f ms): frames are paced by software",
+            ms,
+        )
     if window.gone is not None:
         raise MachineError(window.gone)
     screen.output = window.output
@@ -144,12 +159,21 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
     window, monitor = screen.window, screen.bench.config.monitor
     changed = screen.bench.renderer.changed_codes()
     if changed:
-        changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
-    told = () if screen.output is None else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
+        changed += (
+            "; switch dithering, colour transforms and antialiasing off in the display's driver"
+        )
+    told = (
+        ()
+        if screen.output is None
+        else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
+    )
     doubts = [finding.text for finding in told if not finding.refused]
     if window.others:
         others = f"the X screen has other displays, {', '.join(window.others)}: frames may be copied instead of flipped, or"
-        doubts.insert(0, f"{others} follow another's refresh; switch them off, or give this one an X screen of its own")
+        doubts.insert(
+            0,
+            f"{others} follow another's refresh; switch them off, or give this one an X screen of its own",
+        )
     for doubt in doubts:
         log.warning("%s", doubt)
     wrong = [finding.text for finding in told if finding.refused]
@@ -171,7 +195,9 @@ def burst_periods(screen: Screen, clock: HostClock) -> float:
     took = []
     for _ in range(BURSTS):
         period_ns = screen.clock.period_ns
-        begin_ns = round(screen.clock.next_after(clock.now_ns() + DRAINED * period_ns) + BURST_AT * period_ns)
+        begin_ns = round(
+            screen.clock.next_after(clock.now_ns() + DRAINED * period_ns) + BURST_AT * period_ns
+        )
         clock.wait_until(begin_ns, threading.Event())
         for number in range(BURST):
             screen.present(number)
@@ -231,8 +257,18 @@ def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timi
     on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
     by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
     dropped = periods_ms > DROPPED * wanted_ms
-    error_ms = ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5 if not dropped.all() else 0.0
-    return Timing(period_ms, int(dropped.sum()), by_screen, waits=by_screen or not known_hz, period_error_ms=error_ms)
+    error_ms = (
+        ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5
+        if not dropped.all()
+        else 0.0
+    )
+    return Timing(
+        period_ms,
+        int(dropped.sum()),
+        by_screen,
+        waits=by_screen or not known_hz,
+        period_error_ms=error_ms,
+    )
 
 
 def size_fault(window: Window, monitor: Monitor) -> str:
@@ -293,9 +329,7 @@ def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
     if timing.dropped > MAX_DROPPED:
         yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"
     if timing.variable:
-        ways = (
-            'Option "VariableRefresh" "false", adaptive_sync=false (Mesa), __GL_VRR_ALLOWED=0 (NVIDIA), or the monitor\'s menu'
-        )
+        ways = 'Option "VariableRefresh" "false", adaptive_sync=false (Mesa), __GL_VRR_ALLOWED=0 (NVIDIA), or the monitor\'s menu'
         yield f"the display has a variable refresh: it shows a frame when it comes; switch that off ({ways})"
     if timing.queued:
         held = f"{timing.queued} finished frame{'s' * (timing.queued > 1)}"

@@ -125,7 +125,9 @@ class DrawBudget:
         if len(self._late_leads_ns) < self.SLOW:
             return False
         before_ns = self.guard_ns
-        self.guard_ns = min(max(before_ns, self.MORE * sorted(self._late_leads_ns)[1]), self._period_ns / 2)
+        self.guard_ns = min(
+            max(before_ns, self.MORE * sorted(self._late_leads_ns)[1]), self._period_ns / 2
+        )
         self._late_leads_ns.clear()
         return self.guard_ns > before_ns
 
@@ -163,7 +165,9 @@ class Screen:
         self.output: OutputState | None = None
         self.forced: list[str] = []
         self.aids = Aids()
-        self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
+        self.swap_to_light_ns = round(
+            (bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS
+        )
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())
         self._quit = False
         view = ScreenView(
@@ -181,7 +185,9 @@ class Screen:
         """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen
         keeps time.
         """
-        period_ns = period_ms * NS_PER_MS if by_screen else NS_PER_S / self.bench.config.monitor.refresh_hz
+        period_ns = (
+            period_ms * NS_PER_MS if by_screen else NS_PER_S / self.bench.config.monitor.refresh_hz
+        )
         self.clock = SwapClock(swap_ns, period_ns, by_screen)
         self.budget = DrawBudget(period_ns)
         self.queued = 0
@@ -202,7 +208,9 @@ class Screen:
     @property
     def timestamp_source(self) -> str:
         """Where the times of swaps come from, and who paces them."""
-        return self.window.timestamp_source + ("" if self.clock.paced_by_screen else ", software pacing")
+        return self.window.timestamp_source + (
+            "" if self.clock.paced_by_screen else ", software pacing"
+        )
 
     def present(self, number: int) -> int | None:
         """Draw the bench's last frame on the back buffer; the photodiode square's light in frame
@@ -212,7 +220,11 @@ class Screen:
         white = 2**monitor.bits - 1
         side_px = monitor.photodiode_px
         marker = marker_light(number, monitor.photodiode) if side_px else None
-        self._backend.present(self.aids.overlay, round(self.aids.patch_share * white), (side_px, white * (marker or 0)))
+        self._backend.present(
+            self.aids.overlay,
+            round(self.aids.patch_share * white),
+            (side_px, white * (marker or 0)),
+        )
         return marker
 
     def swap(self, timed: bool = True) -> int:
@@ -243,7 +255,11 @@ class DisplayPacer(Pacer):
     moves_stars = True
 
     def __init__(
-        self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK, requests: SwitchRequests | None = None
+        self,
+        screen: Screen,
+        notices: Notices,
+        clock: HostClock = HOST_CLOCK,
+        requests: SwitchRequests | None = None,
     ) -> None:
         operator = Operator(screen.aids, notices, lambda: screen.window.hidden, requests)
         super().__init__(screen.clock.period_ns, clock, operator)
@@ -256,8 +272,16 @@ class DisplayPacer(Pacer):
         due_ns = swaps.next_after(self.clock.now_ns() + budget.ns)
         while True:
             begin_ns = round(due_ns - budget.ns)
-            yield Moment(slot, begin_ns, due_ns, swap_ns=due_ns, light_ns=due_ns + self._screen.swap_to_light_ns)
-            following_ns = swaps.next_after(max(self.clock.now_ns() + budget.min_ns, due_ns + swaps.period_ns / 2))
+            yield Moment(
+                slot,
+                begin_ns,
+                due_ns,
+                swap_ns=due_ns,
+                light_ns=due_ns + self._screen.swap_to_light_ns,
+            )
+            following_ns = swaps.next_after(
+                max(self.clock.now_ns() + budget.min_ns, due_ns + swaps.period_ns / 2)
+            )
             slot += max(1, round((following_ns - due_ns) / swaps.period_ns))
             due_ns = following_ns
 
@@ -266,10 +290,15 @@ class DisplayPacer(Pacer):
         """Run this thread at real-time priority where that is allowed."""
         with steady_loop() as self.scheduling:
             if self.scheduling.startswith("normal"):
-                log.warning("the frame loop runs at normal priority (%s)", self.scheduling.removeprefix("normal: "))
+                log.warning(
+                    "the frame loop runs at normal priority (%s)",
+                    self.scheduling.removeprefix("normal: "),
+                )
             yield
 
-    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
+    def show(
+        self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]
+    ) -> Presented:
         """Put the frame on the screen at its moment."""
         enter("present")
         marker = self._screen.present(number)
@@ -280,9 +309,16 @@ class DisplayPacer(Pacer):
         enter("swap")
         swap_ns = self._screen.swap()
         due_ns = moment.swap_ns
-        if self._screen.clock.paced_by_screen and due_ns is not None and budget.add_flip(due_ns - ready_ns, swap_ns - due_ns):
+        if (
+            self._screen.clock.paced_by_screen
+            and due_ns is not None
+            and budget.add_flip(due_ns - ready_ns, swap_ns - due_ns)
+        ):
             guard_ms = budget.guard_ns / NS_PER_MS
-            self._notices.tell("guard-raised", f"the display's driver flips late: frames are ready {guard_ms:.2f} ms before")
+            self._notices.tell(
+                "guard-raised",
+                f"the display's driver flips late: frames are ready {guard_ms:.2f} ms before",
+            )
         self._look_at_ramp(swap_ns)
         self._end_with_window()
         return Presented(swap_ns, self._screen.timestamp_source, marker)
@@ -313,11 +349,21 @@ class DisplayPacer(Pacer):
         """Where the times of swaps come from, scheduling, swaps, how long the sky was changed or
         hidden, and the output.
         """
-        named: dict[str, Any] = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
-        named |= {"guard_ms": self._screen.budget.guard_ns / NS_PER_MS, "queued_frames": self._screen.queued}
+        named: dict[str, Any] = {
+            "timestamp_source": self._screen.timestamp_source,
+            "scheduling": self.scheduling,
+        }
+        named |= {
+            "guard_ms": self._screen.budget.guard_ns / NS_PER_MS,
+            "queued_frames": self._screen.queued,
+        }
         named |= swaps | self.operator.summary()
         named["gamma"] = {"frames": self._gamma_frames, "s": self._gamma_ns / NS_PER_S}
         shown = self._screen.window.presented
         output = self._screen.output
-        named |= {"presented": presented_as(shown), "presented_frames": shown, "forced": self._screen.forced}
+        named |= {
+            "presented": presented_as(shown),
+            "presented_frames": shown,
+            "forced": self._screen.forced,
+        }
         return named | {"output": output and output.fields()}

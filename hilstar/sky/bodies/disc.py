@@ -67,7 +67,12 @@ RADII_KM = {
 # Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see:
 # the same source
 POLAR_RADII_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
-POLES_DEG = {"Jupiter": (268.057, 64.495), "Saturn": (40.589, 83.537), "Uranus": (257.311, -15.175), "Neptune": (299.36, 43.46)}
+POLES_DEG = {
+    "Jupiter": (268.057, 64.495),
+    "Saturn": (40.589, 83.537),
+    "Uranus": (257.311, -15.175),
+    "Neptune": (299.36, 43.46),
+}
 LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
 NORTH = np.array([0.0, 0.0, 1.0])
 
@@ -122,7 +127,11 @@ class Disc:
     @cached_property
     def distance_radii(self) -> float:
         """The distance of the centre in the axes of `to_sphere`."""
-        return float(np.linalg.norm(self.to_sphere @ self.direction)) * self.distance_km / self.equator_km
+        return (
+            float(np.linalg.norm(self.to_sphere @ self.direction))
+            * self.distance_km
+            / self.equator_km
+        )
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
@@ -146,7 +155,9 @@ class Disc:
         """The optical depth along a ray that touches the surface, 0 without air (Chapman's
         limit).
         """
-        return 0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
+        return (
+            0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
+        )
 
     def limb(self, count: int, radii: float = 1.0) -> FloatArray:
         """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all
@@ -154,7 +165,9 @@ class Disc:
         """
         sine = min(1.0, radii / self.distance_radii)
         turn = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
-        ring = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1)
+        ring = np.stack(
+            [sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1
+        )
         seen = ring @ np.linalg.inv(self.to_sphere).T
         return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
 
@@ -182,7 +195,9 @@ class Disc:
         that lead away.
         """
         across = np.hypot(seen[:, 0], seen[:, 1])
-        return np.where(seen[:, 2] > 0, self.distance_radii * across / np.linalg.norm(seen, axis=1), np.inf)
+        return np.where(
+            seen[:, 2] > 0, self.distance_radii * across / np.linalg.norm(seen, axis=1), np.inf
+        )
 
     def radiance(self, directions: FloatArray) -> FloatArray:
         """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0
@@ -194,7 +209,9 @@ class Disc:
         ray = seen[on] / np.linalg.norm(seen[on], axis=1, keepdims=True)
         squared = ray[:, 0] ** 2 + ray[:, 1] ** 2
         closest = self.distance_radii * np.column_stack((ray[:, :2] * ray[:, 2:], -squared))
-        place = closest - np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))[:, None] * ray
+        place = (
+            closest - np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))[:, None] * ray
+        )
         light = np.zeros(len(directions))
         light[on] = self.normal_e_per_s_sr * self._shaded(place, seen[on])
         return light
@@ -283,7 +300,10 @@ class Disc:
         node, weight = gauss_legendre(nodes)
         top = np.arccos(1 / self.distance_radii)
         # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
-        latitude, stretch = top * np.sin(node * np.pi / 2), top * np.cos(node * np.pi / 2) * np.pi / 2
+        latitude, stretch = (
+            top * np.sin(node * np.pi / 2),
+            top * np.cos(node * np.pi / 2) * np.pi / 2,
+        )
         reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
@@ -293,7 +313,10 @@ class Disc:
         half = (reach - first) / 2
         longitude = first[:, None] + half[:, None] * (node + 1)
         area = (weight * stretch * np.cos(latitude) * half)[:, None] * weight
-        cosine, sine = np.cos(latitude)[:, None], np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
+        cosine, sine = (
+            np.cos(latitude)[:, None],
+            np.broadcast_to(np.sin(latitude)[:, None], longitude.shape),
+        )
         place = np.stack([cosine * np.sin(longitude), sine, -cosine * np.cos(longitude)], axis=-1)
         return place.reshape(-1, 3), area.ravel()
 
@@ -338,10 +361,14 @@ def apparent_cone(seen_km: FloatArray, velocity_km_s: FloatArray) -> tuple[Float
     beta = velocity_km_s / LIGHT_KM_S
     along = float(beta @ towards)
     middle = towards + math.cos(radius_rad) * (beta - along * towards)
-    return middle / np.linalg.norm(middle), EQUATOR_KM / math.sin(radius_rad - along * math.sin(radius_rad))
+    return middle / np.linalg.norm(middle), EQUATOR_KM / math.sin(
+        radius_rad - along * math.sin(radius_rad)
+    )
 
 
-def earth_disc(seen_km: FloatArray, from_sun_km: FloatArray, velocity_km_s: FloatArray, v0_e_per_s: float) -> Disc:
+def earth_disc(
+    seen_km: FloatArray, from_sun_km: FloatArray, velocity_km_s: FloatArray, v0_e_per_s: float
+) -> Disc:
     """The Earth's disc: `seen_km` and `velocity_km_s` as of `apparent_cone`, and the vector (3,)
     from the Sun to the Earth.
 
@@ -377,7 +404,9 @@ def _normal(sun_km: float, phase_deg: float, v0_e_per_s: float) -> float:
     # From 1 au, where a Lambert sphere's integral over its disc is a closed form
     far_km = KM_PER_AU * np.array([math.cos(phase), math.sin(phase), 0.0])
     rate = v0_e_per_s * flux_ratio(body_v_mag(EARTH, np.array([sun_km, 0.0, 0.0]), far_km, 2000.0))
-    return rate / (2 / 3 * (MEAN_KM / KM_PER_AU) ** 2 * (math.sin(phase) + (math.pi - phase) * math.cos(phase)))
+    return rate / (
+        2 / 3 * (MEAN_KM / KM_PER_AU) ** 2 * (math.sin(phase) + (math.pi - phase) * math.cos(phase))
+    )
 
 
 def pole(name: str) -> FloatArray:

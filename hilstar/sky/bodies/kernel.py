@@ -86,11 +86,15 @@ class Kernel:
     def __init__(self) -> None:
         found = importlib.util.find_spec("skyfield_data")
         if found is None or found.origin is None or importlib.util.find_spec("jplephem") is None:
-            raise MachineError(f"[sky.bodies] and [spacecraft] need an ephemeris of the Solar System; {INSTALL}")
+            raise MachineError(
+                f"[sky.bodies] and [spacecraft] need an ephemeris of the Solar System; {INSTALL}"
+            )
         from jplephem.spk import SPK
 
         spk = SPK.open(str(Path(found.origin).parent / "data" / "de421.bsp"))
-        self._segments: dict[tuple[int, int], Any] = {link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain}
+        self._segments: dict[tuple[int, int], Any] = {
+            link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain
+        }
         for segment in self._segments.values():
             # maps its numbers into memory, where they stay when the file is closed
             segment.compute(segment.start_jd)
@@ -98,7 +102,9 @@ class Kernel:
         sun = self._segments[CHAINS["Sun"][0]]
         self.first_jd, self.last_jd = float(sun.start_jd), float(sun.end_jd)
 
-    def places_km(self, chain: tuple[tuple[int, int], ...], whole: float, part: FloatArray) -> FloatArray:
+    def places_km(
+        self, chain: tuple[tuple[int, int], ...], whole: float, part: FloatArray
+    ) -> FloatArray:
         """Barycentric places (k, 3), ICRS axes, at the Julian dates (TDB) `whole` + `part` (k,)."""
         return np.asarray(sum(self._segments[link].compute(whole, part) for link in chain).T)
 
@@ -107,7 +113,9 @@ class Kernel:
         both = [self._segments[link].compute_and_differentiate(whole, part) for link in EARTH]
         return np.asarray(sum(p for p, _ in both).T), np.asarray(sum(v for _, v in both).T / DAY_S)
 
-    def seen_km(self, name: str, whole: float, part: FloatArray, earth_km: FloatArray) -> FloatArray:
+    def seen_km(
+        self, name: str, whole: float, part: FloatArray, earth_km: FloatArray
+    ) -> FloatArray:
         """Vectors (k, 3) from the Earth's centre to where a body was when the light that arrives
         now left it.
         """
@@ -140,7 +148,9 @@ def apparent_bodies(seen_km: FloatArray, view: Viewpoint) -> FloatArray:
     distance_km = float(np.linalg.norm(view.from_sun_km))
     outward = view.from_sun_km / distance_km
     from_sun = _unit(seen_km[1:] + view.from_sun_km)
-    directions[1:] = erfa.ld(SUN_MASSES, directions[1:], from_sun, outward, distance_km / KM_PER_AU, DEFLECTION_LIMIT)
+    directions[1:] = erfa.ld(
+        SUN_MASSES, directions[1:], from_sun, outward, distance_km / KM_PER_AU, DEFLECTION_LIMIT
+    )
     return aberrate(directions, view.velocity_km_s)
 
 

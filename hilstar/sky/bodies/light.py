@@ -72,11 +72,25 @@ ALBEDOS: dict[str, tuple[float, ...]] = {
     "Neptune": (0.578, 0.562, 0.442, 0.226, 0.072, 0.048),
 }
 MOON_NM = (350.0, 405.0, 441.6, 486.9, 549.1, 665.1, 745.3, 774.8, 865.3, 928.4, 1059.5)
-MOON_ALBEDO = (0.0205, 0.0283, 0.0290, 0.0325, 0.0380, 0.0480, 0.0499, 0.0531, 0.0563, 0.0560, 0.0634)
+MOON_ALBEDO = (
+    0.0205,
+    0.0283,
+    0.0290,
+    0.0325,
+    0.0380,
+    0.0480,
+    0.0499,
+    0.0531,
+    0.0563,
+    0.0560,
+    0.0634,
+)
 B_NM, V_NM = 438.0, 545.0
 
 
-def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float) -> float:
+def body_v_mag(
+    name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float
+) -> float:
     """V of a body by the vectors (3,) to it from the Sun and from the observer, ICRS axes; the
     Sun's by the second alone.
     """
@@ -88,11 +102,18 @@ def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: Float
     if name == "Moon":
         return moon_v_mag(sun_au, distance_au * KM_PER_AU, phase_deg)
     if name in _POLES:
-        sun_deg, observer_deg = (latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km))
+        sun_deg, observer_deg = (
+            latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km)
+        )
     # globe and rings (eq. 10); rings that are lit from the other side do not count
     if name == "Saturn":
         sine = float(np.sin(np.radians(np.sqrt(max(0.0, sun_deg * observer_deg)))))
-        mag = -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
+        mag = (
+            -8.914
+            - 1.825 * sine
+            + 0.026 * phase_deg
+            - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
+        )
     elif name == "Uranus":
         mag = URANUS_MAG + URANUS_PER_DEG * (abs(sun_deg) + abs(observer_deg)) / 2
     elif name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
@@ -123,14 +144,19 @@ def moon_v_mag(sun_au: float, distance_km: float, phase_deg: float) -> float:
 
 def latitude_deg(pole: FloatArray, towards_body: FloatArray) -> float:
     """The planetocentric latitude below the far end of a vector to the body, degrees."""
-    return float(np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1))))
+    return float(
+        np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1)))
+    )
 
 
 _POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}
 
 
 def bodies_electrons_per_s(
-    names: tuple[str, ...], model: electrons.BrightnessModel, optics: electrons.Optics, photometry: electrons.Photometry
+    names: tuple[str, ...],
+    model: electrons.BrightnessModel,
+    optics: electrons.Optics,
+    photometry: electrons.Photometry,
 ) -> FloatArray:
     """Electron rates of bodies of V = 0, shape (n,). Raises InputError as `tabulate_pickles`
     does.
@@ -147,14 +173,20 @@ def reflected(names: tuple[str, ...]) -> electrons.Library:
     lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
     flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # also without bodies
     colour = bodies_bv_mag(names)
-    unscaled = electrons.Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
+    unscaled = electrons.Library(
+        stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan)
+    )
     mean = electrons.band_mean(unscaled, load_curve("johnson-v", "johnson-v"))
-    return electrons.Library(stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag)
+    return electrons.Library(
+        stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag
+    )
 
 
 def bodies_bv_mag(names: tuple[str, ...]) -> FloatArray:
     """B-V of bodies (n,), by the Sun's and their albedos."""
-    blue, visual = (np.array([albedo(name, np.array([nm]))[0] for name in names]) for nm in (B_NM, V_NM))
+    blue, visual = (
+        np.array([albedo(name, np.array([nm]))[0] for name in names]) for nm in (B_NM, V_NM)
+    )
     return np.asarray(SUN_BV_MAG + magnitude(blue / visual))
 
 

@@ -33,7 +33,14 @@ from hilstar.sky.bodies.disc import (
     lunar_share,
     pole,
 )
-from hilstar.sky.bodies.kernel import DAY_S, Kernel, Viewpoint, apparent_bodies, apparent_stars, tdb_of_utc
+from hilstar.sky.bodies.kernel import (
+    DAY_S,
+    Kernel,
+    Viewpoint,
+    apparent_bodies,
+    apparent_stars,
+    tdb_of_utc,
+)
 from hilstar.sky.bodies.light import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
 from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, SkyAt
@@ -126,10 +133,21 @@ class MovingSky:
     """
 
     def __init__(
-        self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING, start_ns: int = 0, unix: bool = False
+        self,
+        kernel: Kernel,
+        orbit: Orbit,
+        utc_ns: int,
+        bodies: BodyLight = NOTHING,
+        start_ns: int = 0,
+        unix: bool = False,
     ) -> None:
         self.names = names = bodies.names
-        self._kernel, self._orbit, self._utc_ns, self._start_ns = kernel, orbit, utc_ns + start_ns, start_ns
+        self._kernel, self._orbit, self._utc_ns, self._start_ns = (
+            kernel,
+            orbit,
+            utc_ns + start_ns,
+            start_ns,
+        )
         self._bodies, self._unix = bodies, unix
         self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
@@ -140,9 +158,15 @@ class MovingSky:
         self._step_ns = round(orbit.step_s * NS_PER_S)
         self._span: Callable[[int], Span] = lru_cache(maxsize=2)(self._compute_span)
         self._node: Callable[[SkyMoment], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
-        self._light: Callable[[SkyMoment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
-        self._face: Callable[[SkyMoment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
-        self._circumstances: Callable[[int], Circumstances] = lru_cache(maxsize=2)(self._compute_circumstances)
+        self._light: Callable[[SkyMoment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(
+            self._compute_light
+        )
+        self._face: Callable[[SkyMoment, int], Disc] = lru_cache(maxsize=len(names) + 1)(
+            self._compute_face
+        )
+        self._circumstances: Callable[[int], Circumstances] = lru_cache(maxsize=2)(
+            self._compute_circumstances
+        )
         self.satellites: Satellites | None = None
         self.air: SiteAir | None = None  # over an observer on the ground
         self._told = False
@@ -162,13 +186,19 @@ class MovingSky:
         """
         if self.satellites is not None:
             colour = np.full(len(self.satellites), SUN_BV_MAG)
-            stars = with_bodies(stars, self.satellites.names, colour, found=False, colours=self._bodies.sunlight)
+            stars = with_bodies(
+                stars, self.satellites.names, colour, found=False, colours=self._bodies.sunlight
+            )
         both = with_bodies(stars, self.names, self._bodies.bv_mag, colours=self._bodies.colours)
         self.seen(both)  # which writes the bodies into the arrays
         return both
 
     def seen(
-        self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None, place_km: FloatArray | None = None
+        self,
+        stars: Stars,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
     ) -> Stars:
         """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved
         there, in the arrays.
@@ -199,7 +229,9 @@ class MovingSky:
         """The UTC of a moment (None: the start), ns since 1970, held within the ephemeris."""
         return self._utc_ns + self._within(t_ns)
 
-    def passing(self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None) -> Pass | None:
+    def passing(
+        self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None
+    ) -> Pass | None:
         """The satellites that can be in a cone at a moment; None for none; the observer's
         velocity and place as in `seen`.
         """
@@ -207,12 +239,18 @@ class MovingSky:
             return None
         since_ns = self._within(t_ns)
         now, utc_ns = partial(self._circumstances, since_ns // MINUTE_NS), self._utc_ns + since_ns
-        found = self.satellites.near(cone, SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place))
+        found = self.satellites.near(
+            cone, SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place)
+        )
         return found if found is None or self.air is None else found.through(self.air, utc_ns)
 
     def satellites_placed(self, t_ns: int | None) -> int:
         """How many of the satellites have a place by their elements at a moment."""
-        return 0 if self.satellites is None else self.satellites.place(self._utc_ns + self._within(t_ns))
+        return (
+            0
+            if self.satellites is None
+            else self.satellites.place(self._utc_ns + self._within(t_ns))
+        )
 
     def _compute_circumstances(self, minute: int) -> Circumstances:
         """The Sun and the Earth's velocity at a minute: 2.5 arcsec of the Sun, 0.4 m/s."""
@@ -251,18 +289,26 @@ class MovingSky:
             directions[others] = aberrate(directions[others], velocity)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         step = self._step(moment)
-        found = [_moved(self._face(step, i), directions[i], float(now[i, 3])) for i in np.flatnonzero(near).tolist()]
+        found = [
+            _moved(self._face(step, i), directions[i], float(now[i, 3]))
+            for i in np.flatnonzero(near).tolist()
+        ]
         if self.air is not None:
             found = _through(self.air, found, self._utc_ns + moment.since_ns)
         return sorted(found, key=lambda disc: disc.distance_km)
 
     def distances_km(
-        self, t_ns: int | None = None, velocity_km_s: FloatArray | None = None, place_km: FloatArray | None = None
+        self,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
     ) -> FloatArray:
         """How far the bodies (n,) are, in the order of `names`; else as `seen`."""
         return self._at(self._moment(t_ns, velocity_km_s, place_km))[:-1, 3]
 
-    def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> SkyMoment:
+    def _moment(
+        self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None
+    ) -> SkyMoment:
         """A time since the start, held within the ephemeris, with the observer's state about the
         Earth where it is given.
         """
@@ -277,7 +323,11 @@ class MovingSky:
         """The last step of the orbit; where the observer's state comes with the frame, the
         moment itself.
         """
-        return SkyMoment(moment.since_ns // self._step_ns * self._step_ns) if moment.state is None else moment
+        return (
+            SkyMoment(moment.since_ns // self._step_ns * self._step_ns)
+            if moment.state is None
+            else moment
+        )
 
     def _at(self, moment: SkyMoment) -> FloatArray:
         """A node's rows (see `_compute_node`) at any moment."""
@@ -296,23 +346,36 @@ class MovingSky:
 
     def _sight(self, moment: SkyMoment) -> Sight:
         seen = self._seen_from(moment)
-        return replace(seen, directions=apparent_bodies(seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)))
+        return replace(
+            seen,
+            directions=apparent_bodies(
+                seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)
+            ),
+        )
 
     def _seen_from(self, moment: SkyMoment) -> Sight:
         """The bodies at a moment, without their directions."""
         span, rest_ns = divmod(moment.since_ns, SPAN_NS)
         cubics = self._span(span)
         share = rest_ns / SPAN_NS
-        powers, slopes = share**EXPONENTS, EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
+        powers, slopes = (
+            share**EXPONENTS,
+            EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S,
+        )
         place_km, about_km_s = self._orbit.state(self._utc_ns + moment.since_ns)
-        from_earth_km, earth_km_s = np.tensordot(powers, cubics.seen_km, 1), powers @ cubics.earth_km_s
+        from_earth_km, earth_km_s = (
+            np.tensordot(powers, cubics.seen_km, 1),
+            powers @ cubics.earth_km_s,
+        )
         velocity_km_s = earth_km_s + about_km_s
         if moment.state is not None:
             place_km, about_km_s = np.array(moment.state[:3]), np.array(moment.state[3:])
         seen_km = from_earth_km - place_km
         # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a
         # low orbit, 700 m of the Moon
-        later_s = (np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)) / LIGHT_KM_S
+        later_s = (
+            np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)
+        ) / LIGHT_KM_S
         seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
         if EARTH in self._tracked and at_centre(place_km):
             seen_km[self._tracked.index(EARTH)] = NORTH
@@ -330,11 +393,17 @@ class MovingSky:
         }
 
     def _compute_span(self, span: int) -> Span:
-        date = tdb_of_utc(self._utc_ns + span * SPAN_NS) if self._unix else self._epoch.after(span * SPAN_S)
+        date = (
+            tdb_of_utc(self._utc_ns + span * SPAN_NS)
+            if self._unix
+            else self._epoch.after(span * SPAN_S)
+        )
         part = date.part + CUBIC_AT * SPAN_S / DAY_S
         earth_km, earth_km_s = self._kernel.earth(date.whole, part)
         seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
-        return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
+        return Span(
+            np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s
+        )
 
     def _compute_node(self, moment: SkyMoment) -> FloatArray:
         """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the
@@ -349,7 +418,9 @@ class MovingSky:
         if self._earth is not None and at_centre(sight.place_km):
             node[self._earth] = np.nan  # nowhere in view
         elif self._earth is not None:
-            node[self._earth, :3], node[self._earth, 3] = apparent_cone(-sight.place_km, sight.about_earth_km_s)
+            node[self._earth, :3], node[self._earth, 3] = apparent_cone(
+                -sight.place_km, sight.about_earth_km_s
+            )
         node[:-1, 4] = np.arcsin(np.minimum(1.0, self._radii_km / node[:-1, 3]))
         node[-1, :3] = sight.view.velocity_km_s - self._fixed_km_s
         return node
@@ -385,14 +456,18 @@ class MovingSky:
         from_sun_km = sight.seen_km + sight.view.from_sun_km
         v_mag = np.array(
             [
-                DARK_V_MAG if name == EARTH else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
+                DARK_V_MAG
+                if name == EARTH
+                else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
                 for row, name in zip(self._drawn, self.names, strict=True)
             ]
         )
         rates = self._bodies.v0_e_per_s * flux_ratio(v_mag)
         if self._earth is not None and not at_centre(sight.place_km):
             disc = self._earth_disc(sight)
-            v_mag[self._earth], rates[self._earth] = earth_light(disc, float(self._bodies.v0_e_per_s[self._earth]))
+            v_mag[self._earth], rates[self._earth] = earth_light(
+                disc, float(self._bodies.v0_e_per_s[self._earth])
+            )
         return v_mag, rates
 
     def _jyear(self, seconds: float) -> float:
@@ -404,10 +479,18 @@ class MovingSky:
         the start is beyond it.
         """
         first, last = self._kernel.first_jd + EDGE_DAYS, self._kernel.last_jd - EDGE_DAYS
-        limits = tuple(round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S) for jd in (first, last))
+        limits = tuple(
+            round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S)
+            for jd in (first, last)
+        )
         if not limits[0] <= 0 <= limits[1]:
-            dates = [str(np.datetime64(round((jd - 2_440_587.5) * DAY_S), "s").astype("datetime64[D]")) for jd in (first, last)]
-            raise InputError(f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date between them")
+            dates = [
+                str(np.datetime64(round((jd - 2_440_587.5) * DAY_S), "s").astype("datetime64[D]"))
+                for jd in (first, last)
+            ]
+            raise InputError(
+                f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date between them"
+            )
         return limits[0], limits[1]
 
     def _within(self, t_ns: int | None) -> int:
@@ -445,7 +528,11 @@ def _through(air: SiteAir, discs: list[Disc], utc_ns: int) -> list[Disc]:
         altitude_rad = above.altitude_rad(disc.direction[None])
         if altitude_rad[0] > -disc.radius_rad:
             light = disc.normal_e_per_s_sr * float(air.shares(np.array([-1]), altitude_rad).mean())
-            seen.append(replace(disc, direction=above.bent(disc.direction[None])[0], normal_e_per_s_sr=light))
+            seen.append(
+                replace(
+                    disc, direction=above.bent(disc.direction[None])[0], normal_e_per_s_sr=light
+                )
+            )
     return seen
 
 

@@ -92,7 +92,9 @@ class TleOrbit:
         if is_omm(text):
             sets = list(read_omm(text, name))
             if len(sets) != 1:
-                raise InputError(f"{name}: has {len(sets)} element sets, and an orbit is one; {TLE_ADVICE}")
+                raise InputError(
+                    f"{name}: has {len(sets)} element sets, and an orbit is one; {TLE_ADVICE}"
+                )
             self._satellite, self.number = sets[0].satrec, sets[0].number
         else:
             self._satellite = Satrec.twoline2rv(*_checked(name, text))
@@ -100,7 +102,12 @@ class TleOrbit:
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
-        return utc_ns / NS_PER_DAY + UNIX_JD - float(self._satellite.jdsatepoch) - float(self._satellite.jdsatepochF)
+        return (
+            utc_ns / NS_PER_DAY
+            + UNIX_JD
+            - float(self._satellite.jdsatepoch)
+            - float(self._satellite.jdsatepochF)
+        )
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place and velocity by SGP4, from the true equator and mean equinox to the ICRS."""
@@ -108,19 +115,29 @@ class TleOrbit:
         error, place_km, velocity_km_s = self._satellite.sgp4(UNIX_JD + days, rest_ns / NS_PER_DAY)
         if error:
             date = np.datetime64(utc_ns, "ns").astype("datetime64[s]")
-            raise InputError(f"{self._name}: no orbit at {date}: {self._errors[error]}; give newer elements")
+            raise InputError(
+                f"{self._name}: no orbit at {date}: {self._errors[error]}; give newer elements"
+            )
         turn = icrs_from_teme(utc_ns // TURN_NS)
         return turn @ place_km, turn @ velocity_km_s
 
 
 def _checked(name: str, text: str) -> tuple[str, str]:
-    found = [line for line in map(str.rstrip, text.splitlines()) if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH]
+    found = [
+        line
+        for line in map(str.rstrip, text.splitlines())
+        if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH
+    ]
     if [line[0] for line in found] != ["1", "2"]:
-        raise InputError(f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2; {TLE_ADVICE}")
+        raise InputError(
+            f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2; {TLE_ADVICE}"
+        )
     for number, line in enumerate(found, start=1):
         total = sum(int(c) if c.isdigit() else c == "-" for c in line[:-1]) % 10
         if str(total) != line[-1]:
-            raise InputError(f"{name}: element line {number}: its digits add up to {total}, not {line[-1]}; {TLE_ADVICE}")
+            raise InputError(
+                f"{name}: element line {number}: its digits add up to {total}, not {line[-1]}; {TLE_ADVICE}"
+            )
     return found[0], found[1]
 
 
@@ -162,20 +179,35 @@ class OemOrbit:
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
         if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
-            spans = ", ".join(" to ".join(_date(int(t)) for t in s.t_ns[[0, -1]]) + f" {s.scale}" for s in self._segments[:5])
-            raise InputError(f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}")
+            spans = ", ".join(
+                " to ".join(_date(int(t)) for t in s.t_ns[[0, -1]]) + f" {s.scale}"
+                for s in self._segments[:5]
+            )
+            raise InputError(
+                f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}"
+            )
         off_km = max(map(_off_km, self._segments))
         if off_km > FAR_KM:
             advice = "write epochs a few minutes apart"
-            log.warning("%s: between its epochs the orbit is off by some %.2g km; %s", name, off_km, advice)
+            log.warning(
+                "%s: between its epochs the orbit is off by some %.2g km; %s", name, off_km, advice
+            )
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest
         epoch, which is told once.
         """
         found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
-        if not self._told and _away_ns(found, utc_ns) > 0 and abs(utc_ns - self._stars_ns) > self._unseen_ns:
-            log.warning("%s: has no orbit at %s UTC; that of its nearest epoch is held", self._name, _date(utc_ns))
+        if (
+            not self._told
+            and _away_ns(found, utc_ns) > 0
+            and abs(utc_ns - self._stars_ns) > self._unseen_ns
+        ):
+            log.warning(
+                "%s: has no orbit at %s UTC; that of its nearest epoch is held",
+                self._name,
+                _date(utc_ns),
+            )
             self._told = True
         t_ns = int(np.clip(_time(found.scale, utc_ns), found.t_ns[0], found.t_ns[-1]))
         return _at(found.t_ns, found.states, t_ns)
@@ -187,9 +219,13 @@ def _away_ns(segment: Segment, utc_ns: int) -> int:
     return max(int(segment.t_ns[0]) - t_ns, t_ns - int(segment.t_ns[-1]), 0)
 
 
-def _at(times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int) -> tuple[FloatArray, FloatArray]:
+def _at(
+    times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int
+) -> tuple[FloatArray, FloatArray]:
     """Place and velocity at a time by the NODES states (n, 6) about it."""
-    first = int(np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES)))
+    first = int(
+        np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES))
+    )
     near = slice(first, first + NODES)
     from scipy.interpolate import KroghInterpolator
 
@@ -204,7 +240,11 @@ def _off_km(segment: Segment) -> float:
     """How far the polynomial is off between epochs, km, by what it is at epochs that are held
     out, where steps are longer.
     """
-    inner = np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int)) if len(segment.t_ns) > 2 else ()
+    inner = (
+        np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int))
+        if len(segment.t_ns) > 2
+        else ()
+    )
     worst_km, order = 0.0, 2 * min(NODES, len(segment.t_ns) - 1)
     for k in inner:
         near = [i for i in range(k - NODES, k + NODES + 1) if i != k and 0 <= i < len(segment.t_ns)]
@@ -228,12 +268,16 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
         elif section in {"header", "metadata"}:
             key, equals, value = line.partition("=")
             if not equals:
-                raise InputError(f"{name}:{number}: {line[:40]!r} in the {section}; write KEYWORD = value")
+                raise InputError(
+                    f"{name}:{number}: {line[:40]!r} in the {section}; write KEYWORD = value"
+                )
             meta[key.strip()] = " ".join(value.upper().split())
         elif section == "data":
             words = line.split()
             if len(words) not in COUNTS:
-                raise InputError(f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT Z_DOT (km/s)")
+                raise InputError(
+                    f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT Z_DOT (km/s)"
+                )
             rows.append([str(number), *words[:7]])
     if section == "metadata":
         raise InputError(f"{name}: ends in the metadata; is it cut off?")
@@ -243,18 +287,26 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
 def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator[Segment]:
     if "REF_FRAME" not in meta and not rows:
         return  # the header
-    frame, centre, scale = (meta.get(key, "missing") for key in ("REF_FRAME", "CENTER_NAME", "TIME_SYSTEM"))
+    frame, centre, scale = (
+        meta.get(key, "missing") for key in ("REF_FRAME", "CENTER_NAME", "TIME_SYSTEM")
+    )
     if frame not in FRAMES or centre != "EARTH":
-        raise InputError(f"{name}: REF_FRAME is {frame[:40]} and CENTER_NAME {centre[:40]}; {OEM_ADVICE}")
+        raise InputError(
+            f"{name}: REF_FRAME is {frame[:40]} and CENTER_NAME {centre[:40]}; {OEM_ADVICE}"
+        )
     if scale not in {"UTC", *TAI_TO_SCALE_S}:
-        raise InputError(f"{name}: TIME_SYSTEM is {scale[:40]}; write UTC, {', '.join(TAI_TO_SCALE_S)}")
+        raise InputError(
+            f"{name}: TIME_SYSTEM is {scale[:40]}; write UTC, {', '.join(TAI_TO_SCALE_S)}"
+        )
     if len(rows) < 2:
         raise InputError(f"{name}: a segment has {len(rows)} states; it needs two or more")
     t_ns = np.array([_epoch_ns(row[1], f"{name}:{row[0]}") for row in rows], dtype=np.int64)
     states = np.array([_numbers(row[2:], f"{name}:{row[0]}") for row in rows])
     back = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(back):
-        raise InputError(f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the lines by time")
+        raise InputError(
+            f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the lines by time"
+        )
     yield Segment(scale, t_ns, states)
 
 
@@ -265,7 +317,9 @@ def _numbers(words: list[str], where: str) -> list[float]:
         numbers = [np.nan] * 6
     place, speed = np.abs(numbers[:3]), np.abs(numbers[3:])
     if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
-        raise InputError(f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s")
+        raise InputError(
+            f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s"
+        )
     return numbers
 
 
@@ -276,14 +330,23 @@ def _epoch_ns(text: str, where: str) -> int:
         if match is None:
             raise ValueError
         year, month, day, of_year, hour, minute, second = match.groups()
-        date = np.datetime64(f"{year}-{month}-{day}" if month else year, "D") + (int(of_year or 1) - 1)
-        inside = int(year) in YEARS and int(of_year or 1) in DAYS_OF_YEAR and int(hour) < 24 and int(minute) < 60
+        date = np.datetime64(f"{year}-{month}-{day}" if month else year, "D") + (
+            int(of_year or 1) - 1
+        )
+        inside = (
+            int(year) in YEARS
+            and int(of_year or 1) in DAYS_OF_YEAR
+            and int(hour) < 24
+            and int(minute) < 60
+        )
         if not inside or float(second) >= 60:
             raise ValueError
         seconds = int(date.astype(np.int64)) * 86_400 + 3600 * int(hour) + 60 * int(minute)
         return seconds * NS_PER_S + round(float(second) * NS_PER_S)
     except ValueError:
-        raise InputError(f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f") from None
+        raise InputError(
+            f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f"
+        ) from None
 
 
 def _time(scale: str, utc_ns: int) -> int:

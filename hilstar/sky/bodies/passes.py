@@ -106,7 +106,12 @@ class Pass:
 
     def only(self, which: IntArray) -> "Pass":
         """Only the satellites at places `which` (k,)."""
-        return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
+        return replace(
+            self,
+            index=self.index[which],
+            seen_km=self.seen_km[:, which],
+            place_km=self.place_km[:, which],
+        )
 
     def through(self, air: SiteAir, utc_ns: int) -> Self:
         """The same through the air at a UTC: bent, and with the light that comes through, none
@@ -115,11 +120,20 @@ class Pass:
         range_km = np.linalg.norm(self.seen_km[0], axis=1)[:, None]
         towards, above, seen_km = self.seen_km[0] / range_km, air.above(utc_ns), self.seen_km.copy()
         seen_km[0] = above.bent(towards) * range_km
-        altitude_rad, standard = above.altitude_rad(towards), self.brightness.standard_e_per_s.copy()
-        standard[self.index] *= air.shares(np.full(len(self), -1), altitude_rad).mean(axis=0) * (altitude_rad > 0)
-        return replace(self, seen_km=seen_km, brightness=replace(self.brightness, standard_e_per_s=standard))
+        altitude_rad, standard = (
+            above.altitude_rad(towards),
+            self.brightness.standard_e_per_s.copy(),
+        )
+        standard[self.index] *= air.shares(np.full(len(self), -1), altitude_rad).mean(axis=0) * (
+            altitude_rad > 0
+        )
+        return replace(
+            self, seen_km=seen_km, brightness=replace(self.brightness, standard_e_per_s=standard)
+        )
 
-    def directions(self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None) -> FloatArray:
+    def directions(
+        self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None
+    ) -> FloatArray:
         """Unit vectors (k, 3), ICRS, of satellites at places `which` (k,), aberrated as bodies are
         by `fixed_km_s`.
 
@@ -166,7 +180,12 @@ class Satellites:
     """
 
     def __init__(
-        self, satellites: Sequence[Satellite], brightness: Brightness, v0_e_per_s: float, orbit: Orbit, zero_ns: int
+        self,
+        satellites: Sequence[Satellite],
+        brightness: Brightness,
+        v0_e_per_s: float,
+        orbit: Orbit,
+        zero_ns: int,
     ) -> None:
         own = orbit.number if isinstance(orbit, TleOrbit) else None
         self._v0_e_per_s = v0_e_per_s
@@ -175,7 +194,9 @@ class Satellites:
         self._satellites, self._orbit, self._zero_ns = satellites, orbit, zero_ns
         self._swarm = Swarm([one.satrec for one in satellites])
         self._numbers = np.array([one.number for one in satellites])
-        self._other = np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
+        self._other = (
+            np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
+        )
         self._watch: _Watch | None = None
         self._lost_told = self._own_told = self._age_told = False
         self._epoch_age_days = np.array([one.age_days(0) for one in satellites])
@@ -197,12 +218,16 @@ class Satellites:
         seen = self._swarm.places_km(found, sky.utc_ns) - observer[0]
         range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
         reach_km, now = _reach_km(observer, cone.half_s), sky.now()
-        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km) & (range_km > OWN_KM)
+        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km) & (
+            range_km > OWN_KM
+        )
         near &= self._brightest(found, seen, range_km, reach_km, now) >= cone.faintest_e_per_s
         which = found[near]
         if not len(which):
             return None
-        place, seen = _light_cubics(self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s)
+        place, seen = _light_cubics(
+            self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s
+        )
         since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
         return Pass(which, self.brightness, seen, place, observer, since_s, now, sky.fixed_km_s)
 
@@ -211,7 +236,9 @@ class Satellites:
         place_km, velocity_km_s = self._orbit.state(sky.utc_ns)
         if sky.place_km is not None:
             place_km = place_km + sky.place_km
-            velocity_km_s = velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
+            velocity_km_s = (
+                velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
+            )
         # It falls about the Earth; at rest where it is the Earth's centre.
         distance = float(np.linalg.norm(place_km))
         pull = -EARTH_GM_KM3_S2 / distance**3 if distance > 0 else 0.0
@@ -221,7 +248,9 @@ class Satellites:
         """The satellites that can be in a cone, from the list that is kept for some time."""
         watch = self._watch
         if watch is None or not watch.covers(cone, sky.utc_ns, observer[0]):
-            self._watch = watch = _Watch(cone, sky.utc_ns, observer, self._search(cone, sky, observer))
+            self._watch = watch = _Watch(
+                cone, sky.utc_ns, observer, self._search(cone, sky, observer)
+            )
         return watch.found
 
     def _search(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
@@ -230,7 +259,10 @@ class Satellites:
         self._tell_own(range_km)
         half_s = WATCH_S + cone.half_s
         reach_km = _reach_km(observer, half_s) + JUMP_KM
-        near = _within(seen @ cone.axis, range_km, cone.radius_rad + WATCH_RAD + SHIFT_RAD, reach_km) & self._other
+        near = (
+            _within(seen @ cone.axis, range_km, cone.radius_rad + WATCH_RAD + SHIFT_RAD, reach_km)
+            & self._other
+        )
         found = np.flatnonzero(near)
         brightest = self._brightest(found, seen[found], range_km[found], reach_km, sky.now())
         found = found[brightest >= cone.faintest_e_per_s]
@@ -239,11 +271,18 @@ class Satellites:
         lit, sun_km = np.zeros(len(found)), sky.now().sun_km
         for seconds in np.array([-half_s, half_s]):
             place = self._swarm.places_km(found, sky.utc_ns, seconds)
-            lit += sunlit_share(place, sun_km) * in_front(_at(observer, seconds)[None], place, HIDDEN_KM)
+            lit += sunlit_share(place, sun_km) * in_front(
+                _at(observer, seconds)[None], place, HIDDEN_KM
+            )
         return np.asarray(found[lit > 0])
 
     def _brightest(
-        self, which: IntArray, seen_km: FloatArray, range_km: FloatArray, reach_km: float, now: Circumstances
+        self,
+        which: IntArray,
+        seen_km: FloatArray,
+        range_km: FloatArray,
+        reach_km: float,
+        now: Circumstances,
     ) -> FloatArray:
         """The most that each of these (n,) can send while it moves by `reach_km`: outside the
         shadow, and in a flash.
@@ -251,11 +290,18 @@ class Satellites:
         range_km = np.maximum(range_km, OWN_KM)
         closest_km = np.maximum(range_km - reach_km, OWN_KM)
         to_sun = now.sun_km / np.linalg.norm(now.sun_km)
-        diffuse = phase_factor(np.clip(-(seen_km @ to_sun) / range_km, -1.0, 1.0)) + STEEPEST_PHASE * reach_km / closest_km
+        diffuse = (
+            phase_factor(np.clip(-(seen_km @ to_sun) / range_km, -1.0, 1.0))
+            + STEEPEST_PHASE * reach_km / closest_km
+        )
         share = MOST_SUN * np.minimum(diffuse, MAX_PHASE_FACTOR) * (STANDARD_KM / closest_km) ** 2
-        return np.asarray(self.brightness.standard_e_per_s[which] * self.brightness.most(which) * share)
+        return np.asarray(
+            self.brightness.standard_e_per_s[which] * self.brightness.most(which) * share
+        )
 
-    def write(self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray) -> None:
+    def write(
+        self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray
+    ) -> None:
         """Put satellites (k,) into the arrays of stars that were made with this list: unit
         vectors (k, 3) and rates (k,).
         """
@@ -314,7 +360,11 @@ class Satellites:
         own = np.flatnonzero(~self._other | (range_km < OWN_KM))
         if len(own):
             self._own_told = True
-            log.warning("%s is the observer itself, or within %g km of it, and is not drawn", self.names[int(own[0])], OWN_KM)
+            log.warning(
+                "%s is the observer itself, or within %g km of it, and is not drawn",
+                self.names[int(own[0])],
+                OWN_KM,
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,7 +395,9 @@ def _reach_km(observer: FloatArray, half_s: float) -> float:
     return half_s * (FASTEST_KM_S + float(np.linalg.norm(observer[1])))
 
 
-def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float) -> BoolArray:
+def _within(
+    along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float
+) -> BoolArray:
     """Whether vectors (n,), by their parts along an axis and their lengths, can come within an
     angle of it by moving so far.
     """
@@ -354,7 +406,9 @@ def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach
     return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
 
 
-def _light_cubics(place_km: FloatArray, observer_km: FloatArray, earth_km_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _light_cubics(
+    place_km: FloatArray, observer_km: FloatArray, earth_km_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Cubics (4, n, 3) of where satellites sent what arrives, about the Earth and from the
     observer, by their places.
     """

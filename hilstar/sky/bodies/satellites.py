@@ -45,10 +45,16 @@ if TYPE_CHECKING:
 
 LINE_LENGTH = 69  # with its checksum
 MAX_NAME = 24  # characters, as CelesTrak has them
-LIST_FORM = "give a list of two-line element sets, with name lines or without, or OMM in JSON, XML or CSV"
+LIST_FORM = (
+    "give a list of two-line element sets, with name lines or without, or OMM in JSON, XML or CSV"
+)
 # Numeric columns of each line (from 0), and what they hold.
 NUMBERS = {
-    "1": {"epoch's year": (18, 20), "epoch's day": (20, 32), "first derivative of the mean motion": (33, 43)},
+    "1": {
+        "epoch's year": (18, 20),
+        "epoch's day": (20, 32),
+        "first derivative of the mean motion": (33, 43),
+    },
     "2": {
         "inclination": (8, 16),
         "right ascension of the node": (17, 25),
@@ -85,7 +91,9 @@ STEP_NS = STEP_S * NS_PER_S
 SHARE = 512
 # Coefficients of 1, s, s^2, s^3 of the cubic through place and velocity (times the step) at both
 # ends
-HERMITE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-3.0, -2.0, 3.0, -1.0], [2.0, 1.0, -2.0, 1.0]])
+HERMITE = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-3.0, -2.0, 3.0, -1.0], [2.0, 1.0, -2.0, 1.0]]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +108,9 @@ class Satellite:
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
-        return float(utc_ns / NS_PER_DAY + UNIX_JD - self.satrec.jdsatepoch - self.satrec.jdsatepochF)
+        return float(
+            utc_ns / NS_PER_DAY + UNIX_JD - self.satrec.jdsatepoch - self.satrec.jdsatepochF
+        )
 
 
 def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
@@ -124,10 +134,15 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
     shared = Counter(one.name for one in found.values())
     names = (
-        (one.name if shared[one.name] == 1 else f"{one.name} {one.number}") if one.name else f"NORAD {one.number}"
+        (one.name if shared[one.name] == 1 else f"{one.name} {one.number}")
+        if one.name
+        else f"NORAD {one.number}"
         for one in found.values()
     )
-    return [Satellite(name, one.number, one.satrec) for name, one in zip(names, found.values(), strict=True)]
+    return [
+        Satellite(name, one.number, one.satrec)
+        for name, one in zip(names, found.values(), strict=True)
+    ]
 
 
 def _satellites(text: str, file: str) -> "Iterator[Satellite]":
@@ -155,11 +170,15 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
             continue
         if first:
             if not line.startswith("2 "):
-                raise InputError(f"{where}: element line 2 is missing after line {first_at}; {LIST_FORM}")
+                raise InputError(
+                    f"{where}: element line 2 is missing after line {first_at}; {LIST_FORM}"
+                )
             _check(line, where)
             if line[2:7] != first[2:7]:
                 other = first[2:7].strip()
-                raise InputError(f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other}; {LIST_FORM}")
+                raise InputError(
+                    f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other}; {LIST_FORM}"
+                )
             yield name, first, line
             name, first = "", ""
         elif line.startswith("1 "):
@@ -186,14 +205,20 @@ def _check(line: str, where: str) -> None:
     numbers.
     """
     if len(line) != LINE_LENGTH or not line.isascii():
-        raise InputError(f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}")
+        raise InputError(
+            f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}"
+        )
     total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
     if str(total) != line[-1]:
-        raise InputError(f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list anew")
+        raise InputError(
+            f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list anew"
+        )
     for what, (begin, end) in NUMBERS[line[0]].items():
         part = line[begin:end].strip()
         if not part.lstrip("+-").replace(".", "", 1).isdigit():
-            raise InputError(f"{where}: columns {begin + 1} to {end}, its {what}, read {part!r}; write a number")
+            raise InputError(
+                f"{where}: columns {begin + 1} to {end}, its {what}, read {part!r}; write a number"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +267,9 @@ class Brightness:
         ratio, per_s = flux_ratio(-self.amplitude_mag[which]), 1 / self.period_s[which]
         middle = ((begin_s + end_s) / 2 - self.flash_at_s[which]) * per_s
         depth = (ratio - 1) / (ratio + 1)
-        return np.asarray(1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s))
+        return np.asarray(
+            1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s)
+        )
 
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
         from scipy.special import ndtr  # 0.1 s, which only flashes need
@@ -254,7 +281,9 @@ class Brightness:
         for seconds in (begin_s, end_s):
             turn = np.floor((seconds - self.flash_at_s[which]) / period_s)
             rest_s = seconds - self.flash_at_s[which] - turn * period_s
-            near = ndtr((rest_s[:, None] - NEIGHBOURS * period_s[:, None]) / sigma_s[:, None]).sum(axis=1)
+            near = ndtr((rest_s[:, None] - NEIGHBOURS * period_s[:, None]) / sigma_s[:, None]).sum(
+                axis=1
+            )
             until.append((turn, near))
         (turn, near), (last_turn, last_near) = until
         flashes = (last_turn - turn) + (last_near - near)
@@ -262,7 +291,9 @@ class Brightness:
         return np.asarray(1 + extra * flashes * sigma_s * np.sqrt(2 * np.pi) / (end_s - begin_s))
 
 
-def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
+def reflected_share(
+    from_observer_km: FloatArray, place_km: FloatArray, sun_km: FloatArray
+) -> FloatArray:
     """Flux over that of the standard magnitude (n,), of satellites at vectors from the observer and
     from the Earth (n, 3).
 
@@ -272,7 +303,9 @@ def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: 
     to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
     range_km = np.linalg.norm(from_observer_km, axis=1)
     diffuse = phase_factor(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
-    return np.asarray((STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km))
+    return np.asarray(
+        (STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km)
+    )
 
 
 def phase_factor(cos_phase: FloatArray) -> FloatArray:
@@ -300,14 +333,18 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
     share = np.where(apart <= within, np.maximum(0.0, 1 - (earth / disc) ** 2), 1.0)
     partly = np.flatnonzero((apart > within) & (apart < earth + disc))
     if len(partly):
-        share[partly] = 1 - _overlap(earth[partly], disc[partly], apart[partly]) / (np.pi * disc[partly] ** 2)
+        share[partly] = 1 - _overlap(earth[partly], disc[partly], apart[partly]) / (
+            np.pi * disc[partly] ** 2
+        )
     return share
 
 
 def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
     """The area that circles of radii a and b share, on a plane."""
     from_a = (apart**2 + a**2 - b**2) / (2 * apart)
-    in_a, in_b = (np.arccos(np.clip(x / r, -1.0, 1.0)) for x, r in ((from_a, a), (apart - from_a, b)))
+    in_a, in_b = (
+        np.arccos(np.clip(x / r, -1.0, 1.0)) for x, r in ((from_a, a), (apart - from_a, b))
+    )
     return np.asarray(a**2 * (in_a - np.sin(2 * in_a) / 2) + b**2 * (in_b - np.sin(2 * in_b) / 2))
 
 
@@ -319,7 +356,9 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
     """
     observer, place = _stretched(observer_km), _stretched(place_km)
     way = place - observer
-    share = np.clip(-np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
+    share = np.clip(
+        -np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0
+    )
     closest = np.linalg.norm(observer + share[:, None] * way, axis=1)
     inside = np.linalg.norm(observer, axis=1) < EARTH_KM
     return np.where((closest < EARTH_KM - depth_km) & ~inside, 0.0, 1.0)
@@ -370,7 +409,9 @@ def _number(text: str, where: str) -> int:
     try:
         return int(from_alpha5(text) if len(text) <= 5 else text)
     except (ValueError, IndexError, KeyError) as error:
-        raise InputError(f"{where}: {KEY} = {shortened(text)!r}; write a catalogue number, such as 25544") from error
+        raise InputError(
+            f"{where}: {KEY} = {shortened(text)!r}; write a catalogue number, such as 25544"
+        ) from error
 
 
 def _values(row: dict[str, str], where: str) -> Row:
@@ -384,16 +425,24 @@ def _values(row: dict[str, str], where: str) -> Row:
         except ValueError:
             values[name] = math.nan
         if not low <= values[name] <= high:
-            raise InputError(f"{where}: {name} = {shortened(text)!r}; write {low:g} to {high:g}, or leave it empty")
+            raise InputError(
+                f"{where}: {name} = {shortened(text)!r}; write {low:g} to {high:g}, or leave it empty"
+            )
     if "amplitude_mag" in values or "flash_s" in values or "period_s" in values:
         if "period_s" not in values or "amplitude_mag" not in values:
-            raise InputError(f"{where}: light that varies has a period_s and an amplitude_mag; write both")
+            raise InputError(
+                f"{where}: light that varies has a period_s and an amplitude_mag; write both"
+            )
         if values.get("flash_s", 0.0) > values["period_s"] / 2:
-            raise InputError(f"{where}: flash_s is over half of period_s; leave it out: the light then goes up and down")
+            raise InputError(
+                f"{where}: flash_s is over half of period_s; leave it out: the light then goes up and down"
+            )
     return values
 
 
-def brightness_of(satellites: Sequence[Satellite], rows: dict[int, Row], default_mag: float, v0_e_per_s: float) -> Brightness:
+def brightness_of(
+    satellites: Sequence[Satellite], rows: dict[int, Row], default_mag: float, v0_e_per_s: float
+) -> Brightness:
     """The brightness of satellites by a table's rows and a standard magnitude for those that have
     none.
 
@@ -401,7 +450,9 @@ def brightness_of(satellites: Sequence[Satellite], rows: dict[int, Row], default
     """
 
     def column(name: str, default: float) -> np.ndarray:
-        return np.array([rows.get(one.number, {}).get(name, default) for one in satellites], dtype=np.float64)
+        return np.array(
+            [rows.get(one.number, {}).get(name, default) for one in satellites], dtype=np.float64
+        )
 
     return Brightness(
         standard_e_per_s=v0_e_per_s * flux_ratio(column("standard_mag", default_mag)),
@@ -464,13 +515,22 @@ class Swarm:
         where there is one.
         """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
-        error, place_km, velocity_km_s = self._shares[k].sgp4(np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY]))
-        states = np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1) @ icrs_from_teme(utc_ns // TURN_NS).T
-        error = np.where(np.isfinite(states).all(axis=(1, 2)), error[:, 0], np.maximum(error[:, 0], 1))
+        error, place_km, velocity_km_s = self._shares[k].sgp4(
+            np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY])
+        )
+        states = (
+            np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1)
+            @ icrs_from_teme(utc_ns // TURN_NS).T
+        )
+        error = np.where(
+            np.isfinite(states).all(axis=(1, 2)), error[:, 0], np.maximum(error[:, 0], 1)
+        )
         states[error != 0] = np.nan
         return states, error
 
-    def places_km(self, which: IntArray | slice, utc_ns: int, seconds: FloatArray | float = 0.0) -> FloatArray:
+    def places_km(
+        self, which: IntArray | slice, utc_ns: int, seconds: FloatArray | float = 0.0
+    ) -> FloatArray:
         """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it
         was moved to; NaN for none.
         """

@@ -13,9 +13,21 @@ from tests.authority.failing_methods import field, sky
 
 # In the order of the light's way. The cases that a machine draws come between the two groups.
 CATALOGUE_AND_GEOMETRY: tuple[Callable[[], FailureCase], ...] = (
-    *(sky.bluest_star, sky.reddest_star, sky.temperature_range, sky.planck_overflow, sky.source_step, sky.cool_stars),
+    *(
+        sky.bluest_star,
+        sky.reddest_star,
+        sky.temperature_range,
+        sky.planck_overflow,
+        sky.source_step,
+        sky.cool_stars,
+    ),
     sky.blind_tracker,
-    *(field.motion_at_pole, field.fields_over_wrap_and_pole, field.boresight_at_pole, field.stars_behind),
+    *(
+        field.motion_at_pole,
+        field.fields_over_wrap_and_pole,
+        field.boresight_at_pole,
+        field.stars_behind,
+    ),
     *(field.field_of_180_deg, field.weak_perspective),
 )
 DETECTOR_AND_ATTITUDE: tuple[Callable[[], FailureCase], ...] = (

@@ -76,7 +76,10 @@ def motion_at_pole() -> FailureCase:
     moved = unit_vectors_icrs(at_pole, HIPPARCOS_EPOCH_JYEAR + years)[0]
     turn_deg = 100.0 * years * RAD_PER_MAS / np.radians(1.0)
     dec_deg = 89.999 + turn_deg / 2
-    wrong = [direction_of(359.9999 + turn_deg / cosine, dec_deg) for cosine in (1.0, np.cos(np.radians(89.999)))]
+    wrong = [
+        direction_of(359.9999 + turn_deg / cosine, dec_deg)
+        for cosine in (1.0, np.cos(np.radians(89.999)))
+    ]
     exact = _great_circle(359.9999, 89.999, np.array([100.0, 50.0]) * years * RAD_PER_MAS)
     error, *faults = (_apart_rad(v, exact) / RAD_PER_MAS for v in (moved, *wrong))
     return FailureCase(
@@ -115,7 +118,9 @@ def fields_over_wrap_and_pole() -> FailureCase:
     for ra_deg, dec_deg in ((0.01, 0.0), (359.99, -45.0), (200.0, 89.0), (20.0, -90.0)):
         axis = direction_of(ra_deg, dec_deg)
         inside = np.flatnonzero(vectors @ axis >= np.cos(np.radians(radius)))
-        box = (np.abs(catalog.ra_deg - ra_deg) <= radius) & (np.abs(catalog.dec_deg - dec_deg) <= radius)
+        box = (np.abs(catalog.ra_deg - ra_deg) <= radius) & (
+            np.abs(catalog.dec_deg - dec_deg) <= radius
+        )
         lost += len(np.setdiff1d(inside, grid.order[grid.near(axis, np.radians(radius))]))
         box_lost, seen = box_lost + int((~box[inside]).sum()), seen + len(inside)
     return FailureCase(
@@ -130,9 +135,14 @@ def fields_over_wrap_and_pole() -> FailureCase:
 
 def stars_behind() -> FailureCase:
     """Half of the sky lies behind the camera."""
-    camera, vectors = _camera(70.0), unit_vectors_icrs(load_catalog().brighter_than(7.5), HIPPARCOS_EPOCH_JYEAR)
+    camera, vectors = (
+        _camera(70.0),
+        unit_vectors_icrs(load_catalog().brighter_than(7.5), HIPPARCOS_EPOCH_JYEAR),
+    )
     behind = vectors[vectors[:, 2] <= 0]
-    ghosts = _on_image(behind[:, :2] / behind[:, 2:] * camera.focal_length_px + camera.principal_point_px, camera)
+    ghosts = _on_image(
+        behind[:, :2] / behind[:, 2:] * camera.focal_length_px + camera.principal_point_px, camera
+    )
     ours = _on_image(np.column_stack(camera.project(behind)), camera)
     return FailureCase(
         "stars behind the camera",
@@ -164,7 +174,14 @@ def field_of_180_deg() -> FailureCase:
         vectors = np.column_stack([np.sin(angle), np.zeros(1000), np.cos(angle)])
         exact = camera.focal_length_px * np.tan(angle) + 1000.0
         error = max(error, float(np.abs(camera.project(vectors)[0] - exact).max()))
-        fault = max(fault, float(np.abs(camera.project(vectors.astype(np.float32).astype(np.float64))[0] - exact).max()))
+        fault = max(
+            fault,
+            float(
+                np.abs(
+                    camera.project(vectors.astype(np.float32).astype(np.float64))[0] - exact
+                ).max()
+            ),
+        )
         spread = 1 / np.cos(angle[-1]) ** 2
     return FailureCase(
         "a field of 179.8 degrees",
@@ -219,7 +236,10 @@ def weak_perspective() -> FailureCase:
     angle = np.radians(angles)
     x_px, _ = camera.project(np.column_stack([np.sin(angle), np.zeros(3), np.cos(angle)]))
     error = float(np.abs(x_px - 2000.0 - camera.focal_length_px * np.tan(angle)).max())
-    fails = ", ".join(f"{a:g} deg: {px:.2g} px, {s:.3g} arcsec" for a, px, s in zip(angles, off_px, off_arcsec, strict=True))
+    fails = ", ".join(
+        f"{a:g} deg: {px:.2g} px, {s:.3g} arcsec"
+        for a, px, s in zip(angles, off_px, off_arcsec, strict=True)
+    )
     return FailureCase(
         "field angle, one depth for all",
         "weak perspective, x = f X / Z0",
@@ -233,7 +253,9 @@ def weak_perspective() -> FailureCase:
 def arccos_slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
     """SLERP as it stands in the books: the angle by arccos, no look at the sign."""
     angle = np.arccos(np.clip(np.dot(a, b), -1, 1))
-    return np.asarray((np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle))
+    return np.asarray(
+        (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle)
+    )
 
 
 def straight_line(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
@@ -253,7 +275,9 @@ def way_error_arcsec(between: Between, sign: float, turn_deg: float) -> float:
     """
     with np.errstate(invalid="ignore"):
         ways = [between(START, sign * turned(turn_deg), float(f)) for f in FRACTIONS]
-    errors = [angle_between_rad(q, turned(turn_deg, f)) for q, f in zip(ways, FRACTIONS, strict=True)]
+    errors = [
+        angle_between_rad(q, turned(turn_deg, f)) for q, f in zip(ways, FRACTIONS, strict=True)
+    ]
     return float(np.max(errors) * ARCSEC_PER_RAD)
 
 
@@ -273,7 +297,8 @@ def two_signs() -> FailureCase:
 def antipodal() -> FailureCase:
     """The same attitude twice, with either sign."""
     error, fault = (
-        float(np.max([way_error_arcsec(between, sign, 0.0) for sign in (1.0, -1.0)])) for between in (slerp, arccos_slerp)
+        float(np.max([way_error_arcsec(between, sign, 0.0) for sign in (1.0, -1.0)]))
+        for between in (slerp, arccos_slerp)
     )
     return FailureCase(
         "SLERP from q to q and to -q",
@@ -312,13 +337,18 @@ def sampled_error_arcsec(turn_deg: float, with_rates: bool) -> float:
         attitude = timeline.at(t_ns)
         if attitude is None:
             raise AssertionError("a timeline with samples has an attitude")
-        worst = max(worst, angle_between_rad(attitude.q_icrs_to_cam, turned(turn_deg, t_ns / NS_PER_S / PERIOD_S)))
+        worst = max(
+            worst,
+            angle_between_rad(attitude.q_icrs_to_cam, turned(turn_deg, t_ns / NS_PER_S / PERIOD_S)),
+        )
     return worst * ARCSEC_PER_RAD
 
 
 def fast_turns() -> FailureCase:
     """Turns of about pi, and more, from sample to sample."""
-    error, fault = (max(sampled_error_arcsec(turn, rates) for turn in TURNS_DEG) for rates in (True, False))
+    error, fault = (
+        max(sampled_error_arcsec(turn, rates) for turn in TURNS_DEG) for rates in (True, False)
+    )
     just_under, just_over = (sampled_error_arcsec(turn, False) / 3600 for turn in TURNS_DEG[1:3])
     return FailureCase(
         f"{TURNS_DEG[0]:g} to {TURNS_DEG[-1]:g} degrees from sample to sample",
@@ -344,7 +374,10 @@ def not_a_number() -> FailureCase:
         numbers = [*START, 0.0, 0.0, 0.0]
         numbers[place] = value
         text = json.dumps({"t_ns": 1, "q": list(numbers[:4]), "rate": numbers[4:]})
-        for message in (encode(AttitudeSample(1, np.array(numbers[:4]), np.array(numbers[4:]))), text.encode()):
+        for message in (
+            encode(AttitudeSample(1, np.array(numbers[:4]), np.array(numbers[4:]))),
+            text.encode(),
+        ):
             taken += not isinstance(decode(message), Refusal)
             passed += norm_alone(tuple(numbers[:4]))
             sent += 1
@@ -367,10 +400,16 @@ def weak_perspectives() -> dict[str, FloatArray]:
 
 def turns() -> dict[str, FloatArray]:
     """Interpolation against the turn from one sample to the next."""
-    turn_deg = np.concatenate([np.linspace(5, 175, 35), [178.0, 179.9, 180.1, 182.0], np.linspace(185, 355, 35)])
+    turn_deg = np.concatenate(
+        [np.linspace(5, 175, 35), [178.0, 179.9, 180.1, 182.0], np.linspace(185, 355, 35)]
+    )
     curves = {
-        "straight line, normalised": [way_error_arcsec(straight_line, 1.0, float(t)) for t in turn_deg],
+        "straight line, normalised": [
+            way_error_arcsec(straight_line, 1.0, float(t)) for t in turn_deg
+        ],
         "SLERP (samples without rates)": [sampled_error_arcsec(float(t), False) for t in turn_deg],
         "samples with rates": [sampled_error_arcsec(float(t), True) for t in turn_deg],
     }
-    return {"turn_deg": turn_deg} | {f"{name} [arcsec]": np.array(errors) for name, errors in curves.items()}
+    return {"turn_deg": turn_deg} | {
+        f"{name} [arcsec]": np.array(errors) for name, errors in curves.items()
+    }

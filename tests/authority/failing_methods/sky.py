@@ -29,7 +29,13 @@ from hilstar.sky.electrons import (
     tabulate,
     tabulate_pickles,
 )
-from hilstar.sky.spectrum import BOLTZMANN_J_K, PLANCK_J_S, TEMPERATURE_SCALES, blackbody_exitance_w_m2_m, constant_curve
+from hilstar.sky.spectrum import (
+    BOLTZMANN_J_K,
+    PLANCK_J_S,
+    TEMPERATURE_SCALES,
+    blackbody_exitance_w_m2_m,
+    constant_curve,
+)
 from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
@@ -75,9 +81,18 @@ def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> FailureCase
     bv, zero, library = np.array([bv_mag]), np.zeros(1), load_library()
     spectrum = library_electrons_per_s(library, OPTICS, Photometry())[star]
     kelvin = {name: float(star_temperatures_k(bv, name)[0]) for name in TEMPERATURE_SCALES}
-    bodies = {name: float(dgs_electrons_per_s(t, OPTICS, Photometry())) / spectrum - 1 for name, t in kelvin.items()}
-    pickles = tabulate_pickles(OPTICS, Photometry()).electrons_per_s(zero, bv, np.array([np.nan]))[0] / spectrum - 1
-    fails = ", ".join(f"{name} {kelvin[name]:.0f} K, {100 * error:+.0f} %" for name, error in bodies.items())
+    bodies = {
+        name: float(dgs_electrons_per_s(t, OPTICS, Photometry())) / spectrum - 1
+        for name, t in kelvin.items()
+    }
+    pickles = (
+        tabulate_pickles(OPTICS, Photometry()).electrons_per_s(zero, bv, np.array([np.nan]))[0]
+        / spectrum
+        - 1
+    )
+    fails = ", ".join(
+        f"{name} {kelvin[name]:.0f} K, {100 * error:+.0f} %" for name, error in bodies.items()
+    )
     return FailureCase(
         f"B-V = {bv_mag:g}",
         "a black body by B-V",
@@ -119,7 +134,9 @@ def planck_overflow() -> FailureCase:
         overflows = int(np.isinf(np.exp(x)).sum())
     with np.errstate(all="raise", under="ignore"):
         ours = blackbody_exitance_w_m2_m(np.array(wavelength_m * 1e9), kelvin)
-    error, fault = (float((np.abs(curve - exact) / np.maximum(exact, scale)).max()) for curve in (ours, naive))
+    error, fault = (
+        float((np.abs(curve - exact) / np.maximum(exact, scale)).max()) for curve in (ours, naive)
+    )
     return FailureCase(
         "Planck at small and large lambda T",
         "exp(x) - 1 as the formula has it",
@@ -136,9 +153,15 @@ def source_step() -> FailureCase:
     jumps = {}
     for name, scale in TEMPERATURE_SCALES.items():
         kelvin = scale(around)
-        jumps[name] = float(kelvin[1] - kelvin[0]), _jump_mag(dgs_electrons_per_s(kelvin, OPTICS, Photometry()))
+        jumps[name] = (
+            float(kelvin[1] - kelvin[0]),
+            _jump_mag(dgs_electrons_per_s(kelvin, OPTICS, Photometry())),
+        )
     colours = np.zeros(2), around, around
-    jumps["pickles"] = 0.0, _jump_mag(tabulate_pickles(OPTICS, Photometry()).electrons_per_s(*colours))
+    jumps["pickles"] = (
+        0.0,
+        _jump_mag(tabulate_pickles(OPTICS, Photometry()).electrons_per_s(*colours)),
+    )
     kelvin_step, fault = jumps.pop("wang2021")
     return FailureCase(
         "B-V = 0",
@@ -198,7 +221,12 @@ def standard_errors(sample: FloatArray, mean: float, sigma: float) -> float:
     standard errors.
     """
     n = sample.size
-    return float(max(abs(sample.mean() - mean) / (sigma / n**0.5), abs(sample.std() - sigma) / (sigma / (2 * n) ** 0.5)))
+    return float(
+        max(
+            abs(sample.mean() - mean) / (sigma / n**0.5),
+            abs(sample.std() - sigma) / (sigma / (2 * n) ** 0.5),
+        )
+    )
 
 
 def by_product(mean: float, count: int, rng: np.random.Generator) -> FloatArray:
@@ -209,7 +237,9 @@ def by_product(mean: float, count: int, rng: np.random.Generator) -> FloatArray:
 
 def billion_electrons() -> FailureCase:
     """1e9 electrons in each pixel of a deep well."""
-    deep = Detector(DetectorSettings(gain_e_per_dn=GAIN_E_PER_DN, full_well_e=1e12, bits=16), SIZE_PX)
+    deep = Detector(
+        DetectorSettings(gain_e_per_dn=GAIN_E_PER_DN, full_well_e=1e12, bits=16), SIZE_PX
+    )
     dn = deep.expose(np.full(SIZE_PX, BILLION_E), 1.0, np.random.default_rng(SEED))
     drawn_e = dn.astype(np.float64) * GAIN_E_PER_DN
     product_e = by_product(BILLION_E, drawn_e.size, np.random.default_rng(SEED))
@@ -228,9 +258,15 @@ def billion_electrons() -> FailureCase:
 def full_well() -> FailureCase:
     """1e9 electrons in each pixel of a CCD47-20."""
     settings = DetectorSettings()
-    dn = Detector(settings, SIZE_PX).expose(np.full(SIZE_PX, BILLION_E), 1.0, np.random.default_rng(SEED))
+    dn = Detector(settings, SIZE_PX).expose(
+        np.full(SIZE_PX, BILLION_E), 1.0, np.random.default_rng(SEED)
+    )
     wanted = settings.full_well_e / settings.gain_e_per_dn
-    wrapped = np.rint(np.full(SIZE_PX, BILLION_E) / settings.gain_e_per_dn).astype(np.int64).astype(np.uint16)
+    wrapped = (
+        np.rint(np.full(SIZE_PX, BILLION_E) / settings.gain_e_per_dn)
+        .astype(np.int64)
+        .astype(np.uint16)
+    )
     error, fault = (float(np.abs(shown - wanted).max()) for shown in (dn, wrapped))
     return FailureCase(
         "a full well",
@@ -242,7 +278,9 @@ def full_well() -> FailureCase:
     )
 
 
-def simulated_dn(exposure_s: float, background_e: float, faintest_v_mag: float) -> tuple[FloatArray, int]:
+def simulated_dn(
+    exposure_s: float, background_e: float, faintest_v_mag: float
+) -> tuple[FloatArray, int]:
     """Orion on a small detector, DN (256, 256), and how many stars are in it."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
@@ -307,7 +345,9 @@ def nan_pixel() -> FailureCase:
     lines, taken = [], 0
     for road in (
         find_stars,
-        lambda light: Detector(DetectorSettings(), SIZE_PX).expose(light, 1.0, np.random.default_rng(SEED)),
+        lambda light: Detector(DetectorSettings(), SIZE_PX).expose(
+            light, 1.0, np.random.default_rng(SEED)
+        ),
     ):
         try:
             road(image)

@@ -101,7 +101,13 @@ def sky(folder: Path, *options: str) -> Iterator[Sky]:
 def run(tmp_path_factory) -> Iterator[Sky]:
     folder = tmp_path_factory.mktemp("page")
     (folder / "faults.toml").write_text(SCENARIO)
-    options = ("--control", "--ledger", str(folder / "run.mcap"), "--scenario", str(folder / "faults.toml"))
+    options = (
+        "--control",
+        "--ledger",
+        str(folder / "run.mcap"),
+        "--scenario",
+        str(folder / "faults.toml"),
+    )
     with sky(folder, *options) as shown:
         yield shown
 
@@ -112,7 +118,9 @@ def live(page, run) -> Browser:
     run.sending.set()
     run.turning.set()
     page.get(run.url)
-    page.until("document.body.dataset.ok === 'true' && document.getElementById('picture').dataset.frame")
+    page.until(
+        "document.body.dataset.ok === 'true' && document.getElementById('picture').dataset.frame"
+    )
     page.run("scrollTo(0, 0)")
     return page
 
@@ -131,7 +139,10 @@ def pictures_in_a_second(page: Browser) -> int:
 
 
 def events(run: Sky) -> list[EventRecord]:
-    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(run.folder / "run.mcap", "/event")]
+    return [
+        msgspec.json.decode(data, type=EventRecord)
+        for data in read_messages(run.folder / "run.mcap", "/event")
+    ]
 
 
 def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
@@ -141,8 +152,12 @@ def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
     run.stand_still()
     wanted = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))
     # Four decimals are shown.
-    live.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {wanted[0]}) < 1e-4")
-    live.until(f"Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) - {wanted[1]}) < 1e-4")
+    live.until(
+        f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {wanted[0]}) < 1e-4"
+    )
+    live.until(
+        f"Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) - {wanted[1]}) < 1e-4"
+    )
 
 
 def test_single_pixels_have_the_codes_of_that_attitude(live, run):
@@ -151,7 +166,9 @@ def test_single_pixels_have_the_codes_of_that_attitude(live, run):
         codes = bench.frame(np.array(run.q())).codes
     y, x = np.unravel_index(np.argmax(codes), codes.shape)
     shown_deg = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))[0]
-    live.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {shown_deg}) < 1e-4")
+    live.until(
+        f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {shown_deg}) < 1e-4"
+    )
     first = frame_of(live)
     live.until(f"document.getElementById('picture').dataset.frame > {first}")
     time.sleep(1)  # until the pictures that were on their way have come
@@ -173,8 +190,17 @@ def assert_overlay(page: Browser, before: str, same: bool) -> None:
 def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
     ActionChains(live).send_keys("h").perform()
     time.sleep(0.3)  # the truth of the picture that is held comes beside it
-    for key, name in (("n", "names"), ("m", "magnitudes"), ("t", "truth"), ("x", "boresight"), ("f", "tracker")):
-        before, pressed = pixels(live, "overlay"), live.find(f"#overlay-{name}").get_attribute("aria-pressed")
+    for key, name in (
+        ("n", "names"),
+        ("m", "magnitudes"),
+        ("t", "truth"),
+        ("x", "boresight"),
+        ("f", "tracker"),
+    ):
+        before, pressed = (
+            pixels(live, "overlay"),
+            live.find(f"#overlay-{name}").get_attribute("aria-pressed"),
+        )
         ActionChains(live).send_keys(key).perform()
         assert live.find(f"#overlay-{name}").get_attribute("aria-pressed") != pressed
         assert_overlay(live, before, same=False)
@@ -190,9 +216,14 @@ def test_labels_are_few_and_none_stands_over_the_codes(live):
     """A label for each 24 000 px of the picture at most, and the field's besides; codes lie over
     everything.
     """
-    area_px = live.run("const c = document.getElementById('overlay'); return c.clientWidth * c.clientHeight")
+    area_px = live.run(
+        "const c = document.getElementById('overlay'); return c.clientWidth * c.clientHeight"
+    )
     live.until("Number(document.getElementById('overlay').dataset.labels) > 3")
-    assert float(live.run("return document.getElementById('overlay').dataset.labels")) <= area_px / 24_000 + 2
+    assert (
+        float(live.run("return document.getElementById('overlay').dataset.labels"))
+        <= area_px / 24_000 + 2
+    )
     ActionChains(live).send_keys("h", "9").perform()
     live.until("document.getElementById('overlay').dataset.labels === '0'")
     assert live.text("#picture-text").split()[-1] != "%"  # the star is named below the picture
@@ -221,12 +252,23 @@ import("/static/charts.js").then(({ Chart }) => {
 
 def test_durations_are_in_the_unit_that_a_person_reads(live):
     told = [text.replace("\u00a0", " ") for text in live.run_async(DURATIONS)]
-    assert told == ["36.5 s", "12 min 05 s", "2 h 03 min", "12.5 ms", "1.0 s", "\u2212250.0 ms", "\u22123.0 s"]
+    assert told == [
+        "36.5 s",
+        "12 min 05 s",
+        "2 h 03 min",
+        "12.5 ms",
+        "1.0 s",
+        "\u2212250.0 ms",
+        "\u22123.0 s",
+    ]
 
 
 def test_a_chart_s_headline_is_its_newest_value_though_the_last_moments_have_none(live):
     """A run slower than the page's ten points a second: every other point is without a frame."""
-    assert [text.replace("\u00a0", " ") for text in live.run_async(LATE_POINT)] == ["12.0 ms", "\u2013"]
+    assert [text.replace("\u00a0", " ") for text in live.run_async(LATE_POINT)] == [
+        "12.0 ms",
+        "\u2013",
+    ]
 
 
 def test_what_a_page_may_do_and_the_ledger_say_it_in_words(live):
@@ -260,7 +302,9 @@ def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
     with CoreWaits(live.service.process.pid) as waited, CoreWaits(run.served.process.pid) as held:
         took_ms = red_after_stale_ms(live, run)
     assert took_ms - (waited.s + held.s) * 1000 < RED_MS, (took_ms, waited.s, held.s)
-    assert live.text("#health-headline") == "Sky is not right" and "stale" in live.text("#health-reasons")
+    assert live.text("#health-headline") == "Sky is not right" and "stale" in live.text(
+        "#health-reasons"
+    )
     assert live.text("#health-icon") == "!"  # by shape and word, not by colour alone
     assert live.text("#attitude-state") == "stale"
     assert live.run("return document.title").startswith("✗")
@@ -280,9 +324,13 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     name.send_keys("Ada Løve", Keys.TAB)
     for control in ("crosshair", "grid", "patch", "pause"):
         live.press(f"#control-{control}")
-        live.until(f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'true'")
+        live.until(
+            f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'true'"
+        )
         live.press(f"#control-{control}")
-        live.until(f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'false'")
+        live.until(
+            f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'false'"
+        )
     live.press("#control-blank")
     assert live.text("#control-blank") == "Press again: blank"
     live.press("#control-blank")
@@ -298,7 +346,9 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     live.press("#control-fault")
     live.until("document.getElementById('control-fault').textContent === 'Inject'")
     live.until("document.body.dataset.ok === 'true'")
-    wait_for(lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger")
+    wait_for(
+        lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger"
+    )
     mark = next(record for record in events(run) if "shutter" in record.detail)
     assert "Ada Løve" in mark.detail
     assert [(record.detail.split()[-4], record.who) for record in events_of(run, "fault", 2)] == [
@@ -321,8 +371,20 @@ def test_by_the_keyboard_alone(live):
         element = live.switch_to.active_element
         reached.add(element.get_attribute("id"))
         if element.tag_name == "button":
-            assert live.run("return getComputedStyle(arguments[0]).outlineStyle", element) == "solid"
-    wanted = {"theme", "overlay-names", "zoom-fit", "hold", "stretch", "control-blank", "mark-text", "control-mark", "events"}
+            assert (
+                live.run("return getComputedStyle(arguments[0]).outlineStyle", element) == "solid"
+            )
+    wanted = {
+        "theme",
+        "overlay-names",
+        "zoom-fit",
+        "hold",
+        "stretch",
+        "control-blank",
+        "mark-text",
+        "control-mark",
+        "events",
+    }
     assert wanted <= reached
 
 
@@ -335,7 +397,10 @@ def test_who_asks_for_less_motion_gets_fewer_pictures_and_no_transitions(page, r
     page.get(run.url)
     page.until("document.getElementById('picture').dataset.frame")
     assert any(2 <= pictures_in_a_second(page) <= 4 for _ in range(CHANCES))  # of 2 Hz
-    assert page.run("return getComputedStyle(document.getElementById('hold')).transitionDuration") == "0s"
+    assert (
+        page.run("return getComputedStyle(document.getElementById('hold')).transitionDuration")
+        == "0s"
+    )
 
 
 def test_without_control_the_page_only_shows(page, tmp_path):
@@ -343,9 +408,15 @@ def test_without_control_the_page_only_shows(page, tmp_path):
         page.get(shown.url)
         page.until("document.body.dataset.ok === 'true'")
         assert page.run(f"return {ALL_DISABLED}")
-        assert "--control" in page.text("#controls-note") and page.text("#control-state") == "read-only"
+        assert (
+            "--control" in page.text("#controls-note")
+            and page.text("#control-state") == "read-only"
+        )
         assert page.run_async(TRY_TO_BLANK) == 403
-        wait_for(lambda: any("403" in line for line in page.complaints()), "the browser's own line about it")
+        wait_for(
+            lambda: any("403" in line for line in page.complaints()),
+            "the browser's own line about it",
+        )
         page.get("about:blank")
 
 

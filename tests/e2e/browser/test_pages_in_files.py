@@ -27,7 +27,15 @@ def session(tmp_path_factory):
     (folder / "bench.toml").write_text(bench_text(TWIN))
     (folder / "truth.toml").write_text(bench_text(TWIN, {"monitor": {"flip_x": True}}) + WARM_UP)
     done = run_hilstar_here(
-        "first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml", "--patches", 0, "--json"
+        "first-light",
+        folder / "bench.toml",
+        "-o",
+        folder / "s",
+        "--virtual",
+        folder / "truth.toml",
+        "--patches",
+        0,
+        "--json",
     )
     assert done.returncode == 0, done.stderr
     return folder / "s" / "first-light.html", json.loads(done.stdout)["steps"]
@@ -46,7 +54,9 @@ def test_each_step_has_its_card_verdict_and_number(page, session):
         else:
             assert step["number"]["of"] in number and step["number"]["unit"] in number
             assert ("\N{PLUS-MINUS SIGN}" in number) == (step["number"]["error"] is not None)
-        assert page.run("return document.querySelectorAll(arguments[0] + ' > figure').length", card) == bool(step["pictures"])
+        assert page.run(
+            "return document.querySelectorAll(arguments[0] + ' > figure').length", card
+        ) == bool(step["pictures"])
         assert not page.run("return document.querySelector(arguments[0] + ' details').open", card)
     assert page.text(".health").startswith("What was measured is in order")
 
@@ -56,7 +66,10 @@ def test_the_planted_warm_up_comes_back_within_its_errors(session):
     assert found["law"] == "exponential" and found["stable"] == "yes"
     off_s = found["stable_after_s"] - found["truth_stable_after_s"]
     assert abs(off_s) < 3 * found["stable_after_error_s"] < 60
-    assert abs(found["drift_percent_per_h"] - found["truth_drift_percent_per_h"]) < 3 * found["drift_error_percent_per_h"]
+    assert (
+        abs(found["drift_percent_per_h"] - found["truth_drift_percent_per_h"])
+        < 3 * found["drift_error_percent_per_h"]
+    )
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -70,10 +83,15 @@ def test_nothing_reaches_out_of_the_window_or_the_file(page, session, size_px, s
     assert page.overflowing() == []
     assert page.run("return document.documentElement.scrollWidth") <= size_px[0]
     assert (
-        page.run("return performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length") == 0
+        page.run(
+            "return performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length"
+        )
+        == 0
     )
     assert not re.search(r"(?:src|href|url)\s*[=(]\s*['\"]?(?!data:|#)[\w/.]", path.read_text())
-    assert page.run("return [...document.images].every(each => each.complete && each.naturalWidth > 0)")
+    assert page.run(
+        "return [...document.images].every(each => each.complete && each.naturalWidth > 0)"
+    )
     ground = page.run("return getComputedStyle(document.body).backgroundColor")
     assert ground == {"light": "rgb(238, 241, 246)", "dark": "rgb(10, 13, 19)"}[scheme]
 
@@ -85,12 +103,16 @@ def test_printed_on_a4_no_picture_is_cut(page, session):
     heights = page.run(
         "return [...document.querySelectorAll('.card, figure')].map(each => each.getBoundingClientRect().height)"
     )
-    whole = page.run("return getComputedStyle(document.querySelector('.card.pictured')).breakInside")
+    whole = page.run(
+        "return getComputedStyle(document.querySelector('.card.pictured')).breakInside"
+    )
     wide = page.run("return document.documentElement.scrollWidth")
     page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     assert whole == "avoid" and wide <= A4_PX[0]
     assert 0 < max(heights) < A4_PX[1]
     pdf = base64.b64decode(
-        page.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True, "printBackground": True})["data"]
+        page.execute_cdp_cmd(
+            "Page.printToPDF", {"preferCSSPageSize": True, "printBackground": True}
+        )["data"]
     )
     assert pdf.startswith(b"%PDF") and 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 8

@@ -32,9 +32,19 @@ TURN_RAD = 2e-4  # a frame
 
 def record(k: int) -> FrameRecord:
     at_ns = 10**12 + k * PERIOD_NS
-    q = tuple(multiply(from_rotation_vector(np.array([0.0, TURN_RAD * k, 0.0])), np.array(ORION_Q)).tolist())
+    q = tuple(
+        multiply(
+            from_rotation_vector(np.array([0.0, TURN_RAD * k, 0.0])), np.array(ORION_Q)
+        ).tolist()
+    )
     age_ns = 400_000_000 if 300 <= k < 330 else 8_000_000 + 10_000 * (k % 50)
-    times = {"t_ns": at_ns, "light_ns": at_ns, "draw_ns": at_ns - 4_000_000, "swap_ns": at_ns, "age_ns": age_ns}
+    times = {
+        "t_ns": at_ns,
+        "light_ns": at_ns,
+        "draw_ns": at_ns - 4_000_000,
+        "swap_ns": at_ns,
+        "age_ns": age_ns,
+    }
     missed = {"missed_before": 2 if k == 450 else 0, "missed": 2 if k >= 450 else 0}
     missed |= {"faults": (1,), "fault_since_ns": (10**12,)} if k in FAULTY else {}
     return FrameRecord(frame=k, q=q, stale=age_ns > 250_000_000, stars_drawn=200, **times, **missed)
@@ -43,7 +53,13 @@ def record(k: int) -> FrameRecord:
 def answer(k: int) -> AnswerRecord:
     """The tracker's answer with frame k: lost in the fault, and wrong once."""
     at_ns = 10**12 + k * PERIOD_NS
-    found = AnswerRecord(host_ns=at_ns + 10**8, raw="", middle_ns=at_ns, verdict="right", residual_arcsec=(2.0, -3.0, 9.0))
+    found = AnswerRecord(
+        host_ns=at_ns + 10**8,
+        raw="",
+        middle_ns=at_ns,
+        verdict="right",
+        residual_arcsec=(2.0, -3.0, 9.0),
+    )
     if k in FAULTY:
         found.verdict, found.residual_arcsec, found.valid = "invalid", None, False
     elif k == 420:
@@ -59,9 +75,20 @@ def report_file(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     (folder / "bench.toml").write_text(SMALL_BENCH)
     with hilstar.load(folder / "bench.toml") as bench, Ledger(folder / "run.mcap", bench) as ledger:
-        ghost = json.dumps({"kind": "false-star", "name": "ghost", "radec_deg": [84.0, -1.0], "v_mag": 2.0})
+        ghost = json.dumps(
+            {"kind": "false-star", "name": "ghost", "radec_deg": [84.0, -1.0], "v_mag": 2.0}
+        )
         ledger.fault(
-            FaultRecord(host_ns=1, event="start", number=1, name="ghost", kind="false-star", who="", t_ns=0, table=ghost)
+            FaultRecord(
+                host_ns=1,
+                event="start",
+                number=1,
+                name="ghost",
+                kind="false-star",
+                who="",
+                t_ns=0,
+                table=ghost,
+            )
         )
         for k in range(FRAMES):
             ledger.frame(record(k))
@@ -85,13 +112,21 @@ def report(page, report_file) -> Browser:
 
 
 def chart_aria(page: Browser, name: str) -> str:
-    return page.run(f"return document.querySelector('#chart-{name} canvas').getAttribute('aria-label')")
+    return page.run(
+        f"return document.querySelector('#chart-{name} canvas').getAttribute('aria-label')"
+    )
 
 
 def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
-    text = {name: report.text(f"#{name}") for name in ("health-headline", "health-reasons", "summary", "events", "refusals")}
+    text = {
+        name: report.text(f"#{name}")
+        for name in ("health-headline", "health-reasons", "summary", "events", "refusals")
+    }
     assert text["health-headline"] == "Sky was not right throughout"
-    assert "30 of 600 frames with a stale attitude" in text["health-reasons"] and "2 refresh periods" in text["health-reasons"]
+    assert (
+        "30 of 600 frames with a stale attitude" in text["health-reasons"]
+        and "2 refresh periods" in text["health-reasons"]
+    )
     assert "<img src=x onerror=alert(1)>" in text["events"]  # as text, never as a tag
     assert "format" in text["refusals"]
     age = chart_aria(report, "age")
@@ -114,18 +149,26 @@ def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(report):
 
 def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(report):
     words = chart_aria(report, "residual")
-    assert "x 2.0 to 2.0" in words and "z 9.0 to 9.0" in words and "1 wrong" in words and "1 fault on" in words
+    assert (
+        "x 2.0 to 2.0" in words
+        and "z 9.0 to 9.0" in words
+        and "1 wrong" in words
+        and "1 fault on" in words
+    )
     cells = [cell.text for cell in report.find_elements("css selector", "#fault-table td")]
     assert cells[0] == "ghost" and cells[2] == "100.0 % / 0.0 % / 98.3 %" and cells[5] == "none"
-    assert "100 ms" not in report.text("#fault-table") and "tracker's answers" in report.text("#summary").lower()
+    assert (
+        "100 ms" not in report.text("#fault-table")
+        and "tracker's answers" in report.text("#summary").lower()
+    )
 
 
 def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
     chart = report.find("#chart-age canvas")
     width = chart.size["width"]
-    ActionChains(report).move_to_element_with_offset(chart, -round(width * 0.4), 0).click_and_hold().move_by_offset(
-        round(width * 0.2), 0
-    ).release().perform()
+    ActionChains(report).move_to_element_with_offset(
+        chart, -round(width * 0.4), 0
+    ).click_and_hold().move_by_offset(round(width * 0.2), 0).release().perform()
     assert "of 10.0" in report.text("#range-text")
     assert "8.0 to 8.5" in chart_aria(report, "age") and "0 stale" in chart_aria(report, "age")
     assert "0 missed" in chart_aria(report, "pacing")
@@ -146,7 +189,9 @@ def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
 
 
 def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(report, report_file):
-    report.run("[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind === 'stale').click()")
+    report.run(
+        "[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind === 'stale').click()"
+    )
     assert report.text("#attitude-state") == "at 5 s"
     pictures = run_data_of(report_file.read_text())["pictures"]
     nearest = min(pictures, key=lambda picture: abs(picture["t_s"] - 5.0))

@@ -7,7 +7,15 @@ from __future__ import annotations
 import pytest
 
 from tests.support.any_bench.draw import drawn_bench, write_bench
-from tests.support.any_bench.judge import FIRST_LIGHT, GOOD_OUTCOMES, MAX_SIGMAS, VERIFY, CommandResult, comparisons, outcome_of
+from tests.support.any_bench.judge import (
+    FIRST_LIGHT,
+    GOOD_OUTCOMES,
+    MAX_SIGMAS,
+    VERIFY,
+    CommandResult,
+    comparisons,
+    outcome_of,
+)
 from tests.support.commands import run_hilstar_here
 
 SEED, SMALL_SEED = 1, 48
@@ -53,7 +61,9 @@ def test_a_small_bench_s_places_are_within_their_errors(tmp_path, number):
     bench = drawn_bench(SMALL_SEED, number, is_small=True)
     results = results_of(bench, tmp_path, (FIRST_LIGHT,))
     steps = {step["name"]: step for step in results[FIRST_LIGHT].found["steps"]}
-    assert all(steps[name]["verdict"] == "done" for name in ("orientation", "focus", "geometry", "scale"))
+    assert all(
+        steps[name]["verdict"] == "done" for name in ("orientation", "focus", "geometry", "scale")
+    )
     compared = comparisons(bench, tmp_path, steps)
     assert {"focus", "geometry", "scale"} <= compared.keys()
     off = {name: one.sigmas for name, one in compared.items() if name in PLACES}

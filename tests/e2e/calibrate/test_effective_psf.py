@@ -53,8 +53,12 @@ def light(parts, x, y, columns, rows):
     """What pixels get of points (n,) through the parts, mean over the points."""
     total = np.zeros((len(rows), len(columns)))
     for weight, off_x, off_y, sx, sy in parts:
-        across = ndtr((columns + 0.5 - x[:, None] - off_x) / sx) - ndtr((columns - 0.5 - x[:, None] - off_x) / sx)
-        down = ndtr((rows + 0.5 - y[:, None] - off_y) / sy) - ndtr((rows - 0.5 - y[:, None] - off_y) / sy)
+        across = ndtr((columns + 0.5 - x[:, None] - off_x) / sx) - ndtr(
+            (columns - 0.5 - x[:, None] - off_x) / sx
+        )
+        down = ndtr((rows + 0.5 - y[:, None] - off_y) / sy) - ndtr(
+            (rows - 0.5 - y[:, None] - off_y) / sy
+        )
         total += weight * down.T @ across / len(x)
     return total
 
@@ -76,10 +80,19 @@ def session(folder, lens):
         image = np.zeros((SIZE[1] + 24, SIZE[0] + 24))
         for k in np.flatnonzero(plan.lit[:, frame]):
             columns, rows, stamp = dots[k]
-            if columns[0] >= -12 and rows[0] >= -12 and columns[-1] < SIZE[0] + 12 and rows[-1] < SIZE[1] + 12:
-                image[rows[0] + 12 : rows[-1] + 13, columns[0] + 12 : columns[-1] + 13] += DOT_E * stamp
+            if (
+                columns[0] >= -12
+                and rows[0] >= -12
+                and columns[-1] < SIZE[0] + 12
+                and rows[-1] < SIZE[1] + 12
+            ):
+                image[rows[0] + 12 : rows[-1] + 13, columns[0] + 12 : columns[-1] + 13] += (
+                    DOT_E * stamp
+                )
         image = rng.poisson(image[12:-12, 12:-12]) + FLOOR_DN + rng.normal(0, NOISE_DN, SIZE[::-1])
-        Image.fromarray(np.rint(image).astype(np.uint16)).save(folder / f"frame_{frame:03}.png", compress_level=1)
+        Image.fromarray(np.rint(image).astype(np.uint16)).save(
+            folder / f"frame_{frame:03}.png", compress_level=1
+        )
 
 
 def calibrated(folder, *options):

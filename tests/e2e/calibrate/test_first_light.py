@@ -20,7 +20,12 @@ from hilstar.basics import charts
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.display.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
+from hilstar.display.calibration import (
+    CalibrationHead,
+    NotesTable,
+    load_calibration,
+    write_calibration,
+)
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.instruments.calibrate.first_light.photometry import response_error_mag
@@ -68,7 +73,9 @@ def plant(folder, **monitor):
     length, light, and delay.
     """
     (folder / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
-    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv"
+    )
     light = {"w": BLACK + gamma_response(10, GAMMA).light}
     write_calibration(folder / "true-response.toml", head, light, 0.0, NotesTable())
     changed = {
@@ -81,10 +88,17 @@ def plant(folder, **monitor):
     size = tuple(read_bench_file(folder / "bench.toml").config.monitor.resolution_px)
     size = size[::-1] if monitor.get("rotate_deg", 0) % 180 else size
     if size != (640, 480):
-        (folder / "truth.toml").write_text(bench_text(TWIN, changed, {"monitor": {"resolution_px": list(size)}}))
+        (folder / "truth.toml").write_text(
+            bench_text(TWIN, changed, {"monitor": {"resolution_px": list(size)}})
+        )
     centre = ((size[0] - 1) / 2 + 15, (size[1] - 1) / 2 - 8)
     lens = Lens((0.6, 0.0, 0.0), (0.0, 0.0), (math.radians(1.0), math.radians(-0.4)))
-    write_geometry(folder / "true.toml", Camera(size, 120e3 / 57.65 * 1.01, centre, to_matrix(q), lens), q, NOTES)
+    write_geometry(
+        folder / "true.toml",
+        Camera(size, 120e3 / 57.65 * 1.01, centre, to_matrix(q), lens),
+        q,
+        NOTES,
+    )
     return folder
 
 
@@ -93,12 +107,21 @@ def places_off_arcsec(folder):
     directions of its field.
     """
     cameras = [
-        bench_camera(file.config, folder) for file in map(read_bench_file, (folder / "bench.toml", folder / "truth.toml"))
+        bench_camera(file.config, folder)
+        for file in map(read_bench_file, (folder / "bench.toml", folder / "truth.toml"))
     ]
-    sides = [np.linspace((1 - SEEN_SHARE) / 2, (1 + SEEN_SHARE) / 2, 15) * (size - 1) for size in cameras[0].resolution_px]
+    sides = [
+        np.linspace((1 - SEEN_SHARE) / 2, (1 + SEEN_SHARE) / 2, 15) * (size - 1)
+        for size in cameras[0].resolution_px
+    ]
     x, y = (part.ravel() for part in np.meshgrid(*sides))
-    mine, its = (rays / np.linalg.norm(rays, axis=1)[:, None] for rays in (camera.rays(x, y) for camera in cameras))
-    return float(np.sqrt((np.linalg.norm(np.cross(mine, its), axis=1) ** 2).mean()) * ARCSEC_PER_RAD)
+    mine, its = (
+        rays / np.linalg.norm(rays, axis=1)[:, None]
+        for rays in (camera.rays(x, y) for camera in cameras)
+    )
+    return float(
+        np.sqrt((np.linalg.norm(np.cross(mine, its), axis=1) ** 2).mean()) * ARCSEC_PER_RAD
+    )
 
 
 def go(folder, *more):
@@ -128,8 +151,15 @@ def whole(tmp_path_factory):
 
 def test_a_wrong_response_fails_the_light_and_not_the_places(whole):
     _, _, before = whole
-    verdicts = {name: before[name]["verdict"] for name in ("geometry", "photometry", "scale", "verify")}
-    assert verdicts == {"geometry": "done", "photometry": "skipped", "scale": "failed", "verify": "failed"}
+    verdicts = {
+        name: before[name]["verdict"] for name in ("geometry", "photometry", "scale", "verify")
+    }
+    assert verdicts == {
+        "geometry": "done",
+        "photometry": "skipped",
+        "scale": "failed",
+        "verify": "failed",
+    }
     assert "photometry" in before["scale"]["line"]
     figures = before["verify"]["figures"]
     assert figures["star_p95_px"] < 0.1  # [verify] centroid_px
@@ -146,7 +176,9 @@ def test_the_response_and_the_full_scale_are_found_and_mended(whole):
     assert light["black_level"] == pytest.approx(BLACK, rel=0.02)
     assert light["bench_file_off_max_mag"] > 0.3
     assert light["truth_max_mag"] < RESPONSE_MAG
-    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(WHITE_E_PER_S, rel=SCALE_MAG)
+    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(
+        WHITE_E_PER_S, rel=SCALE_MAG
+    )
     assert steps["latency"]["figures"]["panel_delay_ms"] == pytest.approx(DELAY_MS, abs=EDGE_MS)
     figures = steps["verify"]["figures"]
     assert max(figures["flux_p95_mag"], figures["twin_flux_p95_mag"]) < 0.05
@@ -194,23 +226,53 @@ def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path
     steps = {step["name"]: step["figures"] for step in found["steps"]}
     images = folder / "s" / "images" / "geometry-1"
     frames = sorted(images.glob("frame_*.png"))
-    words = ["--plan", images, "--dark", images / "dark_000.png", "--tracker-is-ideal", "-o", tmp_path / "geometry.toml"]
+    words = [
+        "--plan",
+        images,
+        "--dark",
+        images / "dark_000.png",
+        "--tracker-is-ideal",
+        "-o",
+        tmp_path / "geometry.toml",
+    ]
     geometry = again_by_hand(folder, "geometric", folder / "bench.toml", *frames, *words)
     assert geometry["model"] == steps["geometry"]["model"]
-    assert geometry["held_out"]["rms_arcsec"] == pytest.approx(steps["geometry"]["held_out_rms_arcsec"], rel=SAME)
-    assert geometry["error"]["rms_arcsec"] == pytest.approx(steps["geometry"]["error_rms_arcsec"], rel=SAME)
+    assert geometry["held_out"]["rms_arcsec"] == pytest.approx(
+        steps["geometry"]["held_out_rms_arcsec"], rel=SAME
+    )
+    assert geometry["error"]["rms_arcsec"] == pytest.approx(
+        steps["geometry"]["error_rms_arcsec"], rel=SAME
+    )
     focal = geometry["parameters"]["focal_length_px"]["value"]
     assert focal == pytest.approx(steps["geometry"]["focal_length_px"], rel=SAME)
-    light = again_by_hand(folder, "photometric", folder / "s" / "measured.csv", "--bits", 10, "-o", tmp_path / "response.toml")
-    assert light["holdout"]["rms_mag"] == pytest.approx(steps["photometry"]["held_out_rms_mag"], rel=SAME)
-    assert light["black_level"]["relative"] == pytest.approx(steps["photometry"]["black_level"], rel=SAME)
+    light = again_by_hand(
+        folder,
+        "photometric",
+        folder / "s" / "measured.csv",
+        "--bits",
+        10,
+        "-o",
+        tmp_path / "response.toml",
+    )
+    assert light["holdout"]["rms_mag"] == pytest.approx(
+        steps["photometry"]["held_out_rms_mag"], rel=SAME
+    )
+    assert light["black_level"]["relative"] == pytest.approx(
+        steps["photometry"]["black_level"], rel=SAME
+    )
     # As the bench file was before the step: white as it had it.
     text = (folder / "bench.toml").read_text()
     before = folder / "before-scale.toml"
-    now, then = (steps["scale"][name] for name in ("flux_at_white_e_per_s", "in_bench_file_e_per_s"))
-    before.write_text(re.sub(r"flux_at_white_e_per_s = .*", f"flux_at_white_e_per_s = {then!r}", text))
+    now, then = (
+        steps["scale"][name] for name in ("flux_at_white_e_per_s", "in_bench_file_e_per_s")
+    )
+    before.write_text(
+        re.sub(r"flux_at_white_e_per_s = .*", f"flux_at_white_e_per_s = {then!r}", text)
+    )
     readings = (folder / "s" / "readings.csv").read_text().splitlines()[1:]
-    scale = again_by_hand(folder, "scale", before, *(word for line in readings for word in ("--reading", line)))
+    scale = again_by_hand(
+        folder, "scale", before, *(word for line in readings for word in ("--reading", line))
+    )
     assert scale["flux_at_white_e_per_s"] == pytest.approx(now, rel=SAME)
 
 
@@ -233,12 +295,24 @@ def test_what_is_done_is_not_done_again(whole):
     assert again.returncode == 0
     assert sorted((folder / "s" / "images").iterdir()) == images
     assert virtually(folder, *FEW, "--again", "focus").returncode == 0
-    assert [path.name for path in sorted((folder / "s" / "images").iterdir()) if path not in images] == ["focus-2"]
+    assert [
+        path.name for path in sorted((folder / "s" / "images").iterdir()) if path not in images
+    ] == ["focus-2"]
 
 
 def started(folder, *more):
-    words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml", *more]
-    return Started([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    words = [
+        "first-light",
+        folder / "bench.toml",
+        "-o",
+        folder / "s",
+        "--virtual",
+        folder / "truth.toml",
+        *more,
+    ]
+    return Started(
+        [*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def ended_at(process, folder, image, ending):
@@ -252,7 +326,10 @@ def ended_at(process, folder, image, ending):
         time.sleep(0.01)
     process.send_signal(ending)
     process.wait(PATIENCE_S)
-    return {path: path.stat().st_mtime_ns for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/[!.]*.png"))}
+    return {
+        path: path.stat().st_mtime_ns
+        for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/[!.]*.png"))
+    }
 
 
 def untouched(taken):
@@ -281,7 +358,17 @@ def test_a_session_that_is_stopped_or_killed_half_way_says_so_and_goes_on_where_
     assert resumed.returncode == 0, resumed.stderr
     assert untouched(readings) == len(readings) - 1 > 10
     names = [
-        f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "uniformity", "verify", "warm-up")
+        f"{name}-1"
+        for name in (
+            "focus",
+            "geometry",
+            "orientation",
+            "photometry",
+            "scale",
+            "uniformity",
+            "verify",
+            "warm-up",
+        )
     ]
     assert sorted(path.name for path in (folder / "s" / "images").iterdir()) == names
     assert not list((folder / "s").rglob("*.part*"))
@@ -298,7 +385,16 @@ def test_the_truth_that_comes_with_hilstar_is_found(tmp_path):
     """
     shutil.copy(resource_path("configs", "demo.toml"), tmp_path / "bench.toml")
     result = run_hilstar_here(
-        "first-light", "bench.toml", "-o", "s", "--virtual", "truth-example.toml", "--patches", 60, "--json", cwd=tmp_path
+        "first-light",
+        "bench.toml",
+        "-o",
+        "s",
+        "--virtual",
+        "truth-example.toml",
+        "--patches",
+        60,
+        "--json",
+        cwd=tmp_path,
     )
     assert result.returncode == 0, result.stderr
     steps = steps_of(result)
@@ -331,14 +427,21 @@ def test_images_come_from_a_command(tmp_path):
     assert light["black_level_measured"].startswith("no")
     measured = load_calibration(tmp_path / "s" / "response.toml", 10).response
     assert np.abs(response_error_mag(measured, srgb)).max() < RESPONSE_MAG
-    white_e_per_s = plain_camera.WHITE_DN_PER_S * read_bench_file(tmp_path / "bench.toml").config.tracker.detector.gain_e_per_dn
-    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(white_e_per_s, rel=SCALE_MAG)
+    white_e_per_s = (
+        plain_camera.WHITE_DN_PER_S
+        * read_bench_file(tmp_path / "bench.toml").config.tracker.detector.gain_e_per_dn
+    )
+    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(
+        white_e_per_s, rel=SCALE_MAG
+    )
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
     assert steps["verify"]["figures"]["flux_p95_mag"] < 0.05
 
 
 def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp_path):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"tracker": {"exposure_s": 0.045}, "render": {"tolerance_px": 0.02}}))
+    (tmp_path / "bench.toml").write_text(
+        bench_text(TWIN, {"tracker": {"exposure_s": 0.045}, "render": {"tolerance_px": 0.02}})
+    )
     fails = f"{sys.executable} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}} {{output}}"
     result = go(tmp_path, "--grab", fails, "--json")
     assert result.returncode == 1
@@ -347,10 +450,17 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
     assert "camera 3 is not there" in steps["orientation"]["line"]
     assert {steps[name]["verdict"] for name in ("focus", "geometry", "verify")} == {"skipped"}
     page = (tmp_path / "s" / "first-light.html").read_text()
-    assert "Not ready: orientation failed" in page and "What to do:" in page and "--again orientation" in page
+    assert (
+        "Not ready: orientation failed" in page
+        and "What to do:" in page
+        and "--again orientation" in page
+    )
     # Whatever fails: 2.7 refreshes beat with the screen.
     (beats,) = (line for line in result.stderr.splitlines() if "refreshes" in line)
-    assert beats.startswith("exposures of 0.045 s are 2.7 refreshes of 60 Hz") and "[tracker] exposure_s = 0.05" in beats
+    assert (
+        beats.startswith("exposures of 0.045 s are 2.7 refreshes of 60 Hz")
+        and "[tracker] exposure_s = 0.05" in beats
+    )
     assert beats in page
     assert json.loads(result.stdout)["beat"]["proposal"]["exposure_s"] == pytest.approx(0.05)
 
@@ -371,7 +481,9 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
 )
 def test_wrong_words_get_one_line(tmp_path, words, said):
     plant(tmp_path)
-    (tmp_path / "small.toml").write_text(bench_text(TWIN, {"monitor": {"resolution_px": [320, 240]}}))
+    (tmp_path / "small.toml").write_text(
+        bench_text(TWIN, {"monitor": {"resolution_px": [320, 240]}})
+    )
     result = run_hilstar_here("first-light", "bench.toml", "-o", "s", *words, cwd=tmp_path)
     assert_refused(result, 2, *said)
     assert not (tmp_path / "s" / "session.json").exists()

@@ -21,7 +21,9 @@ from tests.support.traced_bench import TracedBench, observed_dots
 
 BENCH = TracedBench()
 TRACKER_PX = 2048
-TRACKER = Camera((TRACKER_PX, TRACKER_PX), ARCSEC_PER_RAD / 38, ((TRACKER_PX - 1) / 2,) * 2, np.eye(3))
+TRACKER = Camera(
+    (TRACKER_PX, TRACKER_PX), ARCSEC_PER_RAD / 38, ((TRACKER_PX - 1) / 2,) * 2, np.eye(3)
+)
 FILE = f"""
 [tracker]
 aperture_mm = 30
@@ -44,21 +46,40 @@ STARS_ARCSEC = (0.25, 1.0)  # rms and maximum over the screen
 def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("geometric")
     (folder / "bench.toml").write_text(FILE)
-    made = run_hilstar_here("calibrate", "dots", folder / "bench.toml", "-o", folder / "plan", "--json")
+    made = run_hilstar_here(
+        "calibrate", "dots", folder / "bench.toml", "-o", folder / "plan", "--json"
+    )
     assert made.returncode == 0, made.stderr
-    seen = observed_dots(BENCH, read_plan(folder / "plan" / "plan.csv"), TRACKER, np.random.default_rng(4))
+    seen = observed_dots(
+        BENCH, read_plan(folder / "plan" / "plan.csv"), TRACKER, np.random.default_rng(4)
+    )
     with (folder / "observed.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["frame", "x_px", "y_px"])
-        writer.writerows(zip(seen.frame.tolist(), seen.x_px.tolist(), seen.y_px.tolist(), strict=True))
+        writer.writerows(
+            zip(seen.frame.tolist(), seen.x_px.tolist(), seen.y_px.tolist(), strict=True)
+        )
     return folder
 
 
 @pytest.fixture(scope="module")
 def fitted(session):
-    wanted = ("--plan", session / "plan", "-o", session / "geometry.toml", "--tracker-is-ideal", "--json")
+    wanted = (
+        "--plan",
+        session / "plan",
+        "-o",
+        session / "geometry.toml",
+        "--tracker-is-ideal",
+        "--json",
+    )
     result = run_hilstar_here(
-        "calibrate", "geometric", session / "bench.toml", session / "observed.csv", *wanted, "--plot", session / "geometry.png"
+        "calibrate",
+        "geometric",
+        session / "bench.toml",
+        session / "observed.csv",
+        *wanted,
+        "--plot",
+        session / "geometry.png",
     )
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
@@ -75,7 +96,10 @@ def test_every_frame_shows_the_dots_of_its_rows(session):
 
 
 def test_the_summary_says_what_was_lost_and_what_is_known(fitted, session):
-    assert fitted["centroids"]["matched"] + fitted["centroids"]["false"] == fitted["centroids"]["given"]
+    assert (
+        fitted["centroids"]["matched"] + fitted["centroids"]["false"]
+        == fitted["centroids"]["given"]
+    )
     assert 0.02 < fitted["centroids"]["lost"] / fitted["centroids"]["given"] < 0.1
     assert fitted["noise_px"] == pytest.approx(0.02, rel=0.15)
     assert fitted["held_out"]["rms_arcsec"] < 1.2 * fitted["held_out"]["noise_arcsec"]
@@ -92,7 +116,11 @@ def test_stars_are_drawn_through_the_lens_that_was_found(fitted, session):
         place = {int(hip): k for k, hip in enumerate(bench.stars.hip)}
         vectors = bench.stars.vectors @ to_matrix(q).T
         x, y = BENCH.places_px(vectors[[place[int(hip)] for hip in truth["hip"]]])
-        off = np.hypot(x - truth["x_px"], y - truth["y_px"]) * ARCSEC_PER_RAD / bench.camera.focal_length_px
+        off = (
+            np.hypot(x - truth["x_px"], y - truth["y_px"])
+            * ARCSEC_PER_RAD
+            / bench.camera.focal_length_px
+        )
         front_x, front_y = BENCH.places_px(vectors[vectors[:, 2] > 0.9])
         on_screen = (np.abs(front_x - 959.5) < 960) & (np.abs(front_y - 539.5) < 540)
     assert np.sqrt((off**2).mean()) < STARS_ARCSEC[0]
@@ -104,7 +132,10 @@ def test_stars_are_drawn_through_the_lens_that_was_found(fitted, session):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda text: text.replace("frame,x_px", "frame,col"), ("observed.csv:1", "x_px is missing")),
+        (
+            lambda text: text.replace("frame,x_px", "frame,col"),
+            ("observed.csv:1", "x_px is missing"),
+        ),
         (lambda text: text.replace("\n", "\n0,nan,3\n", 1), ("observed.csv:2", "finite")),
         (lambda text: text.splitlines()[0] + "\n", ("no centroid",)),
         (lambda text: "\n".join(text.splitlines()[:40]) + "\n", ("match no dots",)),
@@ -114,7 +145,9 @@ def test_a_table_that_is_none_gets_one_line(session, tmp_path, change, words):
     path = tmp_path / "observed.csv"
     path.write_text(change((session / "observed.csv").read_text().replace("\r\n", "\n")))
     wanted = ("--plan", session / "plan", "-o", tmp_path / "g.toml", "--tracker-is-ideal")
-    assert_refused(run_hilstar_here("calibrate", "geometric", session / "bench.toml", path, *wanted), 2, *words)
+    assert_refused(
+        run_hilstar_here("calibrate", "geometric", session / "bench.toml", path, *wanted), 2, *words
+    )
     assert not (tmp_path / "g.toml").exists()
 
 
@@ -131,10 +164,15 @@ def test_a_geometry_file_that_is_none_gets_one_line(fitted, session, tmp_path, c
     old, new = change
     text = (session / "geometry.toml").read_text()
     if new == "k1 = -2":
-        text = "".join("k1 = -200\n" if line.startswith(old) else line for line in text.splitlines(keepends=True))
+        text = "".join(
+            "k1 = -200\n" if line.startswith(old) else line
+            for line in text.splitlines(keepends=True)
+        )
     else:
         text = text.replace(old, new)
     (tmp_path / "geometry.toml").write_text(text)
     (tmp_path / "bench.toml").write_text(FILE + 'geometry = "geometry.toml"\n')
-    result = run_hilstar_here("frame", tmp_path / "bench.toml", "--radec", "1,2,3", "--truth", tmp_path / "t.csv")
+    result = run_hilstar_here(
+        "frame", tmp_path / "bench.toml", "--radec", "1,2,3", "--truth", tmp_path / "t.csv"
+    )
     assert_refused(result, 2, "geometry.toml", *words)

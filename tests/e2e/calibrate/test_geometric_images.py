@@ -36,7 +36,9 @@ def image_of(x, y, rng, hot):
             ndtr((places + 0.5 - c) / SIGMA_PX) - ndtr((places - 0.5 - c) / SIGMA_PX)
             for places, c in ((columns, cx), (rows, cy))
         )
-        image[top : top + 17, left : left + 17] += PEAK_DN * 2 * np.pi * SIGMA_PX**2 * np.outer(down, across) / 2.2
+        image[top : top + 17, left : left + 17] += (
+            PEAK_DN * 2 * np.pi * SIGMA_PX**2 * np.outer(down, across) / 2.2
+        )
     image += rng.normal(0, NOISE_DN, image.shape)
     image[hot] += 6000
     return np.clip(np.rint(image), 0, 65535).astype(np.uint16)
@@ -68,9 +70,22 @@ def images_in(folder):
 
 
 def test_images_give_what_centroids_give(session):
-    wanted = ("--plan", session / "plan", "-o", session / "geometry.toml", "--tracker-is-ideal", "--json")
+    wanted = (
+        "--plan",
+        session / "plan",
+        "-o",
+        session / "geometry.toml",
+        "--tracker-is-ideal",
+        "--json",
+    )
     result = run_hilstar_here(
-        "calibrate", "geometric", session / "bench.toml", *images_in(session), *wanted, "--dark", session / "dark.fits"
+        "calibrate",
+        "geometric",
+        session / "bench.toml",
+        *images_in(session),
+        *wanted,
+        "--dark",
+        session / "dark.fits",
     )
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
@@ -94,7 +109,9 @@ def test_images_that_cannot_be_measured_get_one_line(session, tmp_path, kind):
     images = [image]
     match kind:
         case "saturated":
-            Image.fromarray(np.where(good > 2000, 65535, good).astype(np.uint16)).save(image, compress_level=1)
+            Image.fromarray(np.where(good > 2000, 65535, good).astype(np.uint16)).save(
+                image, compress_level=1
+            )
         case "no number":
             images = [tmp_path / "dots.png"]
             shutil.copy(session / "frame_001.png", images[0])
@@ -106,4 +123,8 @@ def test_images_that_cannot_be_measured_get_one_line(session, tmp_path, kind):
             images = [session / "frame_001.png", image]
             shutil.copy(images[0], image)
     wanted = ("--plan", session / "plan", "-o", tmp_path / "g.toml", "--tracker-is-ideal")
-    assert_refused(run_hilstar_here("calibrate", "geometric", session / "bench.toml", *images, *wanted), 2, *words)
+    assert_refused(
+        run_hilstar_here("calibrate", "geometric", session / "bench.toml", *images, *wanted),
+        2,
+        *words,
+    )

@@ -50,7 +50,9 @@ def write_bench(folder: Path, *vary: dict[str, Any], **keys: Any) -> Planted:
 def answering(planted: Planted) -> Iterator[subprocess.Popen[str]]:
     """The tracker while this is open; what it prints comes once its input is closed."""
     command = [sys.executable, "-m", "tests.support.campaign_tracker", json.dumps(asdict(planted))]
-    with Started(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with Started(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         try:
             yield process
         finally:
@@ -58,22 +60,32 @@ def answering(planted: Planted) -> Iterator[subprocess.Popen[str]]:
 
 
 def rows_so_far(folder: Path) -> int:
-    return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
+    return sum(
+        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
+    )
 
 
-def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(tmp_path: Path) -> None:
-    planted = replace(write_bench(tmp_path, cases=500, check_every=100), drift_arcsec_s=0.02, dim_mag_s=0.002)
+def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(
+    tmp_path: Path,
+) -> None:
+    planted = replace(
+        write_bench(tmp_path, cases=500, check_every=100), drift_arcsec_s=0.02, dim_mag_s=0.002
+    )
     with answering(planted) as tracker:
         result = run_hilstar_here(*COMMAND, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
         wild, _ = tracker.communicate()
     found, rows = json.loads(result.stdout), read_columns(tmp_path / "out" / "cases.parquet")
-    assert sorted(rows["order"]) == rows["case"] == list(range(500)) and rows["order"] != rows["case"]
+    assert (
+        sorted(rows["order"]) == rows["case"] == list(range(500)) and rows["order"] != rows["case"]
+    )
     # A machine that stands still tells the stub late what is lit: its answer is then of the case
     # before.
     before = dict(zip(rows["order"], rows["case"], strict=True))
     for each in found["wrong_cases"]:
-        assert {each["case"], before.get(each["order"] - 1), 500 + each["order"] // 100} & set(json.loads(wild))
+        assert {each["case"], before.get(each["order"] - 1), 500 + each["order"] // 100} & set(
+            json.loads(wild)
+        )
     assert found["wrong"] > 0
     assert all(each["off_deg"] > 10 for each in found["wrong_cases"])
     q = np.stack([rows[f"q{name}"] for name in "wxyz"], axis=1)
@@ -87,17 +99,27 @@ def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(tmp
     error = np.array(found["bias_arcsec"]) - planted.bias_arcsec - [*fov.mean(axis=0), 0.0]
     assert np.all(np.abs(error) < 0.5 + 4 * np.array([7.5, 7.5, 12.0]) / np.sqrt(500))
     drift = found["drift"]
-    assert drift["checks"] == 6 and drift["mag"] > 0.002 and drift["mag"] == pytest.approx(0.002 * seconds(tmp_path), rel=0.1)
+    assert (
+        drift["checks"] == 6
+        and drift["mag"] > 0.002
+        and drift["mag"] == pytest.approx(0.002 * seconds(tmp_path), rel=0.1)
+    )
 
 
 def seconds(folder: Path) -> float:
     """The time from the first check case to the last."""
-    lines = [line.split(",")[1] for line in (folder / "out" / "checks.csv").read_text().splitlines()[1:]]
-    return float((np.datetime64(lines[-1][:-1]) - np.datetime64(lines[0][:-1])) / np.timedelta64(1, "s"))
+    lines = [
+        line.split(",")[1] for line in (folder / "out" / "checks.csv").read_text().splitlines()[1:]
+    ]
+    return float(
+        (np.datetime64(lines[-1][:-1]) - np.datetime64(lines[0][:-1])) / np.timedelta64(1, "s")
+    )
 
 
 def started(folder: Path) -> subprocess.Popen[str]:
-    return Started([*HILSTAR, *COMMAND], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Started(
+        [*HILSTAR, *COMMAND], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def reached(folder: Path, goal: int, hilstar: subprocess.Popen[str]) -> bool:
@@ -131,7 +153,9 @@ def killed_once(folder: Path, planted: Planted, kills: int, cases: int) -> dict[
 KILLS = int(os.environ.get("HILSTAR_TEST_KILLS", "3"))
 
 
-def test_a_campaign_that_is_killed_on_either_side_has_the_same_cases_attitudes_and_order(tmp_path: Path) -> None:
+def test_a_campaign_that_is_killed_on_either_side_has_the_same_cases_attitudes_and_order(
+    tmp_path: Path,
+) -> None:
     tables = []
     for name, kills in (("whole", 0), ("killed", KILLS)):
         folder = tmp_path / name
@@ -144,22 +168,33 @@ def test_a_campaign_that_is_killed_on_either_side_has_the_same_cases_attitudes_a
     assert set(killed["status"]) == {"done"} and sorted(killed["order"]) == list(range(24))
     assert len(set(killed["run"])) == 1 + (KILLS + 1) // 2
     by_order = sorted(zip(killed["order"], killed["run"], killed["begun_utc"], strict=True))
-    assert [run for _, run, _ in by_order] == sorted(killed["run"]) and [at for *_, at in by_order] == sorted(
-        killed["begun_utc"]
-    )
+    assert [run for _, run, _ in by_order] == sorted(killed["run"]) and [
+        at for *_, at in by_order
+    ] == sorted(killed["begun_utc"])
 
 
-def test_a_case_without_answers_is_a_result_and_a_first_attitude_has_its_time(tmp_path: Path) -> None:
+def test_a_case_without_answers_is_a_result_and_a_first_attitude_has_its_time(
+    tmp_path: Path,
+) -> None:
     planted = replace(
-        write_bench(tmp_path, cases=6, answers=3, timeout_s=0.5, silent_s=0.0, blank_s=0.05), blind=(2, 4), wild=0.0
+        write_bench(tmp_path, cases=6, answers=3, timeout_s=0.5, silent_s=0.0, blank_s=0.05),
+        blind=(2, 4),
+        wild=0.0,
     )
     with answering(planted):
         result = run_hilstar_here(*COMMAND, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     rows = read_columns(tmp_path / "out" / "cases.parquet")
     assert rows["status"] == ["done", "done", "no-answer", "done", "no-answer", "done"]
-    assert json.loads(result.stdout)["no_answer"] == 2 and rows["why"][2] == "the tracker had no attitude"
-    assert rows["received"][2] == 0 and rows["first_attitude_s"][2] is None and rows["frames"] == [3] * 6
+    assert (
+        json.loads(result.stdout)["no_answer"] == 2
+        and rows["why"][2] == "the tracker had no attitude"
+    )
+    assert (
+        rows["received"][2] == 0
+        and rows["first_attitude_s"][2] is None
+        and rows["frames"] == [3] * 6
+    )
     assert all(0 < rows["first_attitude_s"][case] < 0.5 for case in (0, 1, 3, 5))
     assert all(rows["scatter_z_arcsec"][case] > 0 for case in (0, 1, 3, 5))
     assert rows["solved"] == [3, 3, 0, 3, 0, 3]
@@ -172,18 +207,32 @@ def test_without_a_tracker_every_case_is_a_result(tmp_path: Path) -> None:
     assert read_columns(tmp_path / "out" / "cases.parquet")["status"] == ["no-answer"] * 3
 
 
-def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_they_were(tmp_path: Path) -> None:
+def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_they_were(
+    tmp_path: Path,
+) -> None:
     quantised = {"key": "render.quantisation", "values": ["round", "temporal"]}
     rate = {"key": "rate_deg_s.across", "minimum": 0.1, "maximum": 0.2}
     attitudes = FIELD | {"radius_deg": 0.5}
-    planted = write_bench(tmp_path, quantised, rate, cases=8, answers=3, settle_s=0.5, attitudes=attitudes)
-    planted = replace(planted, fov_arcsec=0.0, pixel_arcsec=0.0, noise_arcsec=(0.5, 0.5, 0.5), wild=0.0)
+    planted = write_bench(
+        tmp_path, quantised, rate, cases=8, answers=3, settle_s=0.5, attitudes=attitudes
+    )
+    planted = replace(
+        planted, fov_arcsec=0.0, pixel_arcsec=0.0, noise_arcsec=(0.5, 0.5, 0.5), wild=0.0
+    )
     with answering(planted):
-        result = run_hilstar_here(*COMMAND, "--console", "127.0.0.1:0", "--frames", "tcp://127.0.0.1:0", cwd=tmp_path)
+        result = run_hilstar_here(
+            *COMMAND, "--console", "127.0.0.1:0", "--frames", "tcp://127.0.0.1:0", cwd=tmp_path
+        )
     assert result.returncode == 0, result.stderr
-    assert "the operator's page is at http://127.0.0.1:" in result.stderr and "frames: tcp://127.0.0.1:" in result.stderr
+    assert (
+        "the operator's page is at http://127.0.0.1:" in result.stderr
+        and "frames: tcp://127.0.0.1:" in result.stderr
+    )
     rows = read_columns(tmp_path / "out" / "cases.parquet")
-    by_order = [value for _, value in sorted(zip(rows["order"], rows["vary.render.quantisation"], strict=True))]
+    by_order = [
+        value
+        for _, value in sorted(zip(rows["order"], rows["vary.render.quantisation"], strict=True))
+    ]
     assert sum(a != b for a, b in pairwise(by_order)) == 1
     error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xyz"], axis=1) - planted.bias_arcsec
     # A frame that is late by its 10 ms is off by 7 arcsec, and after half a second a case has gone
@@ -191,7 +240,9 @@ def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_th
     assert np.median(np.abs(error[:, :2])) < 10 and np.abs(error[:, :2]).max() < 90
 
 
-def test_late_answers_of_the_case_before_are_neither_s_on_a_clock_of_its_own(tmp_path: Path) -> None:
+def test_late_answers_of_the_case_before_are_neither_s_on_a_clock_of_its_own(
+    tmp_path: Path,
+) -> None:
     # The latency is three times what is guessed of a tracker whose clock is its own.
     planted = replace(write_bench(tmp_path, cases=15), latency_s=0.3, answer_hz=3.0, wild=0.0)
     bench = tmp_path / "bench.toml"
@@ -211,26 +262,38 @@ def test_a_case_goes_along_a_log(tmp_path: Path) -> None:
     lines = ["t_s,qw,qx,qy,qz", *(",".join(map(repr, [k / 10, *q])) for k, q in enumerate(turning))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     attitudes = {"kind": "log", "log": "log.csv"}
-    planted = replace(write_bench(tmp_path, cases=5, answers=3, settle_s=0.2, attitudes=attitudes), wild=0.0)
+    planted = replace(
+        write_bench(tmp_path, cases=5, answers=3, settle_s=0.2, attitudes=attitudes), wild=0.0
+    )
     with answering(replace(planted, fov_arcsec=0.0, pixel_arcsec=0.0)):
         result = run_hilstar_here(*COMMAND, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     rows = read_columns(tmp_path / "out" / "cases.parquet")
-    error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xy"], axis=1) - planted.bias_arcsec[:2]
+    error = (
+        np.stack([rows[f"error_{axis}_arcsec"] for axis in "xy"], axis=1) - planted.bias_arcsec[:2]
+    )
     # 0.2 s after its begin a case that stood still would be off by 70
     assert np.median(np.abs(error)) < 15
 
 
 def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:
-    (tmp_path / "faults.toml").write_text('[[fault]]\nkind = "blank"\nname = "dark"\nat_s = 0.0\nfor_s = 0.3\n')
+    (tmp_path / "faults.toml").write_text(
+        '[[fault]]\nkind = "blank"\nname = "dark"\nat_s = 0.0\nfor_s = 0.3\n'
+    )
     scenario = {"key": "scenario", "values": ["faults.toml", ""]}
-    planted = replace(write_bench(tmp_path, scenario, cases=6, sampling="grid", answers=2), wild=0.0)
+    planted = replace(
+        write_bench(tmp_path, scenario, cases=6, sampling="grid", answers=2), wild=0.0
+    )
     with answering(planted):
         result = run_hilstar_here(*COMMAND, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     rows = read_columns(tmp_path / "out" / "cases.parquet")
     for named, end_s, recovery_s, first_s in zip(
-        *(rows[name] for name in ("vary.scenario", "fault_end_s", "recovery_s", "first_attitude_s")), strict=True
+        *(
+            rows[name]
+            for name in ("vary.scenario", "fault_end_s", "recovery_s", "first_attitude_s")
+        ),
+        strict=True,
     ):
         assert end_s == (pytest.approx(0.3) if named else None)
         assert (0 <= recovery_s < 0.3 and first_s > 0.3) if named else recovery_s is None
@@ -239,8 +302,16 @@ def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("vary", "keys", "words"),
     [
-        ({"key": "tracker.focal_length_mm", "values": [25, 26]}, {}, "cannot be changed on a real bench"),
-        ({"key": "misalignment_arcsec.x", "values": [0, 10]}, {}, "cannot be changed on a real bench"),
+        (
+            {"key": "tracker.focal_length_mm", "values": [25, 26]},
+            {},
+            "cannot be changed on a real bench",
+        ),
+        (
+            {"key": "misalignment_arcsec.x", "values": [0, 10]},
+            {},
+            "cannot be changed on a real bench",
+        ),
         ({"key": "noise_seed", "values": [1, 2]}, {}, "cannot be changed on a real bench"),
         (None, {"frames": 3}, "frames: is for through"),
         (None, {"through": "tracker"}, "answers: is for through"),
@@ -256,7 +327,13 @@ def test_what_a_bench_cannot_do_is_refused_before_the_first_case(
 
 def test_options_of_the_other_kind_and_a_bench_without_answers_are_refused(tmp_path: Path) -> None:
     write_bench(tmp_path, cases=4)
-    assert_refused(run_hilstar_here(*COMMAND, "--workers", "2", cwd=tmp_path), 2, "--workers: is for through = tracker")
+    assert_refused(
+        run_hilstar_here(*COMMAND, "--workers", "2", cwd=tmp_path),
+        2,
+        "--workers: is for through = tracker",
+    )
     text = (tmp_path / "bench.toml").read_text()
     (tmp_path / "bench.toml").write_text(text[: text.index("[answers]")])
-    assert_refused(run_hilstar_here(*COMMAND, cwd=tmp_path), 2, "needs the tracker's answers", "[answers]")
+    assert_refused(
+        run_hilstar_here(*COMMAND, cwd=tmp_path), 2, "needs the tracker's answers", "[answers]"
+    )

@@ -55,7 +55,14 @@ OPTIONS = ("--solver", "python:sleepy:solve", "--json")
 def running(folder: Path, log: str, *words: str, **env: str) -> Iterator[subprocess.Popen[bytes]]:
     """A program of Dask's, whose log goes to a file, until the end of this."""
     with (folder / log).open("wb") as out:
-        process = Started([*DASK, *words], cwd=folder, stdout=out, stderr=out, env=os.environ | env, start_new_session=True)
+        process = Started(
+            [*DASK, *words],
+            cwd=folder,
+            stdout=out,
+            stderr=out,
+            env=os.environ | env,
+            start_new_session=True,
+        )
     try:
         yield process
     finally:
@@ -71,7 +78,9 @@ def other_version(folder: Path) -> Path:
     for entry in [*package.iterdir(), *(package / basics).iterdir()]:
         copy = folder / "other" / "hilstar" / entry.relative_to(package)
         if entry.name == "version.py":
-            copy.write_text(re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text()))
+            copy.write_text(
+                re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text())
+            )
         elif entry.name not in {"__pycache__", basics.name}:
             copy.symlink_to(entry)
     for name in ("shaders", "configs"):
@@ -93,17 +102,23 @@ def pool_table(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     folder = tmp_path_factory.mktemp("pool")
     write_campaign(folder, cases=24)
     (folder / "sleepy.py").write_text(SOLVER)
-    result = run_hilstar_here("campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder)
+    result = run_hilstar_here(
+        "campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder
+    )
     assert result.returncode == 0, result.stderr
     return (folder / "pool/cases.parquet").read_bytes()
 
 
 def rows_so_far(folder: Path) -> int:
-    return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
+    return sum(
+        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
+    )
 
 
 @contextlib.contextmanager
-def scheduler(folder: Path, port: str = "0", *more: str) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+def scheduler(
+    folder: Path, port: str = "0", *more: str
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """A scheduler and its address, once it listens there."""
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
@@ -120,37 +135,53 @@ def driver_of(folder: Path, address: str) -> subprocess.Popen[bytes]:
         return Started(command, cwd=folder, stdout=log, stderr=log)
 
 
-def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path, pool_table: bytes) -> None:
+def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(
+    folder: Path, pool_table: bytes
+) -> None:
     with contextlib.ExitStack() as stack:
         _, address = stack.enter_context(scheduler(folder))
         other = str(other_version(folder))
-        stack.enter_context(running(folder, "c.log", "worker", address, *WORKER, "--name", "other", PYTHONPATH=other))
+        stack.enter_context(
+            running(
+                folder, "c.log", "worker", address, *WORKER, "--name", "other", PYTHONPATH=other
+            )
+        )
         driver = driver_of(folder, address)
-        wait_for(lambda: "is refused" in (folder / "driver.log").read_text(), "the other version is not refused")
+        wait_for(
+            lambda: "is refused" in (folder / "driver.log").read_text(),
+            "the other version is not refused",
+        )
 
         victim = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
         stack.enter_context(running(folder, "b.log", "worker", address, *WORKER))
         wait_for(lambda: rows_so_far(folder) >= 3, "nothing comes")
         os.kill(victim.pid, signal.SIGKILL)
         after_kill = rows_so_far(folder)
-        wait_for(lambda: rows_so_far(folder) > after_kill + 2, "nothing comes after a worker was killed")
+        wait_for(
+            lambda: rows_so_far(folder) > after_kill + 2, "nothing comes after a worker was killed"
+        )
         driver.kill()
         driver.wait()
         (folder / "slow").unlink()
         assert rows_so_far(folder) < 24
 
-        last = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder)
+        last = run_hilstar_here(
+            "campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder
+        )
     assert last.returncode == 0, last.stderr
     for said in ((folder / "driver.log").read_text(), last.stderr):
         assert re.search(
-            rf"worker tcp://\S+ is refused: it has hilstar 99.0, and the campaign is of {hilstar.__version__}", said
+            rf"worker tcp://\S+ is refused: it has hilstar 99.0, and the campaign is of {hilstar.__version__}",
+            said,
         )
     assert (folder / "out/cases.parquet").read_bytes() == pool_table
     columns = read_columns(folder / "out/cases.parquet")
     assert columns["case"] == list(range(24)) and {"done", "failed"} == set(columns["status"])
 
 
-def test_a_campaign_goes_on_when_its_scheduler_was_killed_and_is_started_again(folder: Path) -> None:
+def test_a_campaign_goes_on_when_its_scheduler_was_killed_and_is_started_again(
+    folder: Path,
+) -> None:
     with contextlib.ExitStack() as stack:
         process, address = stack.enter_context(scheduler(folder))
         stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
@@ -177,11 +208,24 @@ def test_an_answer_that_died_with_its_worker_is_not_waited_for(folder: Path) -> 
 
 def certificates(folder: Path, name: str) -> tuple[str, ...]:
     """A CA and a certificate of it, as options of Dask's and of the campaign's."""
-    ca, key, cert, asked = (folder / f"{name}-{part}.pem" for part in ("ca", "key", "cert", "asked"))
+    ca, key, cert, asked = (
+        folder / f"{name}-{part}.pem" for part in ("ca", "key", "cert", "asked")
+    )
     new = ["openssl", "req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={name}"]
     by_ca = ["-CA", str(ca), "-CAkey", f"{ca}.key", "-CAcreateserial", "-days", "2"]
     for command in (
-        [*new, "-x509", "-days", "2", "-keyout", f"{ca}.key", "-out", str(ca), "-subj", f"/CN={name} CA"],
+        [
+            *new,
+            "-x509",
+            "-days",
+            "2",
+            "-keyout",
+            f"{ca}.key",
+            "-out",
+            str(ca),
+            "-subj",
+            f"/CN={name} CA",
+        ],
         [*new, "-keyout", str(key), "-out", str(asked)],
         ["openssl", "x509", "-req", "-in", str(asked), "-out", str(cert), *by_ca],
     ):
@@ -196,14 +240,20 @@ def test_a_cluster_with_dasks_tls_runs_a_campaign_and_takes_nobody_elses_certifi
     (folder / "slow").unlink()
     ours, theirs = certificates(folder, "ours"), certificates(folder, "theirs")
     with contextlib.ExitStack() as stack:
-        _, address = stack.enter_context(scheduler(folder, "0", "--host", "127.0.0.1", "--protocol", "tls", *ours))
+        _, address = stack.enter_context(
+            scheduler(folder, "0", "--host", "127.0.0.1", "--protocol", "tls", *ours)
+        )
         assert address.startswith("tls://127.0.0.1:")
-        stack.enter_context(running(folder, "a.log", "worker", address, *WORKER, "--host", "127.0.0.1", *ours))
+        stack.enter_context(
+            running(folder, "a.log", "worker", address, *WORKER, "--host", "127.0.0.1", *ours)
+        )
         words = ("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS)
         monkeypatch.setattr(cluster, "CONNECT_S", 5.0)
         refused = run_hilstar_here(*words, *theirs, cwd=folder)
         assert_refused(refused, 3, "certificate")
-        assert_refused(run_hilstar_here(*words, cwd=folder), 2, "no certificate is named", "--tls-ca-file")
+        assert_refused(
+            run_hilstar_here(*words, cwd=folder), 2, "no certificate is named", "--tls-ca-file"
+        )
         monkeypatch.undo()
         result = run_hilstar_here(*words, *ours, cwd=folder)
     assert result.returncode == 0, result.stderr
@@ -227,14 +277,28 @@ TLS = ("--tls-ca-file", "plan.toml", "--tls-cert", "plan.toml")
         (["--scheduler", "tcp://192.0.2.1:8786", *TLS], ["not encrypted", "tls://HOST:PORT"]),
         (["--scheduler", "tls://192.0.2.1:8786", *TLS[:2]], ["--tls-cert is missing"]),
         (["--scheduler", "tls://192.0.2.1:8786", *TLS], ["plan.toml", "--tls-key"]),
-        (["--scheduler", "tls://192.0.2.1:8786", "--tls-ca-file", "none.pem", "--tls-cert", "none.pem"], ["none.pem"]),
+        (
+            [
+                "--scheduler",
+                "tls://192.0.2.1:8786",
+                "--tls-ca-file",
+                "none.pem",
+                "--tls-cert",
+                "none.pem",
+            ],
+            ["none.pem"],
+        ),
         (["--scheduler", "tls://:1"], ["tls://:1"]),
         (["--scheduler", "tcp://127.0.0.1:99999"], ["99999"]),
         ([*TLS], ["--scheduler tls://HOST:PORT"]),
     ],
 )
-def test_code_runs_over_no_network_without_tls(folder: Path, words: list[str], said: list[str]) -> None:
-    assert_refused(run_hilstar_here("campaign", "plan.toml", "-o", "o", *words, cwd=folder), 2, *said)
+def test_code_runs_over_no_network_without_tls(
+    folder: Path, words: list[str], said: list[str]
+) -> None:
+    assert_refused(
+        run_hilstar_here("campaign", "plan.toml", "-o", "o", *words, cwd=folder), 2, *said
+    )
 
 
 def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder: Path) -> None:
@@ -245,15 +309,23 @@ def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder:
         if address.startswith("tcp://127."):
             pytest.skip("this machine has no other address than loopback's")
         here = f"tcp://127.0.0.1:{address.rpartition(':')[2]}"
-        stack.enter_context(running(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1"))
-        result = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder)
+        stack.enter_context(
+            running(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1")
+        )
+        result = run_hilstar_here(
+            "campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder
+        )
     assert result.returncode == 0, result.stderr
     assert f"the scheduler listens at {address} without TLS" in result.stderr
 
 
 def test_no_scheduler_and_no_address_are_one_line(folder: Path) -> None:
     assert_refused(
-        run_hilstar_here("campaign", "plan.toml", "-o", "o", "--scheduler", "here", cwd=folder), 2, "tcp://HOST:PORT"
+        run_hilstar_here("campaign", "plan.toml", "-o", "o", "--scheduler", "here", cwd=folder),
+        2,
+        "tcp://HOST:PORT",
     )
     both = ("--scheduler", "tcp://127.0.0.1:9", "--workers", "2")
-    assert_refused(run_hilstar_here("campaign", "plan.toml", "-o", "o", *both, cwd=folder), 2, "--workers")
+    assert_refused(
+        run_hilstar_here("campaign", "plan.toml", "-o", "o", *both, cwd=folder), 2, "--workers"
+    )

@@ -44,7 +44,9 @@ def start(folder: Path, workers: int) -> subprocess.Popen[str]:
 
 
 def rows_so_far(folder: Path) -> int:
-    return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
+    return sum(
+        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
+    )
 
 
 def runs(pid: int) -> bool:
@@ -55,8 +57,12 @@ def runs(pid: int) -> bool:
         return False
 
 
-def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(folder: Path) -> None:
-    whole = run_hilstar_here("campaign", "plan.toml", "-o", "whole", "--workers", "2", *OPTIONS, cwd=folder)
+def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
+    folder: Path,
+) -> None:
+    whole = run_hilstar_here(
+        "campaign", "plan.toml", "-o", "whole", "--workers", "2", *OPTIONS, cwd=folder
+    )
     assert whole.returncode == 0, whole.stderr
     wanted = json.loads(whole.stdout)
 
@@ -85,23 +91,41 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     after_both = rows_so_far(folder)
 
     (folder / "slow").unlink()
-    last = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder)
+    last = run_hilstar_here(
+        "campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder
+    )
     assert last.returncode == 0, last.stderr
     summary = json.loads(last.stdout)
     assert after_both < 30 and summary["sha256"] == wanted["sha256"]
-    assert (folder / "out" / "cases.parquet").read_bytes() == (folder / "whole" / "cases.parquet").read_bytes()
+    assert (folder / "out" / "cases.parquet").read_bytes() == (
+        folder / "whole" / "cases.parquet"
+    ).read_bytes()
 
     columns = read_columns(folder / "out" / "cases.parquet")
     assert columns["case"] == list(range(30))
-    failed = [why for why, status in zip(columns["why"], columns["status"], strict=True) if status == "failed"]
-    assert failed and len(failed) == summary["failed"] and all("ValueError: not this one" in why for why in failed)
-    assert all(why == "the solver found no attitude" for why in columns["why"] if why and why not in failed)
+    failed = [
+        why
+        for why, status in zip(columns["why"], columns["status"], strict=True)
+        if status == "failed"
+    ]
+    assert (
+        failed
+        and len(failed) == summary["failed"]
+        and all("ValueError: not this one" in why for why in failed)
+    )
+    assert all(
+        why == "the solver found no attitude" for why in columns["why"] if why and why not in failed
+    )
 
 
 def test_another_plan_and_a_budget_that_is_too_small_are_refused(folder: Path) -> None:
-    short = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=folder)
+    short = run_hilstar_here(
+        "campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=folder
+    )
     last = short.stderr.splitlines()[-1]  # a busy machine has told its progress before
-    assert (short.returncode, short.stdout) == (2, "") and "--memory" in last and "or more" in last, short.stderr
+    assert (
+        (short.returncode, short.stdout) == (2, "") and "--memory" in last and "or more" in last
+    ), short.stderr
     before = rows_so_far(folder)
     write_campaign(folder, seed=8)
     other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
@@ -134,7 +158,9 @@ def test_requirements_are_judged_and_judged_again_without_running_a_case(tmp_pat
     assert availability["verdict"] == "not shown" and availability["more_cases"] > 1000
     header, *rows = (tmp_path / "out" / "requirements.csv").read_text().splitlines()
     assert header == ALL_COLUMNS and len(rows) == 2
-    assert rows[0].startswith("noise,cross,rate_deg_s.across <= 0.5,1000.0,") and rows[0].endswith(",met")
+    assert rows[0].startswith("noise,cross,rate_deg_s.across <= 0.5,1000.0,") and rows[0].endswith(
+        ",met"
+    )
     assert rows[1].startswith("availability,,,0.999,") and rows[1].endswith(",0.9,64,not shown")
     page = (tmp_path / "out" / "requirements.html").read_text()
     assert all(words in page for words in ("Signature", "not shown", "data:image/svg+xml;base64,"))
@@ -142,7 +168,13 @@ def test_requirements_are_judged_and_judged_again_without_running_a_case(tmp_pat
     table = (tmp_path / "out" / "cases.parquet").read_bytes()
     plan.write_text(text + REQUIRE.format(0.001))  # another limit is no other campaign
     again = run_hilstar_here(*command, cwd=tmp_path)
-    assert again.returncode == 1 and "noise cross at most 0.001 arcsec where rate_deg_s.across <= 0.5: not met" in again.stdout
+    assert (
+        again.returncode == 1
+        and "noise cross at most 0.001 arcsec where rate_deg_s.across <= 0.5: not met"
+        in again.stdout
+    )
     assert (tmp_path / "out" / "cases.parquet").read_bytes() == table
     plan.write_text(text + REQUIRE.format(1.0).replace("rate_deg_s", "speed"))
-    assert_refused(run_hilstar_here(*command, cwd=tmp_path), 2, "speed.across is no key that the plan varies")
+    assert_refused(
+        run_hilstar_here(*command, cwd=tmp_path), 2, "speed.across is no key that the plan varies"
+    )

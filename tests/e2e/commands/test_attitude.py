@@ -37,7 +37,9 @@ def told(*arguments: object) -> dict:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(tmp_path, small_bench_file, seed):
+def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(
+    tmp_path, small_bench_file, seed
+):
     turn = Rotation.random(rng=np.random.default_rng(seed))
     q = turn.as_quat(scalar_first=True).tolist()
     found = told(log_of(tmp_path, [(0.0, q), (1.0, q)]), "--bench", small_bench_file)
@@ -53,15 +55,23 @@ def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(tmp_pa
         place = SkyCoord(catalog.ra_deg[row], catalog.dec_deg[row], unit="deg")
         seen = SkyCoord(star["ra_deg"], star["dec_deg"], unit="deg")
         assert place.separation(seen).deg < MOTION_DEG
-        assert seen.separation(looked).deg == pytest.approx(star["from_boresight_deg"], abs=ROUNDING_DEG)
+        assert seen.separation(looked).deg == pytest.approx(
+            star["from_boresight_deg"], abs=ROUNDING_DEG
+        )
         cam = turn.apply(seen.cartesian.xyz.to_value(units.one))
-        side = np.array([star["x_px"], star["y_px"]]) - (np.array(found["tracker"]["resolution_px"]) - 1) / 2
+        side = (
+            np.array([star["x_px"], star["y_px"]])
+            - (np.array(found["tracker"]["resolution_px"]) - 1) / 2
+        )
         # on the same side
         assert side @ cam[:2] == pytest.approx(np.hypot(*side) * np.hypot(*cam[:2]), rel=1e-6)
 
 
 def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
-    turns = [Rotation.from_euler("z", angle, degrees=True).as_quat(scalar_first=True).tolist() for angle in (0, 2, 4)]
+    turns = [
+        Rotation.from_euler("z", angle, degrees=True).as_quat(scalar_first=True).tolist()
+        for angle in (0, 2, 4)
+    ]
     rows = [(1_700_000_000.0 + 10 * k, q) for k, q in enumerate(turns)]
     log = log_of(tmp_path, rows)
     by_seconds, by_date = told(log, "--at", "15"), told(log, "--at", "2023-11-14T22:13:35")
@@ -77,7 +87,9 @@ def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
 def test_a_log_of_boot_time_has_no_dates(tmp_path):
     log = log_of(tmp_path, [(5.0, [1.0, 0.0, 0.0, 0.0]), (6.0, [1.0, 0.0, 0.0, 0.0])])
     result = run_hilstar_here("attitude", log, "--at", "2026-11-22T10:00:00.5")
-    assert_refused(result, 2, "1 s long, and its times are no dates; write seconds after its first sample\n")
+    assert_refused(
+        result, 2, "1 s long, and its times are no dates; write seconds after its first sample\n"
+    )
 
 
 def test_a_live_stream_is_awaited(tmp_path):
@@ -106,7 +118,9 @@ def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
 def test_silence_and_wrong_uses_are_refused_in_one_line(tmp_path):
     bench = tmp_path / "bench.toml"
     bench.write_text(SMALL_BENCH + attitude_table(free_port()))
-    assert_refused(run_hilstar_here("attitude", bench, "--wait", "0.2"), 2, "no attitude within 0.2 s")
+    assert_refused(
+        run_hilstar_here("attitude", bench, "--wait", "0.2"), 2, "no attitude within 0.2 s"
+    )
     assert_refused(run_hilstar_here("attitude", bench, "--at", "3"), 2, "--at 3")
     bench.write_text(SMALL_BENCH + attitude_table(free_port(), "lockstep = true"))
     assert_refused(run_hilstar_here("attitude", bench), 2, "lockstep")

@@ -128,9 +128,13 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
         "/dev/full": "it is a device",
         "/dev/urandom": "it is a device",
     }
-    for name, reason in (names | {"large": "" if kind == "ledger" else f"{size_gb} GB or more"}).items():
+    for name, reason in (
+        names | {"large": "" if kind == "ledger" else f"{size_gb} GB or more"}
+    ).items():
         absolute = str(tmp_path / name)
-        line = refusal(*place(kind, name if kind in {"response", "grid"} and name[0] != "/" else absolute))
+        line = refusal(
+            *place(kind, name if kind in {"response", "grid"} and name[0] != "/" else absolute)
+        )
         assert reason in line, (name, line)
         assert Path(name).name in line
 
@@ -221,10 +225,16 @@ SIMULATE = ("simulate", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits")
 
 @pytest.mark.parametrize("value", ["5e-324", "1e-310", "1e-200"])
 @pytest.mark.parametrize("key", ["quantum_efficiency", "transmission"])
-@pytest.mark.parametrize("words", [FRAME, SIMULATE, ("budget", "bench.toml"), ("doctor", "bench.toml")], ids=lambda w: w[0])
+@pytest.mark.parametrize(
+    "words",
+    [FRAME, SIMULATE, ("budget", "bench.toml"), ("doctor", "bench.toml")],
+    ids=lambda w: w[0],
+)
 def test_a_curve_of_next_to_nothing_is_refused(words, key, value):
     lines = [line for line in BENCH.splitlines() if not line.startswith(f"{key} =")]
-    Path("bench.toml").write_text("\n".join(lines).replace("[tracker]", f"[tracker]\n{key} = {value}"))
+    Path("bench.toml").write_text(
+        "\n".join(lines).replace("[tracker]", f"[tracker]\n{key} = {value}")
+    )
     assert f"[tracker] {key} = {value}: write a number from 1e-06 to 1" in refusal(*words)
 
 
@@ -263,7 +273,14 @@ BURST = '[[fault]]\nname = "protons"\nkind = "cosmic-rays"\nat_s = 0\nnumber = 4
     "words",
     [
         ("budget", "bench.toml", "--noise", "-o", "budget"),
-        ("tracker", "bench.toml", "--watch", "tcp://127.0.0.1:5563", "--answer", "tcp://127.0.0.1:5564"),
+        (
+            "tracker",
+            "bench.toml",
+            "--watch",
+            "tcp://127.0.0.1:5563",
+            "--answer",
+            "tcp://127.0.0.1:5564",
+        ),
         (*SIMULATE, "--scenario", "burst.toml"),
         (*FRAME, "--scenario", "burst.toml"),
     ],
@@ -277,14 +294,19 @@ def test_an_exposure_of_no_length_is_refused_where_light_is_divided_by_it(words)
 
 def test_a_noise_budget_of_no_star_is_refused():
     Path("bench.toml").write_text(BENCH + "\n[sky]\nfaintest_v_mag = -3\n")
-    assert "[sky] faintest_v_mag = -3 leaves no star" in refusal("budget", "bench.toml", "--noise", "-o", "budget")
+    assert "[sky] faintest_v_mag = -3 leaves no star" in refusal(
+        "budget", "bench.toml", "--noise", "-o", "budget"
+    )
 
 
 @pytest.mark.parametrize(("table", "size"), [("tracker", "[64, 64]"), ("monitor", "[64, 48]")])
 def test_an_image_of_a_thousand_million_pixels_is_refused(table, size):
     assert BENCH.count(f"resolution_px = {size}") == 1
     Path("bench.toml").write_text(BENCH.replace(size, "[32768, 32768]"))
-    assert f"[{table}] resolution_px = [32768, 32768]: 1074 million pixels; write 67 million at most" in refusal(*FRAME)
+    assert (
+        f"[{table}] resolution_px = [32768, 32768]: 1074 million pixels; write 67 million at most"
+        in refusal(*FRAME)
+    )
 
 
 def test_whoever_calls_from_python_gets_a_bounded_line_too():
@@ -294,7 +316,10 @@ def test_whoever_calls_from_python_gets_a_bounded_line_too():
     assert len(str(refused.value)) < 700
 
 
-@pytest.mark.parametrize("words", [["--help"], ["frame", "--help"], ["convert", "log.csv", "out.csv"], [*FRAME, "--json"]])
+@pytest.mark.parametrize(
+    "words",
+    [["--help"], ["frame", "--help"], ["convert", "log.csv", "out.csv"], [*FRAME, "--json"]],
+)
 def test_a_full_stdout_is_one_line(words):
     Path("bench.toml").write_text(BENCH)
     Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
@@ -331,23 +356,36 @@ def test_a_full_disk_is_one_line(words):
     Path("long.csv").write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{k},1,0,0,0\n" for k in range(500)))
     command = [sys.executable, "-m", "hilstar", *words]
     result = subprocess.run(
-        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, preexec_fn=limited, env=limited_environment()
+        command,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+        preexec_fn=limited,
+        env=limited_environment(),
     )
     assert_refused(result, 2, "cannot be written")
 
 
 @pytest.mark.parametrize(
-    ("module", "kept"), [("instruments/study/models.py", 200), ("cli/app.py", 16), ("basics/errors.py", 200)]
+    ("module", "kept"),
+    [("instruments/study/models.py", 200), ("cli/app.py", 16), ("basics/errors.py", 200)],
 )
 def test_a_compiled_module_that_a_full_disk_cut_short_is_named(tmp_path, module, kept):
     """Marshal reads past its end: an EOFError, which click takes for Ctrl-C."""
     source = ROOT / "hilstar" / module
-    compiled = tmp_path / "cache" / source.with_suffix(f".{sys.implementation.cache_tag}.pyc").relative_to("/")
+    compiled = (
+        tmp_path
+        / "cache"
+        / source.with_suffix(f".{sys.implementation.cache_tag}.pyc").relative_to("/")
+    )
     py_compile.compile(str(source), cfile=str(compiled), doraise=True)
     os.truncate(compiled, kept)
     environment = os.environ | {"PYTHONPYCACHEPREFIX": str(tmp_path / "cache")} | WITHOUT_BYTECODE
     command = [sys.executable, "-m", "hilstar", "study", "models", "-o", "study", "--quick"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment)
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment
+    )
     assert_refused(result, 2, str(compiled), "damaged", "delete")
 
 
@@ -358,10 +396,16 @@ def test_names_that_are_not_utf_8_are_as_good_as_others():
     result = run_hilstar_here("frame", bench, "--radec", "84,-1,0", "--codes", codes, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["written"] == [codes]
-    result = run_hilstar_here("replay", bench, "log.csv", "--headless", "--speed", "max", "--ledger", "run.mcap")
+    result = run_hilstar_here(
+        "replay", bench, "log.csv", "--headless", "--speed", "max", "--ledger", "run.mcap"
+    )
     assert result.returncode == 0, result.stderr
     assert_refused(
-        run_hilstar_here("frame", os.fsdecode(b"n\xff.toml"), "--radec", "84,-1,0", "--codes", "c.png"), 2, "n\\xff.toml"
+        run_hilstar_here(
+            "frame", os.fsdecode(b"n\xff.toml"), "--radec", "84,-1,0", "--codes", "c.png"
+        ),
+        2,
+        "n\\xff.toml",
     )
 
 

@@ -38,7 +38,19 @@ FLOAT32_OF_PEAK = 1e-5
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench") / "out"
-    result = run_started([sys.executable, "-c", FEWER_ROUNDS, "benchmark", "--quick", *GRID, "--json", "-o", str(folder)])
+    result = run_started(
+        [
+            sys.executable,
+            "-c",
+            FEWER_ROUNDS,
+            "benchmark",
+            "--quick",
+            *GRID,
+            "--json",
+            "-o",
+            str(folder),
+        ]
+    )
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == 1
     return json.loads(result.stdout), folder
@@ -52,13 +64,25 @@ def test_rows_are_those_of_the_contract(measured):
         assert (row["width"], row["height"]) == (640, 480)
         assert 0 < row["ms"]["min"] <= row["ms"]["median"] <= row["ms"]["max"]
     for count in (100, 1000):
-        kinds = [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"]
+        kinds = [
+            row["kind"]
+            for row in result["rows"]
+            if row["stars"] == count and row["method"] == "hilstar"
+        ]
         assert kinds.count("whole_frame") == kinds.count("turning") == 1
         assert set(STAGES) < set(kinds)
-        assert [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "numpy"] == ["linear_only"]
+        assert [
+            row["kind"]
+            for row in result["rows"]
+            if row["stars"] == count and row["method"] == "numpy"
+        ] == ["linear_only"]
     assert min(result[name] for name in ("import_ms", "first_frame_ms", "memory_mb")) > 0
     assert {row["method"] for row in result["agreement"]} >= {"numpy"}
-    assert all(row["worst_of_peak"] < FLOAT32_OF_PEAK for row in result["agreement"] if row["method"] == "numpy")
+    assert all(
+        row["worst_of_peak"] < FLOAT32_OF_PEAK
+        for row in result["agreement"]
+        if row["method"] == "numpy"
+    )
 
 
 def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
@@ -78,7 +102,11 @@ def test_stages_make_up_the_whole_frame(measured):
     result, _ = measured
     for count in (100, 1000):
         # The minimum: what else the machine has to do is in the median.
-        ms = {row["kind"]: row["ms"]["min"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"}
+        ms = {
+            row["kind"]: row["ms"]["min"]
+            for row in result["rows"]
+            if row["stars"] == count and row["method"] == "hilstar"
+        }
         total = sum(ms[stage] for stage in STAGES)
         assert 1 / SUM_FACTOR < total / ms["whole_frame"] < SUM_FACTOR
 
@@ -102,7 +130,9 @@ def test_the_files_say_the_same(measured):
     result, folder = measured
     with (folder / "bench.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["median_ms"]) for row in rows] == [row["ms"]["median"] for row in result["rows"]]
+    assert [float(row["median_ms"]) for row in rows] == [
+        row["ms"]["median"] for row in result["rows"]
+    ]
     with Image.open(folder / "bench.png") as picture:
         assert picture.width > 500
 
@@ -110,10 +140,14 @@ def test_the_files_say_the_same(measured):
 def test_the_virtual_tracker_is_timed_beside_its_peers(measured):
     result, folder = measured
     kinds = {(row["method"], row["kind"]) for row in result["tracker"]}
-    assert {("hilstar", kind) for kind in ("exposure", "find_stars", "case", "verify")} | {("numpy", "exposure")} <= kinds
+    assert {("hilstar", kind) for kind in ("exposure", "find_stars", "case", "verify")} | {
+        ("numpy", "exposure")
+    } <= kinds
     with (folder / "tracker.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["median_ms"]) for row in rows] == [row["ms"]["median"] for row in result["tracker"]]
+    assert [float(row["median_ms"]) for row in rows] == [
+        row["ms"]["median"] for row in result["tracker"]
+    ]
 
 
 def test_a_bench_file_is_measured_at_its_own_size(small_bench_file, monkeypatch):
@@ -141,7 +175,12 @@ def test_wrong_options_are_refused(options, words):
 
 
 def test_a_bench_file_and_sizes_exclude_each_other(small_bench_file):
-    assert_refused(run_hilstar_here("benchmark", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
+    assert_refused(
+        run_hilstar_here("benchmark", small_bench_file, "--sizes", "640x480"),
+        2,
+        "--sizes",
+        "leave out",
+    )
 
 
 def test_a_bench_without_stars_is_refused(small_bench_file):
@@ -181,5 +220,9 @@ def test_slow_works_take_fewer_turns_evenly(monkeypatch):
     times = benchmark.interleaved(works, rounds=8, budget_s=5.0)
     # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one
     # counts.
-    assert {name: len(values) for name, values in times.items()} == {"fast": 8, "slow": 4, "slowest": 1}
+    assert {name: len(values) for name, values in times.items()} == {
+        "fast": 8,
+        "slow": 4,
+        "slowest": 1,
+    }
     assert taken[3:] == ["fast", "fast", "slow"] * 4

@@ -22,13 +22,21 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "stars.csv").write_text(HEAD + ROWS)
     keys = {"catalogue": "stars.csv", "with_hipparcos": True}
-    (tmp_path / "bench.toml").write_text(bench_text({"sky": keys, "collimator": {"focal_length_mm": 350}}))
+    (tmp_path / "bench.toml").write_text(
+        bench_text({"sky": keys, "collimator": {"focal_length_mm": 350}})
+    )
     return tmp_path
 
 
 def test_the_table_s_star_is_in_the_frame_beside_hipparcos(folder):
     done = run_hilstar_here(
-        "frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv", "--explain"
+        "frame",
+        folder / "bench.toml",
+        "--radec",
+        "84.057,-1.2,0",
+        "--truth",
+        folder / "t.csv",
+        "--explain",
     )
     assert done.returncode == 0, done.stderr
     assert "stars.csv: 1 stars of 2 rows, V and V-I from Gaia's G, BP and RP" in done.stderr
@@ -38,13 +46,23 @@ def test_the_table_s_star_is_in_the_frame_beside_hipparcos(folder):
     assert {0, 26311} <= set(rows)  # Alnilam is Hipparcos'
     assert (rows[0]["name"], rows[26311]["name"]) == (f"Gaia DR3 {SOURCE}", "")
     # G - V of Riello et al. 2021, table C.2, at BP - RP = 0.42, by hand.
-    assert float(rows[0]["v_mag"]) == pytest.approx(7.31 + 0.02704 - 0.0059808 + 0.03803184 - 0.00105649, abs=1e-6)
+    assert float(rows[0]["v_mag"]) == pytest.approx(
+        7.31 + 0.02704 - 0.0059808 + 0.03803184 - 0.00105649, abs=1e-6
+    )
 
 
 def test_a_star_without_a_hip_number_clips_by_name(folder):
     with (folder / "bench.toml").open("a") as file:
         file.write("[render]\nflux_at_white_e_per_s = 1000\n")
-    done = run_hilstar_here("frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv", "--json")
+    done = run_hilstar_here(
+        "frame",
+        folder / "bench.toml",
+        "--radec",
+        "84.057,-1.2,0",
+        "--truth",
+        folder / "t.csv",
+        "--json",
+    )
     summary = json.loads(done.stdout)
     assert {26311, f"Gaia DR3 {SOURCE}"} <= set(summary["clipped"])
     assert summary["clipped_mag"][f"Gaia DR3 {SOURCE}"] > 0
@@ -59,7 +77,9 @@ def test_the_bench_s_hash_covers_the_table(folder):
 
 def test_a_table_that_cannot_be_used_is_one_line(folder):
     (folder / "stars.csv").write_text("ra,dec,mass\n1,2,3\n")
-    done = run_hilstar_here("frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv")
+    done = run_hilstar_here(
+        "frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv"
+    )
     assert done.returncode == 2
     assert "has no magnitude with a colour among its columns (ra, dec, mass)" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

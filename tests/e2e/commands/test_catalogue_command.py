@@ -52,7 +52,17 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
     from astropy.table import Table
 
     for ending in ("csv", "fits", "vot", "parquet"):
-        done = run_hilstar_here("catalogue", bench, "-o", tmp_path / f"s.{ending}", "--to", "2", "--epoch", "2030", "--json")
+        done = run_hilstar_here(
+            "catalogue",
+            bench,
+            "-o",
+            tmp_path / f"s.{ending}",
+            "--to",
+            "2",
+            "--epoch",
+            "2030",
+            "--json",
+        )
         assert (done.returncode, done.stderr) == (0, "")
         assert json.loads(done.stdout)["epoch_jyear"] == 2030
     with (tmp_path / "s.csv").open() as file:
@@ -60,7 +70,11 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
     assert set(rows[0]) >= NAMES
     assert all(float(row["v_mag"]) <= 2 for row in rows)
     vega = next(row for row in rows if row["hip"] == "91262")
-    assert (vega["spectral_type"], vega["luminosity_class"], len(vega["ra_deg"].split(".")[1])) == ("A0Vvar", "V", 9)
+    assert (vega["spectral_type"], vega["luminosity_class"], len(vega["ra_deg"].split(".")[1])) == (
+        "A0Vvar",
+        "V",
+        9,
+    )
     # by its colours: CALSPEC_LIMIT of test_pickles
     assert float(vega["instrument_mag_vega"]) == pytest.approx(0.03, abs=0.03)
     assert float(vega["absolute_mag"]) == pytest.approx(0.03 + 5 + 5 * np.log10(0.12893), abs=1e-4)
@@ -96,7 +110,11 @@ def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(bench, tmp_path):
     assert done.returncode == 0, done.stderr
     table = parse_single_table(tmp_path / "s.vot")
     rows, words = table.array, {field.name: field.description for field in table.fields}
-    assert np.asarray(rows["b_measured_mag"]) == pytest.approx(np.asarray(rows["v_mag"] + rows["b_v_mag"]), abs=1e-9)
-    assert np.asarray(rows["i_measured_mag"]) == pytest.approx(np.asarray(rows["v_mag"] - rows["v_i_mag"]), abs=1e-9)
+    assert np.asarray(rows["b_measured_mag"]) == pytest.approx(
+        np.asarray(rows["v_mag"] + rows["b_v_mag"]), abs=1e-9
+    )
+    assert np.asarray(rows["i_measured_mag"]) == pytest.approx(
+        np.asarray(rows["v_mag"] - rows["v_i_mag"]), abs=1e-9
+    )
     assert np.abs(rows["b_mag"] - rows["b_measured_mag"]).max() > 0.5
     assert "not V + (B-V)" in words["b_mag"] and "chosen by V-I" in words["b_mag"]

@@ -21,7 +21,13 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.response import encode, srgb_response
 from tests.support import leftovers
 from tests.support.benches import ROOT, SMALL_BENCH, still_log
-from tests.support.commands import HILSTAR, assert_refused, has_handlers, run_hilstar, run_hilstar_here
+from tests.support.commands import (
+    HILSTAR,
+    assert_refused,
+    has_handlers,
+    run_hilstar,
+    run_hilstar_here,
+)
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -48,7 +54,10 @@ def orion(tmp_path_factory):
 
 def test_orion_is_the_right_way_up(orion):
     folder, _ = orion
-    stars = {int(row["hip"]): (float(row["x_px"]), float(row["y_px"])) for row in read_truth(folder / "o.csv")}
+    stars = {
+        int(row["hip"]): (float(row["x_px"]), float(row["y_px"]))
+        for row in read_truth(folder / "o.csv")
+    }
     x, y = stars[ALNILAM]
     assert np.hypot(x - 511.5, y - 511.5) < 1.0  # Alnilam is in the middle
     assert stars[BETELGEUSE][0] < 511 and stars[BETELGEUSE][1] < 511  # up left
@@ -59,15 +68,36 @@ def test_orion_is_the_right_way_up(orion):
 def test_the_frame_s_files_agree_with_each_other(orion):
     folder, summary = orion
     rows = read_truth(folder / "o.csv")
-    first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
-    last = ["variable", "range_mag", "period_d", "double", "separation_arcsec", "name", "sigma_pos_mas", "sigma_mag"]
+    first = [
+        "hip",
+        "x_px",
+        "y_px",
+        "v_mag",
+        "bv",
+        "temperature_k",
+        "electrons_per_s",
+        "drawn",
+        "clipped",
+    ]
+    last = [
+        "variable",
+        "range_mag",
+        "period_d",
+        "double",
+        "separation_arcsec",
+        "name",
+        "sigma_pos_mas",
+        "sigma_mag",
+    ]
     assert list(rows[0]) == [*first, *last]
     with fits.open(folder / "o.fits") as hdus:
         linear, header = hdus[0].data, hdus[0].header
         assert linear.dtype == np.dtype(">f4")
         assert linear.shape == (1024, 1024)
         assert header["BUNIT"] == "electron/s"
-        assert [header[k] for k in ("QW", "QX", "QY", "QZ")] == pytest.approx(from_radec_roll_deg(84.057, -1.2, 0), abs=1e-15)
+        assert [header[k] for k in ("QW", "QX", "QY", "QZ")] == pytest.approx(
+            from_radec_roll_deg(84.057, -1.2, 0), abs=1e-15
+        )
         assert header["EPOCHJYR"] == 2000.0
         assert header["CREATOR"] == f"hilstar {hilstar.__version__}"
         assert len(header["BENCHSHA"]) == 64
@@ -84,7 +114,9 @@ def test_the_frame_s_files_agree_with_each_other(orion):
         assert peak.argmax() == 4, row["hip"]
     png = np.array(Image.open(folder / "o.png"))
     assert png.dtype == np.uint8
-    assert np.array_equal(png, encode(linear.astype("=f4"), srgb_response(8), summary["flux_at_white_e_per_s"]))
+    assert np.array_equal(
+        png, encode(linear.astype("=f4"), srgb_response(8), summary["flux_at_white_e_per_s"])
+    )
     assert summary["stars"] == len(rows)
     assert {r["drawn"] for r in rows} == {"1"}
     assert {r["clipped"] for r in rows} == {"0"}
@@ -111,7 +143,9 @@ def test_a_quaternion_and_its_negative_are_the_attitude_of_its_radec(orion, tmp_
 
 def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_bench_file):
     small_bench_file.write_text(SMALL_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
-    result = run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--codes", tmp_path / "c.png")
+    result = run_hilstar_here(
+        "frame", small_bench_file, "--radec", "84.057,-1.2,0", "--codes", tmp_path / "c.png"
+    )
     assert result.returncode == 0, result.stderr
     png = np.array(Image.open(tmp_path / "c.png"))
     assert png.dtype == np.uint16
@@ -123,7 +157,15 @@ def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_benc
 
 def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + "[render]\nflux_at_white_e_per_s = 5e5\n")
-    result = run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv", "--json")
+    result = run_hilstar_here(
+        "frame",
+        small_bench_file,
+        "--radec",
+        "84.057,-1.2,0",
+        "--truth",
+        tmp_path / "t.csv",
+        "--json",
+    )
     clipped = json.loads(result.stdout)["clipped"]
     assert {ALNILAM, ALNITAK} <= set(clipped)
     marked = {int(r["hip"]) for r in read_truth(tmp_path / "t.csv") if r["clipped"] == "1"}
@@ -134,9 +176,15 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     """AGS knows no colour: two stars of one magnitude have one rate."""
     small_bench_file.write_text(SMALL_BENCH + '[sky]\nbrightness = "ags"\n')
     assert (
-        run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv").returncode == 0
+        run_hilstar_here(
+            "frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv"
+        ).returncode
+        == 0
     )
-    rates = {float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"])) for r in read_truth(tmp_path / "t.csv")}
+    rates = {
+        float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"]))
+        for r in read_truth(tmp_path / "t.csv")
+    }
     assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
 
 
@@ -150,13 +198,34 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["frame", "BENCH", "--quaternion", "1,1,1,1", "-o", "x.fits"], ["norm is 2"]),
         (["frame", "BENCH", "--quaternion", "nan,0,0,1", "-o", "x.fits"], ["finite"]),
         (["frame", "BENCH", "--radec", "1,2,3"], ["no output", "-o OUT.fits"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"], ["none/x.fits", "cannot be written"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "-o", "x.png"], ["-o x.png", "a FITS file is written there", "write x.fits"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "--truth", "x.fits"], ["--truth x.fits", "CSV", "write x.csv"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "--codes", "x.jpg"], ["--codes x.jpg", "PNG", "write x.png"]),
-        (["serve", "BENCH", "--headless", "--frames", "1", "--ledger", "run.csv"], ["--ledger run.csv", "write run.mcap"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "--truth", "none/x.csv"], ["none/x.csv", "cannot be written"]),
-        (["frame", "BENCH", "--radec", "1,2,3", "--codes", "none/x.png"], ["none/x.png", "cannot be written"]),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"],
+            ["none/x.fits", "cannot be written"],
+        ),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "-o", "x.png"],
+            ["-o x.png", "a FITS file is written there", "write x.fits"],
+        ),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "--truth", "x.fits"],
+            ["--truth x.fits", "CSV", "write x.csv"],
+        ),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "--codes", "x.jpg"],
+            ["--codes x.jpg", "PNG", "write x.png"],
+        ),
+        (
+            ["serve", "BENCH", "--headless", "--frames", "1", "--ledger", "run.csv"],
+            ["--ledger run.csv", "write run.mcap"],
+        ),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "--truth", "none/x.csv"],
+            ["none/x.csv", "cannot be written"],
+        ),
+        (
+            ["frame", "BENCH", "--radec", "1,2,3", "--codes", "none/x.png"],
+            ["none/x.png", "cannot be written"],
+        ),
         (["replay", "BENCH", "none.csv", "--headless"], ["none.csv", "No such file"]),
         (["replay", "BENCH", "LOG", "--headless", "--speed", "fast"], ["fast", "realtime"]),
         (["send"], ["LOG or --spin"]),
@@ -175,7 +244,9 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["serve", "BENCH", "--unknown"], ["--unknown"]),
     ],
 )
-def test_a_wrong_command_gets_one_line_and_exit_code_2(tmp_path, small_bench_file, arguments, words):
+def test_a_wrong_command_gets_one_line_and_exit_code_2(
+    tmp_path, small_bench_file, arguments, words
+):
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
     places = {"BENCH": small_bench_file, "LOG": tmp_path / "log.csv"}
     result = run_hilstar_here(*(places.get(a, a) for a in arguments), cwd=tmp_path)
@@ -197,10 +268,17 @@ def no_opengl(tmp_path):
     return os.environ | {"LD_LIBRARY_PATH": str(folder)}
 
 
-def test_a_stream_without_opengl_gets_one_line_and_exit_code_3(small_bench_file, tmp_path, no_opengl):
+def test_a_stream_without_opengl_gets_one_line_and_exit_code_3(
+    small_bench_file, tmp_path, no_opengl
+):
     log = still_log(tmp_path / "log.csv", seconds=1)
-    for words in (("replay", small_bench_file, log, "--headless", "--speed", "max"), ("serve", small_bench_file, "--headless")):
-        assert_refused(run_hilstar(*words, env=no_opengl), 3, "apt-get install libegl1 libgl1-mesa-dri")
+    for words in (
+        ("replay", small_bench_file, log, "--headless", "--speed", "max"),
+        ("serve", small_bench_file, "--headless"),
+    ):
+        assert_refused(
+            run_hilstar(*words, env=no_opengl), 3, "apt-get install libegl1 libgl1-mesa-dri"
+        )
 
 
 # by which two DN without noise may differ: float32 adds up light in another order, and the ADC
@@ -209,7 +287,9 @@ NUMPY_DN = 2
 NUMPY_OTHER = 1e-3  # of lit pixels, whose light is within rounding of a threshold
 
 
-def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(small_bench_file, tmp_path, no_opengl):
+def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(
+    small_bench_file, tmp_path, no_opengl
+):
     small_bench_file.write_text(SMALL_BENCH + '[render]\nquantisation = "round"\n')
     drawn = {}
     for name, run in (("gl", run_hilstar_here), ("numpy", partial(run_hilstar, env=no_opengl))):
@@ -244,7 +324,10 @@ def test_without_opengl_verify_measures_the_same(small_bench_file, no_opengl):
     assert found["numpy"]["stars"] == found["gl"]["stars"] > 0
     for figure in ("flux_error_mag", "centroid_error_px"):
         for part, value in found["gl"][figure].items():
-            assert found["numpy"][figure][part] == pytest.approx(value, rel=0.05, abs=1e-4), (figure, part)
+            assert found["numpy"][figure][part] == pytest.approx(value, rel=0.05, abs=1e-4), (
+                figure,
+                part,
+            )
 
 
 def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, no_opengl):
@@ -255,7 +338,12 @@ def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, 
         "print('moderngl' in sys.modules)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], env=no_opengl, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [sys.executable, "-c", script],
+        env=no_opengl,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert done.stdout.split()[-1:] == ["False"], done.stderr
 
@@ -265,7 +353,10 @@ def test_doctor_says_what_numpy_draws_where_opengl_is_missing(no_opengl):
     assert done.returncode == 3
     check = next(check for check in json.loads(done.stdout)["checks"] if check["name"] == "opengl")
     assert not check["ok"]
-    assert "apt-get install libegl1" in check["detail"] and "NumPy draws frame, simulate and verify" in check["detail"]
+    assert (
+        "apt-get install libegl1" in check["detail"]
+        and "NumPy draws frame, simulate and verify" in check["detail"]
+    )
 
 
 def test_doctor_says_what_is_there():
@@ -288,7 +379,15 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
         rows.append(",".join(map(repr, [k * 0.1, *map(float, q)])))
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
     result = run_hilstar_here(
-        "replay", small_bench_file, tmp_path / "log.csv", "--headless", "--speed", "max", "-o", tmp_path / "out", "--json"
+        "replay",
+        small_bench_file,
+        tmp_path / "log.csv",
+        "--headless",
+        "--speed",
+        "max",
+        "-o",
+        tmp_path / "out",
+        "--json",
     )
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)
@@ -304,8 +403,14 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
 
 
 def test_replay_in_real_time_takes_the_log_s_time(tmp_path, small_bench_file):
-    (tmp_path / "log.jsonl").write_text('{"t_ns":0,"q":[1,0,0,0]}\n{"t_ns":500000000,"q":[0.9999,0.01,0,0.0099]}\n')
-    summary = json.loads(run_hilstar_here("replay", small_bench_file, tmp_path / "log.jsonl", "--headless", "--json").stdout)
+    (tmp_path / "log.jsonl").write_text(
+        '{"t_ns":0,"q":[1,0,0,0]}\n{"t_ns":500000000,"q":[0.9999,0.01,0,0.0099]}\n'
+    )
+    summary = json.loads(
+        run_hilstar_here(
+            "replay", small_bench_file, tmp_path / "log.jsonl", "--headless", "--json"
+        ).stdout
+    )
     assert summary["frames"] + summary["missed_frames"] == 31
     assert summary["duration_s"] == pytest.approx(0.5, abs=0.2)
 
@@ -314,19 +419,25 @@ def test_an_unwritable_directory_is_refused(tmp_path, small_bench_file):
     blocker = tmp_path / "file"
     blocker.write_text("")
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    result = run_hilstar_here("replay", small_bench_file, tmp_path / "log.csv", "--headless", "-o", blocker / "out")
+    result = run_hilstar_here(
+        "replay", small_bench_file, tmp_path / "log.csv", "--headless", "-o", blocker / "out"
+    )
     assert_refused(result, 2, "cannot be written")
     assert_refused(run_hilstar("demo", "-o", blocker / "out"), 2, "cannot be written")
 
 
 def test_output_to_a_closed_pipe_leaves_no_traceback():
     command = f"{sys.executable} -m hilstar doctor | true"
-    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=os.environ, check=False)
+    result = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, env=os.environ, check=False
+    )
     assert "Traceback" not in result.stderr
 
 
 def test_a_png_is_a_png_whatever_its_name(tmp_path, small_bench_file):
-    result = run_hilstar_here("frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path)
+    result = run_hilstar_here(
+        "frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path
+    )
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "codes").read_bytes()[:4] == b"\x89PNG"
 
@@ -336,7 +447,9 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
     sender = ["send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{free_port()}"]
     for command in (sender, ["serve", str(small_bench_file), "--headless"]):
         for delay_s in (0.0, 0.1, 0.4, 1.0):
-            process = subprocess.Popen([*HILSTAR, *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+            process = subprocess.Popen(
+                [*HILSTAR, *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+            )
             try:
                 # Python's own start is not ours to guard
                 wait_for(lambda process=process: has_handlers(process), poll_s=0.005)
@@ -354,13 +467,19 @@ def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path
     """
     with pytest.raises(subprocess.TimeoutExpired):
         run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=4)
-    assert [command for command in leftovers.living_children().values() if str(tmp_path) in command] == []
+    assert [
+        command for command in leftovers.living_children().values() if str(tmp_path) in command
+    ] == []
     orphan_command = [sys.executable, "-c", "import time; time.sleep(60)", f"-m hilstar {tmp_path}"]
     middle = f"import subprocess; subprocess.Popen({orphan_command!r})"
     subprocess.run([sys.executable, "-c", middle], check=True)
 
     def orphans() -> list[int]:
-        return [number for number, command in leftovers.living_children().items() if str(tmp_path) in command]
+        return [
+            number
+            for number, command in leftovers.living_children().items()
+            if str(tmp_path) in command
+        ]
 
     wait_for(orphans)  # /proc may still have another name or parent for it
     orphan = orphans()
@@ -370,5 +489,9 @@ def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path
 
 
 def test_without_a_display_a_window_is_refused_as_the_machine_s_lack(small_bench_file):
-    bare = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    bare = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("DISPLAY", "WAYLAND_DISPLAY")
+    }
     assert_refused(run_hilstar("serve", small_bench_file, env=bare), 3, "DISPLAY", "--headless")

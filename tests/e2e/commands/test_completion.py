@@ -21,7 +21,9 @@ BASH = shutil.which("bash")
 INSTALLED = Path(sys.executable).parent / "hilstar"
 LIMIT_S = 120.0  # 300 times what one completion takes on an idle machine
 
-pytestmark = pytest.mark.skipif(BASH is None or not INSTALLED.exists(), reason="no bash, or hilstar is not installed")
+pytestmark = pytest.mark.skipif(
+    BASH is None or not INSTALLED.exists(), reason="no bash, or hilstar is not installed"
+)
 
 
 @pytest.fixture
@@ -69,7 +71,9 @@ def typed(env, keys, wanted):
 
 def test_tab_in_a_real_bash_completes_an_option_and_the_line_runs(env):
     installed(env)
-    assert f"hilstar {hilstar.__version__}" in typed(env, "hilstar --vers\t\n", f"hilstar {hilstar.__version__}")
+    assert f"hilstar {hilstar.__version__}" in typed(
+        env, "hilstar --vers\t\n", f"hilstar {hilstar.__version__}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +111,9 @@ def test_zsh_gets_its_script(env):
     ).stdout
     assert "#compdef hilstar" in script
     asked = env | {"_HILSTAR_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "hilstar fr"}
-    done = subprocess.run([str(INSTALLED)], env=asked, capture_output=True, text=True, timeout=LIMIT_S, check=True)
+    done = subprocess.run(
+        [str(INSTALLED)], env=asked, capture_output=True, text=True, timeout=LIMIT_S, check=True
+    )
     assert '"frame"' in done.stdout
 
 
@@ -116,6 +122,9 @@ def test_completing_needs_no_numpy_and_a_command_no_pydantic():
     # command: 0.33 and 0.44 s.
     code = "import hilstar.cli, sys; print('numpy' in sys.modules); hilstar.cli.run_command(['frame', 'none.toml'])"
     found = subprocess.run(
-        [sys.executable, "-c", f"{code}; print('pydantic' in sys.modules)"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", f"{code}; print('pydantic' in sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert found.stdout.split() == ["False", "False"]

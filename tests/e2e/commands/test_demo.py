@@ -68,13 +68,19 @@ def test_the_sender_begins_once_a_frame_is_drawn_however_long_that_takes(tmp_pat
 @pytest.mark.parametrize("seconds", [0.5, 2.0, 10.0])
 def test_a_short_demo_too_turns_no_faster_than_a_receiver_takes(seconds):
     samples = demo.slew_samples(seconds, np.random.default_rng(1))
-    assert max(math.hypot(*sample.rate_cam_rad_s) for sample in samples) < math.radians(AttitudeSettings().max_rate_deg_s)
+    assert max(math.hypot(*sample.rate_cam_rad_s) for sample in samples) < math.radians(
+        AttitudeSettings().max_rate_deg_s
+    )
 
 
 def test_a_sky_that_stood_still_is_said_last_and_is_no_success(tmp_path, monkeypatch):
     """The sender ends after a third of a second."""
     write = demo.write_log
-    monkeypatch.setattr(demo, "write_log", lambda path, samples: write(path, samples[: round(SECONDS / 5 * demo.SEND_HZ)]))
+    monkeypatch.setattr(
+        demo,
+        "write_log",
+        lambda path, samples: write(path, samples[: round(SECONDS / 5 * demo.SEND_HZ)]),
+    )
     result = run_demo(tmp_path)
     assert result.returncode == 1
     last = result.stdout.splitlines()[-1]
@@ -92,19 +98,36 @@ def test_a_sender_that_ends_before_an_attitude_came_is_named(tmp_path, monkeypat
     popen = subprocess.Popen
 
     def fails(command, **options):
-        return popen([sys.executable, "-c", "raise SystemExit(7)"] if "send" in command else command, **options)
+        return popen(
+            [sys.executable, "-c", "raise SystemExit(7)"] if "send" in command else command,
+            **options,
+        )
 
     monkeypatch.setattr(demo.subprocess, "Popen", fails)
-    assert_refused(run_demo(tmp_path), 3, "the demo's sender ended before an attitude came", "hilstar send")
+    assert_refused(
+        run_demo(tmp_path), 3, "the demo's sender ended before an attitude came", "hilstar send"
+    )
 
 
 def test_the_demo_can_be_watched_and_acted_on(tmp_path):
-    command = [*HILSTAR, "demo", "-o", str(tmp_path / "demo"), "--duration", "60", "--console", "127.0.0.1:0", "--control"]
+    command = [
+        *HILSTAR,
+        "demo",
+        "-o",
+        str(tmp_path / "demo"),
+        "--duration",
+        "60",
+        "--console",
+        "127.0.0.1:0",
+        "--control",
+    ]
     with Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             page = page_of(Served(process, 0))
             with live(page) as link:
-                hello = link.await_message(lambda said: isinstance(said, dict) and "hello" in said)["hello"]
+                hello = link.await_message(lambda said: isinstance(said, dict) and "hello" in said)[
+                    "hello"
+                ]
                 link.want(picture=True, hz=8)
                 head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
             assert hello["command"] == "hilstar demo" and hello["control"]
@@ -119,7 +142,9 @@ def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was
     """Six seconds: the bias, with what the field-of-view error adds to it over so short a scan,
     and the live figures.
     """
-    result = run_hilstar_here("demo", "--loop", "-o", tmp_path / "demo", "--duration", "6", "--json")
+    result = run_hilstar_here(
+        "demo", "--loop", "-o", tmp_path / "demo", "--duration", "6", "--json"
+    )
     if "and 30 are needed" in result.stderr or "and 30 others are needed" in result.stderr:
         pytest.skip("the machine is too busy for three answers a second, or for most of the frames")
     # 1: a busy machine's sky stood still for a moment
@@ -129,6 +154,9 @@ def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was
     (line,) = (line for line in result.stderr.splitlines() if line.startswith('{"loop"'))
     found = {row["quantity"]: row for row in json.loads(line)["loop"]}
     for axis in "xy":
-        assert abs(found[f"bias {axis}"]["found"] - found[f"bias {axis}"]["planted"]) < LOOP_BIAS_ARCSEC
+        assert (
+            abs(found[f"bias {axis}"]["found"] - found[f"bias {axis}"]["planted"])
+            < LOOP_BIAS_ARCSEC
+        )
     assert {"field-of-view error across", "pixel error across", "wrong answers"} <= found.keys()
     assert (tmp_path / "demo" / "budget.html").stat().st_size > 10_000

@@ -27,7 +27,9 @@ ENVIRONMENT = {"PIP_NO_COMPILE": "no"}
 
 def clean_environment() -> dict[str, str]:
     """Without what would lead Python back to this checkout."""
-    return {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")} | ENVIRONMENT
+    return {
+        key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")
+    } | ENVIRONMENT
 
 
 def shape(text: str) -> str:
@@ -65,9 +67,16 @@ def test_the_first_command_does_the_main_job_in_a_fresh_checkout(checkout):
 def test_nothing_that_pip_pulled_is_under_the_gpl(checkout):
     folder, _ = checkout
     [packages] = (folder / ".venv" / "lib").glob("python*/site-packages")
-    licences = {each.metadata["Name"]: licence_of(each) for each in metadata.distributions(path=[str(packages)])}
+    licences = {
+        each.metadata["Name"]: licence_of(each)
+        for each in metadata.distributions(path=[str(packages)])
+    }
     assert "hilstar" in licences
-    assert {name: licence for name, licence in licences.items() if licence == UNKNOWN or is_copyleft(licence)} == {}
+    assert {
+        name: licence
+        for name, licence in licences.items()
+        if licence == UNKNOWN or is_copyleft(licence)
+    } == {}
 
 
 def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_path):
@@ -80,7 +89,13 @@ def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_pa
 
     def printed(*command: str | Path) -> str:
         done = subprocess.run(
-            command, cwd=elsewhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=clean_environment()
+            command,
+            cwd=elsewhere,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+            env=clean_environment(),
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -89,4 +104,6 @@ def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_pa
     shown = json.loads(printed(programs / "hilstar", "demo", "--duration", "2", "--json"))
     assert shown["frames"] > 0 and shown["stars_drawn"]["mean"] > 50
     assert len(list((elsewhere / "hilstar-demo").glob("*_codes.png"))) == 4
-    assert str(folder / ".venv") in printed(programs / "python", "-c", "import hilstar; print(hilstar.__file__)")
+    assert str(folder / ".venv") in printed(
+        programs / "python", "-c", "import hilstar; print(hilstar.__file__)"
+    )

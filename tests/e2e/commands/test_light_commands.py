@@ -42,13 +42,19 @@ def test_where_a_star_clips_and_where_it_shows_nothing_is_where_frames_say_so(be
     bench = bench_with('[render]\nquantisation = "round"\nflux_at_white_e_per_s = 1e8\n')
     found = budget(bench)
     zero_mag = zero_point_mag(bench)
-    white_rate, dark_rate = (10 ** (0.4 * (zero_mag - v)) for v in (found.clips_v_mag, found.nothing_v_mag))
+    white_rate, dark_rate = (
+        10 ** (0.4 * (zero_mag - v)) for v in (found.clips_v_mag, found.nothing_v_mag)
+    )
     assert white_rate * GaussianPsf((0.85, 0.85)).peak_share == pytest.approx(1e8, rel=1e-12)
     half_code = 0.5 / 255 / 12.92
-    assert dark_rate * GaussianPsf((0.85, 0.85)).peak_share == pytest.approx(1e8 * half_code, rel=1e-12)
+    assert dark_rate * GaussianPsf((0.85, 0.85)).peak_share == pytest.approx(
+        1e8 * half_code, rel=1e-12
+    )
     corner = 10 ** (0.4 * (zero_mag - found.clips_v_mag_at_best)) * pixel_share(0.5, 0.85) ** 2
     assert corner == pytest.approx(1e8, rel=1e-9)
-    clipped = bench.stars.hip[bench.stars.electrons_per_s * GaussianPsf((0.85, 0.85)).peak_share > 1e8]
+    clipped = bench.stars.hip[
+        bench.stars.electrons_per_s * GaussianPsf((0.85, 0.85)).peak_share > 1e8
+    ]
     assert sorted(found.clipped_hip) == sorted(clipped.tolist())
     assert found.range_mag == pytest.approx(-2.5 * math.log10(half_code))
     rates = bench.stars.electrons_per_s
@@ -91,7 +97,9 @@ def test_budget_writes_its_chart_and_table(tmp_path, small_bench_file):
 def test_a_formula_s_shares_of_white_are_said_to_be_assumed(tmp_path):
     path = tmp_path / "bench.toml"
     for calibration, assumed in (("srgb", True), ("lcd-example", False)):
-        path.write_text(bench_text({"monitor": {"calibration": calibration}, "render": {"bit_stealing": True}}))
+        path.write_text(
+            bench_text({"monitor": {"calibration": calibration}, "render": {"bit_stealing": True}})
+        )
         told = run_hilstar_here("budget", path)
         assert told.returncode == 0, told.stderr
         assert ("as 0.2126, 0.7152, 0.0722 of red, green and blue" in told.stderr) is assumed
@@ -105,20 +113,29 @@ def test_budget_has_every_centroider_and_takes_the_bench_s_own(tmp_path, small_b
     assert fit["centroider"] == "fit"
     row = fit["rows"][12]
     assert set(row["axis_rms_px"]) == {"moment", "window", "wide", "fit", "box3", "box5"}
-    assert row["axis_rms_px"] == fit["centroid_rms_px"] and len(set(row["axis_rms_px"].values())) == 6
+    assert (
+        row["axis_rms_px"] == fit["centroid_rms_px"] and len(set(row["axis_rms_px"].values())) == 6
+    )
     assert row["centroid_rms_px"] == pytest.approx(math.sqrt(2) * row["axis_rms_px"]["fit"])
     with (tmp_path / "out" / "budget.csv").open() as file:
         written = list(csv.DictReader(file))[12]
     assert float(written["axis_rms_px_box5"]) == pytest.approx(row["axis_rms_px"]["box5"])
     small_bench_file.write_text(small_bench_file.read_text() + '[verify]\ncentroider = "box5"\n')
-    own, every = of_json("budget", small_bench_file), of_json("budget", small_bench_file, "--centroider", "all")
+    own, every = (
+        of_json("budget", small_bench_file),
+        of_json("budget", small_bench_file, "--centroider", "all"),
+    )
     assert own["centroider"] == "box5"
-    assert own["rows"][12]["centroid_rms_px"] == pytest.approx(math.sqrt(2) * own["rows"][12]["axis_rms_px"]["box5"])
+    assert own["rows"][12]["centroid_rms_px"] == pytest.approx(
+        math.sqrt(2) * own["rows"][12]["axis_rms_px"]["box5"]
+    )
     pairs = zip(every["rows"][:-1], own["rows"][:-1], strict=True)
     assert all(worst["centroid_max_px"] >= one["centroid_max_px"] for worst, one in pairs)
     said = run_hilstar_here("budget", small_bench_file, "--centroider", "all").stdout
     assert "   moment   window     wide      fit     box3     box5   max px" in said
-    assert_refused(run_hilstar_here("budget", small_bench_file, "--centroider", "psf"), 2, "box5, all")
+    assert_refused(
+        run_hilstar_here("budget", small_bench_file, "--centroider", "psf"), 2, "box5, all"
+    )
 
 
 @pytest.mark.parametrize("method", ["dither", "temporal"])
@@ -131,7 +148,9 @@ def test_white_is_the_brightest_star_wanted(bench_with):
     bench = bench_with("[render]\nbrightest_v_mag = 1.0\n")
     stars = bench.stars
     wanted = stars.electrons_per_s[stars.v_mag >= 1.0].max()
-    assert bench.flux_at_white_e_per_s == pytest.approx(wanted * GaussianPsf((0.85, 0.85)).peak_share, rel=1e-15)
+    assert bench.flux_at_white_e_per_s == pytest.approx(
+        wanted * GaussianPsf((0.85, 0.85)).peak_share, rel=1e-15
+    )
     assert 32349 in budget(bench).clipped_hip  # Sirius
 
 
@@ -140,7 +159,9 @@ def test_the_white_of_a_file_that_gives_none_leaves_codes_for_most_fields(tmp_pa
     median field.
     """
     bench_file = tmp_path / "wide.toml"
-    bench_file.write_text(SMALL_BENCH.replace("[320, 240]", "[1920, 1080]").replace("= 60", "= 350"))
+    bench_file.write_text(
+        SMALL_BENCH.replace("[320, 240]", "[1920, 1080]").replace("= 60", "= 350")
+    )
     fields = Rotation.random(30, random_state=1).as_quat(scalar_first=True)
     with hilstar.load(bench_file) as bench:
         brightest, clipped = [], 0
@@ -153,18 +174,30 @@ def test_the_white_of_a_file_that_gives_none_leaves_codes_for_most_fields(tmp_pa
         assert 1 <= len(clipping_hip(bench)) <= 21
 
 
-def test_a_run_names_the_stars_that_clip_and_a_bench_without_such_stars_says_nothing(small_bench_file):
+def test_a_run_names_the_stars_that_clip_and_a_bench_without_such_stars_says_nothing(
+    small_bench_file,
+):
     small_bench_file.write_text(SMALL_BENCH + '[attitude]\nendpoint = "tcp://127.0.0.1:5599"\n')
     spoken = run_hilstar_here("serve", small_bench_file, "--headless", "--frames", "1")
-    assert "13 stars" in spoken.stderr and "HIP 32349, 30438" in spoken.stderr and "brightest_v_mag = 1.5" in spoken.stderr
+    assert (
+        "13 stars" in spoken.stderr
+        and "HIP 32349, 30438" in spoken.stderr
+        and "brightest_v_mag = 1.5" in spoken.stderr
+    )
     small_bench_file.write_text(small_bench_file.read_text() + "[render]\nbrightest_v_mag = -2\n")
-    assert "HIP" not in run_hilstar_here("serve", small_bench_file, "--headless", "--frames", "1").stderr
+    assert (
+        "HIP"
+        not in run_hilstar_here("serve", small_bench_file, "--headless", "--frames", "1").stderr
+    )
 
 
 def test_a_sky_of_the_brightest_stars_alone_has_a_white(bench_with):
     """Of the stars to V = 1 none is as faint as the default white."""
     bench = bench_with("[sky]\nfaintest_v_mag = 1.0\n")
-    assert bench.flux_at_white_e_per_s == bench.stars.electrons_per_s.max() * GaussianPsf((0.85, 0.85)).peak_share
+    assert (
+        bench.flux_at_white_e_per_s
+        == bench.stars.electrons_per_s.max() * GaussianPsf((0.85, 0.85)).peak_share
+    )
     assert clipping_hip(bench) == []
 
 
@@ -177,16 +210,25 @@ def test_two_whites_or_none_get_one_line(small_bench_file):
         assert_refused(run_hilstar_here("budget", small_bench_file), 2, said)
 
 
-def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(tmp_path, small_bench_file):
+def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(
+    tmp_path, small_bench_file
+):
     """Readings of three stars as a tracker would give them, and a copy of the bench file,
     comments kept.
     """
-    small_bench_file.write_text(SMALL_BENCH + "[render]  # how light becomes codes\nsprite_sigma_px = [0.9, 0.9]  # wide\n")
+    small_bench_file.write_text(
+        SMALL_BENCH + "[render]  # how light becomes codes\nsprite_sigma_px = [0.9, 0.9]  # wide\n"
+    )
     with hilstar.load(small_bench_file) as bench:
         white = bench.flux_at_white_e_per_s
-        rates = {hip: float(bench.stars.electrons_per_s[bench.stars.hip == hip][0]) for hip in (26311, 26727, 25930)}
+        rates = {
+            hip: float(bench.stars.electrons_per_s[bench.stars.hip == hip][0])
+            for hip in (26311, 26727, 25930)
+        }
     readings = [f"--reading={hip},{1.3 * rate * 0.1 / 24:.3f}" for hip, rate in rates.items()]
-    found = of_json("calibrate", "scale", small_bench_file, *readings, "-o", tmp_path / "scaled.toml")
+    found = of_json(
+        "calibrate", "scale", small_bench_file, *readings, "-o", tmp_path / "scaled.toml"
+    )
     assert found["flux_at_white_e_per_s"] == pytest.approx(1.3 * white, rel=1e-3)
     assert found["scatter_mag"] < 1e-3
     text = (tmp_path / "scaled.toml").read_text()
@@ -195,13 +237,23 @@ def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(tmp_pat
     with hilstar.load(tmp_path / "scaled.toml") as bench:
         assert bench.flux_at_white_e_per_s == found["flux_at_white_e_per_s"]
         assert bench.config.render.sprite_sigma_px == (0.9, 0.9)
-    again = of_json("calibrate", "scale", tmp_path / "scaled.toml", "--reading", "26311,1000", "-o", tmp_path / "third.toml")
+    again = of_json(
+        "calibrate",
+        "scale",
+        tmp_path / "scaled.toml",
+        "--reading",
+        "26311,1000",
+        "-o",
+        tmp_path / "third.toml",
+    )
     assert (tmp_path / "third.toml").read_text().count("flux_at_white_e_per_s") == 1
     assert again["assumed_e_per_s"] == found["flux_at_white_e_per_s"]
 
 
 def test_readings_that_disagree_are_said_to(small_bench_file):
-    result = run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "26311,1000", "--reading", "26727,3000")
+    result = run_hilstar_here(
+        "calibrate", "scale", small_bench_file, "--reading", "26311,1000", "--reading", "26727,3000"
+    )
     assert result.returncode == 0
     assert "disagree" in result.stderr
 
@@ -222,7 +274,11 @@ def test_a_scale_that_cannot_be_gets_one_line(small_bench_file, arguments, said)
 
 def test_a_star_that_clips_is_no_scale(small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + "[render]\nbrightest_v_mag = 3\n")
-    assert_refused(run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "32349,100"), 2, "clips")
+    assert_refused(
+        run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "32349,100"),
+        2,
+        "clips",
+    )
 
 
 def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
@@ -230,12 +286,16 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
     its file's hash.
     """
     plan = tmp_path / "plan.csv"
-    planned = of_json("calibrate", "plan", "-o", plan, "--headless", tmp_path / "patches", "--resolution", "64,48")
+    planned = of_json(
+        "calibrate", "plan", "-o", plan, "--headless", tmp_path / "patches", "--resolution", "64,48"
+    )
     true = load_calibration("lcd-example", 8).response
     with plan.open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == planned["patches"]
-    assert len(list((tmp_path / "patches").glob("*.png"))) == len({row["code"] for row in rows}) >= 32
+    assert (
+        len(list((tmp_path / "patches").glob("*.png"))) == len({row["code"] for row in rows}) >= 32
+    )
     for row in rows:
         light = 250 * (true.black + true.light[int(row["code"])]) / (1 + true.black)
         row["value"] = f"{light * (1 + 0.01 * rng.normal()):.6g}"
@@ -244,15 +304,25 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
         writer.writeheader()
         writer.writerows(rows)
     fitted = of_json(
-        "calibrate", "photometric", tmp_path / "measured.csv", "-o", tmp_path / "monitor.toml", "--plot", tmp_path / "fit.png"
+        "calibrate",
+        "photometric",
+        tmp_path / "measured.csv",
+        "-o",
+        tmp_path / "monitor.toml",
+        "--plot",
+        tmp_path / "fit.png",
     )
     assert fitted["noise_relative"] == pytest.approx(0.01, rel=0.2)
     response = load_calibration(tmp_path / "monitor.toml", 8).response
     bright = true.light >= 1e-3
     assert np.abs(response.light[bright] / true.light[bright] - 1).max() < RESPONSE_ERROR
     assert response.black == pytest.approx(true.black, rel=0.03)
-    small_bench_file.write_text(SMALL_BENCH.replace("[collimator]", 'calibration = "monitor.toml"\n[collimator]'))
-    shot = run_hilstar_here("frame", small_bench_file, "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
+    small_bench_file.write_text(
+        SMALL_BENCH.replace("[collimator]", 'calibration = "monitor.toml"\n[collimator]')
+    )
+    shot = run_hilstar_here(
+        "frame", small_bench_file, "--radec", "84,-1,0", "-o", tmp_path / "out.fits"
+    )
     assert shot.returncode == 0, shot.stderr
     assert fits.getheader(tmp_path / "out.fits")["CALSHA"] == fitted["sha256"]
 
@@ -269,7 +339,10 @@ def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path)
     true = load_calibration("lcd-example", 8).response
     with (tmp_path / "PLAN.csv").open() as file:
         rows = list(csv.DictReader(file))
-    lines = [f"{row['order']},{row['code']},w,{float(true.black + true.light[int(row['code'])])!r}" for row in rows]
+    lines = [
+        f"{row['order']},{row['code']},w,{float(true.black + true.light[int(row['code'])])!r}"
+        for row in rows
+    ]
     (tmp_path / "MEASURED.csv").write_text("\n".join(["order,code,channel,value", *lines]))
     fitted = run_hilstar_here(*fit.split(), cwd=tmp_path)
     assert fitted.returncode == 0, fitted.stderr
@@ -278,9 +351,14 @@ def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path)
 def test_the_words_of_a_calibration_say_what_to_write(tmp_path):
     light = load_calibration("gamma2.2", 8).response.light
     codes = [0, *range(5, 256, 10)]
-    lines = ["code,channel,value", *(f"{code},w,{light[code] * 100 + 0.1:.5f}" for code in codes for _ in range(2))]
+    lines = [
+        "code,channel,value",
+        *(f"{code},w,{light[code] * 100 + 0.1:.5f}" for code in codes for _ in range(2)),
+    ]
     (tmp_path / "m.csv").write_text("\n".join(lines))
-    result = run_hilstar_here("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "mon.toml")
+    result = run_hilstar_here(
+        "calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "mon.toml"
+    )
     assert result.returncode == 0, result.stderr
     assert 'calibration = "mon.toml"' in result.stdout
     assert "contrast 1 : " in result.stdout

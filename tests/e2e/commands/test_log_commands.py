@@ -22,7 +22,13 @@ def log(tmp_path) -> Path:
     path = tmp_path / "log.jsonl"
     start = from_radec_roll_deg(84, -1, 0)
     lines = [
-        json.dumps({"t_ns": 10**9 + k * 10**8, "q": propagate(start, RATE, k / 10).tolist(), "rate": RATE.tolist()})
+        json.dumps(
+            {
+                "t_ns": 10**9 + k * 10**8,
+                "q": propagate(start, RATE, k / 10).tolist(),
+                "rate": RATE.tolist(),
+            }
+        )
         for k in range(21)
     ]
     path.write_text("\n".join(lines))
@@ -30,7 +36,9 @@ def log(tmp_path) -> Path:
 
 
 def replayed(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
-    result = run_hilstar_here("replay", bench, log, "--headless", "--speed", "max", "-o", output, *options)
+    result = run_hilstar_here(
+        "replay", bench, log, "--headless", "--speed", "max", "-o", output, *options
+    )
     assert result.returncode == 0, result.stderr
     with (output / "frames.csv").open() as file:
         return list(csv.DictReader(file))
@@ -46,18 +54,25 @@ def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_fi
     converted = run_hilstar_here("convert", log, other)
     assert converted.returncode == 0, converted.stderr
     assert "21 attitudes" in converted.stdout
-    ours, theirs = (replayed(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25") for path in (log, other))
+    ours, theirs = (
+        replayed(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25")
+        for path in (log, other)
+    )
     assert len(ours) == len(theirs) == 9
     for a, b in zip(ours, theirs, strict=True):
         # AEM's rates come back through q and q_dot, to some 1e-15.
         assert quaternion(a) == pytest.approx(quaternion(b), abs=1e-13)
-    frames = [np.array(Image.open(tmp_path / path.suffix / "frame_000004.png")) for path in (log, other)]
+    frames = [
+        np.array(Image.open(tmp_path / path.suffix / "frame_000004.png")) for path in (log, other)
+    ]
     assert (frames[0] != frames[1]).mean() < 1e-4
     assert frames[0].max() > 50
 
 
 def test_a_replay_s_span_and_step_are_those_asked_for(tmp_path, small_bench_file, log):
-    rows = replayed(small_bench_file, log, tmp_path / "out", "--start", "0.5", "--stop", "1.5", "--step", "0.1")
+    rows = replayed(
+        small_bench_file, log, tmp_path / "out", "--start", "0.5", "--stop", "1.5", "--step", "0.1"
+    )
     assert [float(row["t_s"]) for row in rows] == pytest.approx([1.5 + 0.1 * k for k in range(11)])
 
 
@@ -81,18 +96,29 @@ def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_benc
     ],
 )
 def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, log, options, said):
-    assert_refused(run_hilstar_here("replay", small_bench_file, log, "--headless", *options), 2, said)
+    assert_refused(
+        run_hilstar_here("replay", small_bench_file, log, "--headless", *options), 2, said
+    )
 
 
 def test_convert_says_what_it_cannot(tmp_path, log):
     assert_refused(run_hilstar_here("convert", log, tmp_path / "out.doc"), 2, ".csv", "out.doc")
-    assert_refused(run_hilstar_here("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv")
+    assert_refused(
+        run_hilstar_here("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv"
+    )
     assert_refused(run_hilstar_here("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
 
 
 def test_fault_options_stand_alone_or_take_a_share(tmp_path):
-    for options, said in ((["--lose", "110%"], "--lose 110%"), (["--corrupt", "60%", "--lose", "60%"], "100 %")):
-        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", *options), 2, said)
+    for options, said in (
+        (["--lose", "110%"], "--lose 110%"),
+        (["--corrupt", "60%", "--lose", "60%"], "100 %"),
+    ):
+        assert_refused(
+            run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", *options),
+            2,
+            said,
+        )
     result = run_hilstar_here(
         "send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--rate", "5000", "--count", "4000", "--wait", "0",
         "--json", "--reorder", "--corrupt", "--lose", "0.1",
@@ -119,14 +145,22 @@ def test_a_resampled_log_keeps_its_breaks_and_its_rates(tmp_path):
     path.write_text("\n".join(map(json.dumps, lines)))
     sent = list(log_samples(read_log(path), 2.0))
     assert [sample.discontinuity for sample in sent] == [False] * 4 + [True, False, False]
-    assert [float(sample.rate_cam_rad_s[2]) for sample in sent] == pytest.approx([0.1, 0.2, 0.3, 0.3, 0.5, 0.5, 0.5])
+    assert [float(sample.rate_cam_rad_s[2]) for sample in sent] == pytest.approx(
+        [0.1, 0.2, 0.3, 0.3, 0.5, 0.5, 0.5]
+    )
 
 
 def test_a_gap_in_a_log_is_held_and_said_once(tmp_path, small_bench_file):
     path = tmp_path / "gap.csv"
-    rows = [(t, propagate(from_radec_roll_deg(84, -1, 0), RATE, t)) for t in (0, 0.5, 1, 1.5, 9, 9.5)]
-    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *(f"{t},{','.join(map(repr, q.tolist()))}" for t, q in rows)]))
-    result = run_hilstar_here("replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json")
+    rows = [
+        (t, propagate(from_radec_roll_deg(84, -1, 0), RATE, t)) for t in (0, 0.5, 1, 1.5, 9, 9.5)
+    ]
+    path.write_text(
+        "\n".join(["t_s,qw,qx,qy,qz", *(f"{t},{','.join(map(repr, q.tolist()))}" for t, q in rows)])
+    )
+    result = run_hilstar_here(
+        "replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json"
+    )
     assert result.stderr.count("1 gap, the longest 7.5 s (over") == 1
     summary = json.loads(result.stdout)
     assert summary["events"]["log-gap"] == 1

@@ -21,7 +21,10 @@ def test_the_picture_is_what_the_program_makes(tmp_path):
     script = [sys.executable, ROOT / "tools" / "make_picture.py", tmp_path / "p.png"]
     made = subprocess.run(script, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
-    ours, theirs = (np.array(Image.open(path).convert("L")).astype(int) for path in (tmp_path / "p.png", ROOT / "readme.png"))
+    ours, theirs = (
+        np.array(Image.open(path).convert("L")).astype(int)
+        for path in (tmp_path / "p.png", ROOT / "readme.png")
+    )
     assert ours.shape == theirs.shape
     # Another driver may round a code the other way: the preview's power of 0.35 makes at most 40
     # grey levels of one, and a code that is written out differs in a hundred pixels of a million.
@@ -35,7 +38,9 @@ def test_the_sender_is_heard(tmp_path):
     (tmp_path / "bench.toml").write_text(blocks("toml")[0] + attitude_table(port))
     with Started([sys.executable, "-c", sender]) as process:
         try:
-            result = run_hilstar("serve", "bench.toml", "--headless", "--duration", "2", cwd=tmp_path)
+            result = run_hilstar(
+                "serve", "bench.toml", "--headless", "--duration", "2", cwd=tmp_path
+            )
         finally:
             process.kill()
     assert result.returncode == 0, result.stderr

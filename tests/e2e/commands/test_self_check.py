@@ -43,7 +43,9 @@ Numbers = list[float]
 
 def csv(folder: Path, q: Numbers) -> Path:
     path = folder / "a.csv"
-    path.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t_s},{','.join(map(repr, q))}\n" for t_s in (0, 1)))
+    path.write_text(
+        "t_s,qw,qx,qy,qz\n" + "".join(f"{t_s},{','.join(map(repr, q))}\n" for t_s in (0, 1))
+    )
     return path
 
 
@@ -67,7 +69,18 @@ def kernel(folder: Path, q: Numbers) -> Path:
     ck.write_texts(folder)
     ticks = np.array([0.0, 1.0]) * ck.TICKS_PER_S
     with ck.new_ck(path) as handle:
-        spiceypy.ckw01(handle, *ticks, ck.BODY, "J2000", False, "by a test", 2, ticks, np.array([q, q]), np.zeros((2, 3)))
+        spiceypy.ckw01(
+            handle,
+            *ticks,
+            ck.BODY,
+            "J2000",
+            False,
+            "by a test",
+            2,
+            ticks,
+            np.array([q, q]),
+            np.zeros((2, 3)),
+        )
     return path
 
 
@@ -83,12 +96,17 @@ def cic(folder: Path, q: Numbers) -> Path:
     return folder / "a.cic"
 
 
-def bag(kind: str, frame: str, release: str, write: Callable[..., Path], name: str) -> Callable[[Path, Numbers], Path]:
+def bag(
+    kind: str, frame: str, release: str, write: Callable[..., Path], name: str
+) -> Callable[[Path, Numbers], Path]:
     def written(folder: Path, q: Numbers) -> Path:
         x, y, z, w = q
         make = Make(release)
         times = [START_NS, START_NS + 10**9]
-        sent = [("/a", kind, t_ns, make.of(kind, t_ns, frame, "body", (w, x, y, z), (0, 0, 0))) for t_ns in times]
+        sent = [
+            ("/a", kind, t_ns, make.of(kind, t_ns, frame, "body", (w, x, y, z), (0, 0, 0)))
+            for t_ns in times
+        ]
         path = folder / f"{time.monotonic_ns()}{name}"
         return write(path, sent, **({} if release == "noetic" else {"release": release}))
 
@@ -101,13 +119,25 @@ LOGS = {
     "json": (json_lines, "q", ()),
     "aem-1": (aem(), "Q1 Q2 Q3 QC", ()),
     "aem-1-back": (aem(**B2A), "QC Q1 Q2 Q3", ()),
-    "aem-1-from-body": (aem(REF_FRAME_A="SC_BODY_1", REF_FRAME_B="EME2000", QUATERNION_TYPE="FIRST"), "QC Q1 Q2 Q3", ()),
+    "aem-1-from-body": (
+        aem(REF_FRAME_A="SC_BODY_1", REF_FRAME_B="EME2000", QUATERNION_TYPE="FIRST"),
+        "QC Q1 Q2 Q3",
+        (),
+    ),
     "aem-2": (aem("2.0"), "Q1 Q2 Q3 QC", ()),
     "aem-2-teme": (aem("2.0", REF_FRAME_A="TEME"), "Q1 Q2 Q3 QC", ()),
     "aem-1-itrf": (aem("1.0", REF_FRAME_A="ITRF-97", ATTITUDE_DIR="B2A"), "Q1 Q2 Q3 QC", ()),
-    "aem-2-tracker": (aem("2.0", REF_FRAME_A="STARTRACKER_1", REF_FRAME_B="ICRF"), "Q1 Q2 Q3 QC", ()),
+    "aem-2-tracker": (
+        aem("2.0", REF_FRAME_A="STARTRACKER_1", REF_FRAME_B="ICRF"),
+        "Q1 Q2 Q3 QC",
+        (),
+    ),
     "ck": (kernel, "m2q(C), C from J2000", ()),
-    "ros1": (bag(ros_bags.POSE_STAMPED, "map", "noetic", write_bag1, ".bag"), "x y z w", ("--reference", "enu", STATED[2])),
+    "ros1": (
+        bag(ros_bags.POSE_STAMPED, "map", "noetic", write_bag1, ".bag"),
+        "x y z w",
+        ("--reference", "enu", STATED[2]),
+    ),
     "ros2": (bag(ros_bags.IMU, "", "humble", write_bag2, ""), "x y z w", ("--reference", "icrs")),
     "ros2-mcap": (bag(ros_bags.TF, "gcrf", "jazzy", write_mcap, ".mcap"), "x y z w", ()),
     "stk": (stk, "Q1 Q2 Q3 QC", ()),
@@ -129,7 +159,9 @@ def looked_at(*arguments: object) -> tuple[dict, str, Numbers]:
     result = run_hilstar_here("attitude", *arguments, "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
-    words, numbers = re.search(r"^self-check: at (.*?) = \((.*?)\)", told["conventions"][-1]).groups()
+    words, numbers = re.search(
+        r"^self-check: at (.*?) = \((.*?)\)", told["conventions"][-1]
+    ).groups()
     return told, words, [float(number) for number in numbers.split(",")]
 
 
@@ -181,7 +213,9 @@ def json_of(t_ns: int, numbers: Numbers) -> bytes:
     return json.dumps({"t_ns": t_ns, "q": numbers}).encode()
 
 
-def zmq_of(content: Callable[[int, Numbers], bytes]) -> Callable[[Numbers], contextlib.AbstractContextManager]:
+def zmq_of(
+    content: Callable[[int, Numbers], bytes],
+) -> Callable[[Numbers], contextlib.AbstractContextManager]:
     @contextlib.contextmanager
     def sending(numbers: Numbers) -> Iterator[dict[str, object]]:
         with publisher() as (sender, port), timed(lambda t_ns: sender.send(content(t_ns, numbers))):
@@ -235,7 +269,9 @@ def test_a_stream_of_the_self_check_s_attitude_looks_at_the_star_that_it_names(t
 
     def seen(numbers: Numbers) -> tuple[dict, str, Numbers]:
         with sending(numbers) as attitude:
-            (tmp_path / "live.toml").write_text(bench_text({"tracker": {"q_body_to_cam": MOUNTING}, "attitude": attitude}))
+            (tmp_path / "live.toml").write_text(
+                bench_text({"tracker": {"q_body_to_cam": MOUNTING}, "attitude": attitude})
+            )
             return looked_at(tmp_path / "live.toml")
 
     _, words, numbers = seen(start)

@@ -45,7 +45,16 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 def frame(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str, str]]]:
     folder = bench_file.parent
     done = run_hilstar_here(
-        "frame", bench_file, "--radec", radec, "--truth", folder / "t.csv", "-o", folder / "f.fits", "--json", *more
+        "frame",
+        bench_file,
+        "--radec",
+        radec,
+        "--truth",
+        folder / "t.csv",
+        "-o",
+        folder / "f.fits",
+        "--json",
+        *more,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout), read_rows(folder / "t.csv")
@@ -70,7 +79,9 @@ def test_planets_in_the_truth_table_are_where_skyfield_has_them(bodies_file, at_
 
 
 def test_wide_bodies_are_said_to_be_discs(bodies_file):
-    done = run_hilstar_here("frame", bodies_file, "--radec", MOON, "--codes", bodies_file.parent / "c.png", "--explain")
+    done = run_hilstar_here(
+        "frame", bodies_file, "--radec", MOON, "--codes", bodies_file.parent / "c.png", "--explain"
+    )
     assert "Moon: 1897" in done.stderr and "drawn as a disc" in done.stderr
     assert "Neptune" not in done.stderr
     assert "clipped: Moon by" in done.stdout
@@ -78,7 +89,9 @@ def test_wide_bodies_are_said_to_be_discs(bodies_file):
 
 def test_the_virtual_tracker_sees_the_same_bodies(bodies_file):
     folder = bodies_file.parent
-    done = run_hilstar_here("simulate", bodies_file, "--radec", MOON, "-o", folder / "s.fits", "--json")
+    done = run_hilstar_here(
+        "simulate", bodies_file, "--radec", MOON, "-o", folder / "s.fits", "--json"
+    )
     assert json.loads(done.stdout)["clipped"] == ["Moon"]
     truth = fits.getdata(folder / "s.fits", extname="TRUTH")
     assert truth["name"][truth["hip"] == 0].tolist() == ["Moon"]
@@ -90,7 +103,13 @@ def test_the_sun_in_view_overflows_nothing(bodies_file):
     """
     for path, command in (("s.fits", ("simulate", "-o")), ("c.png", ("frame", "--codes"))):
         done = run_hilstar_here(
-            command[0], bodies_file, "--radec", "236.056,-19.779,0", command[1], bodies_file.parent / path, "--json"
+            command[0],
+            bodies_file,
+            "--radec",
+            "236.056,-19.779,0",
+            command[1],
+            bodies_file.parent / path,
+            "--json",
         )
         assert done.returncode == 0, done.stderr
         assert "Sun" in json.loads(done.stdout)["clipped"]
@@ -122,8 +141,14 @@ def test_shares_of_light_are_the_stars_own(bodies_file):
     bodies_file.write_text(text)
     with load(bodies_file) as bench:
         with_bodies = not_drawn(bench)
-        assert faintest_e_per_s(bench) >= bench.faintest_shown_e_per_s > bench.stars.electrons_per_s.min()
-    bodies_file.write_text(text.split("[sky.bodies]")[0] + '[spacecraft]\norbit = "geocentre"\n' + COARSE)
+        assert (
+            faintest_e_per_s(bench)
+            >= bench.faintest_shown_e_per_s
+            > bench.stars.electrons_per_s.min()
+        )
+    bodies_file.write_text(
+        text.split("[sky.bodies]")[0] + '[spacecraft]\norbit = "geocentre"\n' + COARSE
+    )
     with load(bodies_file) as bench:
         assert not_drawn(bench) == with_bodies
         assert with_bodies.stars > 0
@@ -139,13 +164,30 @@ def test_a_run_s_ledger_replays_bodies_bit_for_bit_and_summaries_name_what_clips
     (folder / "log.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
     more = ("--headless", "--speed", "max", "--json")
     first = run_hilstar_here(
-        "replay", bodies_file, folder / "log.csv", "--step", "60", "--ledger", folder / "run.mcap", "-o", folder / "a", *more
+        "replay",
+        bodies_file,
+        folder / "log.csv",
+        "--step",
+        "60",
+        "--ledger",
+        folder / "run.mcap",
+        "-o",
+        folder / "a",
+        *more,
     )
     assert first.returncode == 0, first.stderr
     assert "brighter than white" in first.stderr and "Sun" in first.stderr
     summary = json.loads(first.stdout)
-    assert (summary["frames"], summary["clipped"]) == (11, {"max": 2, "hip": [], "bodies": ["Moon", "Saturn"]})
-    assert run_hilstar_here("replay", bodies_file, folder / "run.mcap", "-o", folder / "b", *more).returncode == 0
+    assert (summary["frames"], summary["clipped"]) == (
+        11,
+        {"max": 2, "hip": [], "bodies": ["Moon", "Saturn"]},
+    )
+    assert (
+        run_hilstar_here(
+            "replay", bodies_file, folder / "run.mcap", "-o", folder / "b", *more
+        ).returncode
+        == 0
+    )
     frames = [sorted((folder / name).glob("*.png")) for name in "ab"]
     assert len(frames[0]) == 11
     assert [path.read_bytes() for path in frames[0]] == [path.read_bytes() for path in frames[1]]
@@ -176,7 +218,9 @@ def test_from_a_low_orbit_the_moon_is_elsewhere(bodies_file):
     bodies_file.write_text(text + '[spacecraft]\norbit = "station.tle"\n')
     with from_the_middle, load(bodies_file) as bench:
         moon = bench.stars.bodies.index("Moon") - len(bench.stars.bodies)
-        apart_deg = np.degrees(np.linalg.norm(bench.stars.vectors[moon] - from_the_middle.stars.vectors[moon]))
+        apart_deg = np.degrees(
+            np.linalg.norm(bench.stars.vectors[moon] - from_the_middle.stars.vectors[moon])
+        )
         assert 0.1 < apart_deg < 1.1
 
 
@@ -188,7 +232,11 @@ def test_an_oem_of_the_same_orbit_shows_the_same_moon(bodies_file):
     for orbit in ("station.tle", "station.oem"):
         bodies_file.write_text(text + f'[spacecraft]\norbit = "{orbit}"\n')
         with load(bodies_file) as bench:
-            places.append(bench.stars.vectors[bench.stars.bodies.index("Moon") - len(bench.stars.bodies)].copy())
+            places.append(
+                bench.stars.vectors[
+                    bench.stars.bodies.index("Moon") - len(bench.stars.bodies)
+                ].copy()
+            )
     # a microarcsecond; metres in their distance
     assert places[0] == pytest.approx(places[1], abs=5e-12)
 
@@ -196,10 +244,14 @@ def test_an_oem_of_the_same_orbit_shows_the_same_moon(bodies_file):
 def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodies_file):
     folder = bodies_file.parent
     (folder / "station.oem").write_text(oem(segment(range(0, 600, 60))))
-    (folder / "station.aem").write_text(kvn(["2008-09-20T12:31:00 0 0 0 1", "2008-09-20T12:32:00 0 0 0 1"]))
+    (folder / "station.aem").write_text(
+        kvn(["2008-09-20T12:31:00 0 0 0 1", "2008-09-20T12:32:00 0 0 0 1"])
+    )
     text = bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source")
     bodies_file.write_text(text + '[spacecraft]\norbit = "station.oem"\n')
-    done = run_hilstar_here("attitude", folder / "station.aem", "--bench", bodies_file, "--at", "30")
+    done = run_hilstar_here(
+        "attitude", folder / "station.aem", "--bench", bodies_file, "--at", "30"
+    )
     # how the tracker is mounted
     assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr
 
@@ -216,33 +268,52 @@ def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodi
             "follows from the ephemeris; leave it out",
         ),
         (DATED + '[spacecraft]\norbit = "none.tle"\n', "none.tle: cannot be read"),
-        (DATED + "[sky.bodies]\nearth = true\n", "from its centre no Earth is seen; write [spacecraft] orbit ="),
-        (DATED + '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "geocentre"\n', "from its centre no Earth is seen"),
-        (DATED + '[spacecraft]\norbit = "source"\n', 'only "vizard" (Basilisk) sends the spacecraft\'s place'),
         (
-            DATED + '[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\nuse_velocity = false\n',
+            DATED + "[sky.bodies]\nearth = true\n",
+            "from its centre no Earth is seen; write [spacecraft] orbit =",
+        ),
+        (
+            DATED + '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "geocentre"\n',
+            "from its centre no Earth is seen",
+        ),
+        (
+            DATED + '[spacecraft]\norbit = "source"\n',
+            'only "vizard" (Basilisk) sends the spacecraft\'s place',
+        ),
+        (
+            DATED
+            + '[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\nuse_velocity = false\n',
             "takes the source's place and velocity; leave use_velocity out",
         ),
-        ('[sky]\nepoch_utc = "1850-01-01T00:00:00Z"\n[sky.bodies]\nmoon = true\n', "the ephemeris covers 1899-07-30 to"),
+        (
+            '[sky]\nepoch_utc = "1850-01-01T00:00:00Z"\n[sky.bodies]\nmoon = true\n',
+            "the ephemeris covers 1899-07-30 to",
+        ),
     ],
 )
 def test_keys_that_make_no_sky_are_refused_in_one_line(small_bench_file, more, words):
     small_bench_file.write_text(small_bench_file.read_text() + more)
-    done = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", small_bench_file.parent / "t.csv")
+    done = run_hilstar_here(
+        "frame", small_bench_file, "--radec", MOON, "--truth", small_bench_file.parent / "t.csv"
+    )
     assert (done.returncode, done.stdout) == (2, "")
     assert words in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_time_for_a_sky_that_stands_still_is_refused(small_bench_file):
     for command in (("frame", "--truth", "t.csv"), ("simulate", "-o", "s.fits")):
-        done = run_hilstar_here(command[0], small_bench_file, "--radec", MOON, *command[1:], "--at", "3")
+        done = run_hilstar_here(
+            command[0], small_bench_file, "--radec", MOON, *command[1:], "--at", "3"
+        )
         assert done.returncode == 2
         assert "nothing moves in this sky" in done.stderr
 
 
 def test_without_the_extra_the_machine_lacks_something(bodies_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "skyfield_data", None)
-    done = run_hilstar_here("frame", bodies_file, "--radec", MOON, "--truth", bodies_file.parent / "t.csv")
+    done = run_hilstar_here(
+        "frame", bodies_file, "--radec", MOON, "--truth", bodies_file.parent / "t.csv"
+    )
     assert done.returncode == 3
     assert "pip install 'hilstar[bodies]'" in done.stderr
 
@@ -258,8 +329,12 @@ def test_a_date_alone_places_the_stars_of_that_year(small_bench_file):
     with load(small_bench_file) as bench:
         dated = bench.stars.vectors
         assert bench.moving is None
-        assert bench.config.sky.epoch_jyear == pytest.approx(2000 + (utc_ns("2026-11-21") / 86_400e9 - 10_957.5) / 365.25)
-    small_bench_file.write_text(plain + f"[sky]\nepoch_jyear = {2000 + (20778 - 10957.5) / 365.25!r}\n")
+        assert bench.config.sky.epoch_jyear == pytest.approx(
+            2000 + (utc_ns("2026-11-21") / 86_400e9 - 10_957.5) / 365.25
+        )
+    small_bench_file.write_text(
+        plain + f"[sky]\nepoch_jyear = {2000 + (20778 - 10957.5) / 365.25!r}\n"
+    )
     with load(small_bench_file) as bench:
         assert np.array_equal(bench.stars.vectors, dated)
 
@@ -270,10 +345,18 @@ SCALES = {"UTC": 0.0, "TAI": 37.0, "GPS": 18.0, "TT": 69.184, "TDB": 69.184}
 
 def moon_message(path: Path, scale: str) -> Path:
     """An AEM of a minute from 2026-11-21 0:00 UTC on, with the Moon on the boresight."""
-    epochs = [str(np.datetime64(round((second + SCALES[scale]) * 1e9) + utc_ns("2026-11-21"), "ns")) for second in (0, 60)]
+    epochs = [
+        str(np.datetime64(round((second + SCALES[scale]) * 1e9) + utc_ns("2026-11-21"), "ns"))
+        for second in (0, 60)
+    ]
     q = conjugate(from_radec_roll_deg(7.557, 7.141, 0.0))
     rows = [f"{epoch} {' '.join(map(repr, np.roll(q, -1).tolist()))}" for epoch in epochs]
-    keys = {"REF_FRAME_B": "CAM", "TIME_SYSTEM": scale, "START_TIME": epochs[0], "STOP_TIME": epochs[1]}
+    keys = {
+        "REF_FRAME_B": "CAM",
+        "TIME_SYSTEM": scale,
+        "START_TIME": epochs[0],
+        "STOP_TIME": epochs[1],
+    }
     path.write_text(kvn(rows, **keys))
     return path
 
@@ -301,17 +384,33 @@ def test_the_dates_of_a_message_place_bodies_on_its_own_time_scale(bodies_file, 
 def test_a_message_with_dates_is_replayed_on_them(bodies_file):
     bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
     log = moon_message(bodies_file.parent / "log.aem", "TAI")
-    done = run_hilstar_here("replay", bodies_file, log, "--headless", "--speed", "max", "--step", "30", "--json", "--explain")
+    done = run_hilstar_here(
+        "replay",
+        bodies_file,
+        log,
+        "--headless",
+        "--speed",
+        "max",
+        "--step",
+        "30",
+        "--json",
+        "--explain",
+    )
     assert done.returncode == 0, done.stderr
     assert "Moon: 1897" in done.stderr
     assert json.loads(done.stdout)["clipped"]["bodies"] == ["Moon", "Saturn"]
 
 
-@pytest.mark.parametrize("command", [("frame", "--radec", MOON, "--truth"), ("simulate", "--radec", MOON, "-o")])
+@pytest.mark.parametrize(
+    "command", [("frame", "--radec", MOON, "--truth"), ("simulate", "--radec", MOON, "-o")]
+)
 def test_dates_of_a_source_are_refused_where_there_is_none(bodies_file, command):
     bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
     done = run_hilstar_here(
-        command[0], bodies_file, *command[1:], bodies_file.parent / ("t.csv" if "--truth" in command else "s.fits")
+        command[0],
+        bodies_file,
+        *command[1:],
+        bodies_file.parent / ("t.csv" if "--truth" in command else "s.fits"),
     )
     assert done.returncode == 2
     assert "is for a log that has dates" in done.stderr and done.stderr.count("\n") == 1
@@ -322,20 +421,32 @@ def test_a_log_without_dates_gives_none(bodies_file):
     (bodies_file.parent / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
     done = run_hilstar_here("replay", bodies_file, bodies_file.parent / "log.csv", "--headless")
     assert done.returncode == 2
-    assert "are no dates in UTC, TAI, TT, TDB or GPS" in done.stderr and done.stderr.count("\n") == 1
+    assert (
+        "are no dates in UTC, TAI, TT, TDB or GPS" in done.stderr and done.stderr.count("\n") == 1
+    )
 
 
 def test_without_a_source_s_message_the_earth_is_not_there_and_explain_says_so(small_bench_file):
     source = '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\n'
     small_bench_file.write_text(small_bench_file.read_text() + DATED + source)
     folder = small_bench_file.parent
-    done = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain")
+    done = run_hilstar_here(
+        "frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain"
+    )
     assert done.returncode == 0, done.stderr
     assert "seen from the Earth's centre, without the Earth" in done.stderr
     assert "Earth" not in {row["name"] for row in read_rows(folder / "t.csv")}
     (folder / "station.tle").write_text(STATION_TLE)
-    text = small_bench_file.read_text().replace('orbit = "source"', 'orbit = "station.tle"').replace('source = "vizard"', "")
+    text = (
+        small_bench_file.read_text()
+        .replace('orbit = "source"', 'orbit = "station.tle"')
+        .replace('source = "vizard"', "")
+    )
     text = text.replace("2026-11-21T00:00:00Z", STATION_UTC)
     small_bench_file.write_text(text)
-    from_orbit = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain")
-    assert "Earth: 143" in from_orbit.stderr and "drawn as a disc" in from_orbit.stderr, from_orbit.stderr
+    from_orbit = run_hilstar_here(
+        "frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain"
+    )
+    assert "Earth: 143" in from_orbit.stderr and "drawn as a disc" in from_orbit.stderr, (
+        from_orbit.stderr
+    )

@@ -41,18 +41,24 @@ def modules_after(program: str, *words: str) -> set[str]:
     return set(result.stdout.split())
 
 
-@pytest.mark.parametrize("module", ["hilstar.cli", "hilstar.server.bench.build", "hilstar.server.send_log"])
+@pytest.mark.parametrize(
+    "module", ["hilstar.cli", "hilstar.server.bench.build", "hilstar.server.send_log"]
+)
 def test_nothing_heavy_is_imported_before_it_is_used(module):
     assert not imported_by(module) & HEAVY
 
 
 def test_the_process_that_reads_a_link_imports_no_numpy():
     """That is half of what its start would cost."""
-    assert "numpy" not in imported_by("hilstar.attitude.wire.apart_child, hilstar.attitude.wire.zmq_links")
+    assert "numpy" not in imported_by(
+        "hilstar.attitude.wire.apart_child, hilstar.attitude.wire.zmq_links"
+    )
 
 
 def test_a_run_imports_before_its_first_frame_what_some_frames_need():
-    assert {"scipy.special", "hilstar.display.render.disc_tiles"} <= imported_by("hilstar.server.loop")
+    assert {"scipy.special", "hilstar.display.render.disc_tiles"} <= imported_by(
+        "hilstar.server.loop"
+    )
 
 
 def test_the_first_frame_of_stars_alone_imports_nothing_that_only_others_need():
@@ -65,8 +71,15 @@ def test_a_run_begins_no_other_process_by_what_it_imports():
     """
     program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
     program += "import hilstar.cli.serve, hilstar.server.screen.gate; print('glfw' in sys.modules)"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")
+    }
     result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S, env=environment
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE_S,
+        env=environment,
     )
     assert result.stdout == "True\n"

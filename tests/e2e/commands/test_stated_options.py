@@ -23,7 +23,12 @@ TO_CAM = Rotation.from_quat(MOUNTING, scalar_first=True)
 CAMERA = Rotation.from_quat(from_radec_roll_deg(84.0, -1.2, 10.0), scalar_first=True)
 # A body's attitude, from the body to the ICRS, x, y, z, w.
 SENT = (TO_CAM.inv() * CAMERA).inv().as_quat().tolist()
-STATED = ("--convention", "scalar=last,direction=cam_to_icrs", "--mounting", ",".join(map(str, MOUNTING)))
+STATED = (
+    "--convention",
+    "scalar=last,direction=cam_to_icrs",
+    "--mounting",
+    ",".join(map(str, MOUNTING)),
+)
 SAME_RAD = 1e-9
 ATTITUDE_BYTES = 64
 SHOWN_RAD = np.radians(1e-6)  # a header's decimals
@@ -42,9 +47,29 @@ def words(command: str, files, tmp_path, port: int = 9) -> tuple[object, ...]:
     bench, log = files
     return {
         "attitude": ("attitude", log),
-        "replay": ("replay", bench, log, "--headless", "--speed", "max", "--step", "1", "-o", tmp_path / "frames"),
+        "replay": (
+            "replay",
+            bench,
+            log,
+            "--headless",
+            "--speed",
+            "max",
+            "--step",
+            "1",
+            "-o",
+            tmp_path / "frames",
+        ),
         "convert": ("convert", log, tmp_path / "out.csv"),
-        "simulate": ("simulate", bench, "--log", log, "--frames", "1", "-o", tmp_path / "exposures"),
+        "simulate": (
+            "simulate",
+            bench,
+            "--log",
+            log,
+            "--frames",
+            "1",
+            "-o",
+            tmp_path / "exposures",
+        ),
         "send": ("send", log, "--to", f"udp://127.0.0.1:{port}", "--wait", "0", "--count", "1"),
     }[command]
 
@@ -58,9 +83,14 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(30)
-        result = run_hilstar_here(*words(command, files, tmp_path, receiver.getsockname()[1]), *STATED)
+        result = run_hilstar_here(
+            *words(command, files, tmp_path, receiver.getsockname()[1]), *STATED
+        )
         assert result.returncode == 0, result.stderr
-        assert 'read with convention = { scalar = "last", direction = "cam_to_icrs", frame = "body" }' in result.stderr
+        assert (
+            'read with convention = { scalar = "last", direction = "cam_to_icrs", frame = "body" }'
+            in result.stderr
+        )
         if command == "send":
             datagrams = iter(lambda: receiver.recv(100), b"")  # its time requests are among them
             packet = next(datagram for datagram in datagrams if len(datagram) == ATTITUDE_BYTES)
@@ -71,7 +101,10 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
         path = tmp_path / ("frames/frames.csv" if command == "replay" else "out.csv")
         with path.open() as file:
             rows = list(csv.DictReader(file))
-        assert max(off_rad([row[name] for name in ("qw", "qx", "qy", "qz")]) for row in rows) < SAME_RAD
+        assert (
+            max(off_rad([row[name] for name in ("qw", "qx", "qy", "qz")]) for row in rows)
+            < SAME_RAD
+        )
     if command == "simulate":
         (path,) = (tmp_path / "exposures").glob("*.fits")
         header = fits.getheader(path)
@@ -102,21 +135,40 @@ def test_each_command_refuses_by_name_what_is_not_used(tmp_path, files, command,
 def test_a_mounting_of_the_cameras_own_attitude_is_a_contradiction(tmp_path, files, command):
     stated = ("--mounting", "0.5,-0.5,-0.5,-0.5", "--convention", "frame=cam")
     result = run_hilstar_here(*words(command, files, tmp_path), *stated)
-    assert_refused(result, 2, "says that the attitudes are the camera's; write frame=body, or leave out --mounting")
+    assert_refused(
+        result,
+        2,
+        "says that the attitudes are the camera's; write frame=body, or leave out --mounting",
+    )
 
 
 def test_without_a_log_nothing_can_be_stated_of_one(files):
     bench, _ = files
-    for command in (("simulate", bench, "--radec", "84,-1,0", "--png", "a.png"), ("send", "--spin", "z,1")):
-        for option in ("--kernel", "--topic", "--body", "--reference", "--epoch-utc", "--place", "--mounting", "--convention"):
+    for command in (
+        ("simulate", bench, "--radec", "84,-1,0", "--png", "a.png"),
+        ("send", "--spin", "z,1"),
+    ):
+        for option in (
+            "--kernel",
+            "--topic",
+            "--body",
+            "--reference",
+            "--epoch-utc",
+            "--place",
+            "--mounting",
+            "--convention",
+        ):
             assert_refused(run_hilstar_here(*command, option, "x"), 2, f"{option} x: it is for")
 
 
-def test_the_convention_of_a_bench_file_holds_for_its_logs_and_the_command_line_takes_its_place(tmp_path, files):
+def test_the_convention_of_a_bench_file_holds_for_its_logs_and_the_command_line_takes_its_place(
+    tmp_path, files
+):
     bench, log = files
     table = 'convention = { scalar = "last", direction = "cam_to_icrs", frame = "body" }'
     bench.write_text(
-        SMALL_BENCH.replace("[tracker]", f"[tracker]\nq_body_to_cam = {list(MOUNTING)}") + f"[attitude]\n{table}\n"
+        SMALL_BENCH.replace("[tracker]", f"[tracker]\nq_body_to_cam = {list(MOUNTING)}")
+        + f"[attitude]\n{table}\n"
     )
     looked = run_hilstar_here("attitude", log, "--bench", bench)
     assert "RA 84.0000, Dec -1.2000, roll 10.0000 deg" in looked.stdout

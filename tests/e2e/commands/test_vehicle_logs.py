@@ -32,7 +32,18 @@ def bag(tmp_path):
 
 
 def test_a_bag_is_replayed_with_what_is_stated(tmp_path, small_bench_file, bag):
-    options = ("--reference", "icrs", "--headless", "--speed", "max", "--step", "0.5", "-o", tmp_path / "out", "--explain")
+    options = (
+        "--reference",
+        "icrs",
+        "--headless",
+        "--speed",
+        "max",
+        "--step",
+        "0.5",
+        "-o",
+        tmp_path / "out",
+        "--explain",
+    )
     result = run_hilstar_here("replay", small_bench_file, bag, *options)
     assert result.returncode == 0, result.stderr
     assert "the reference is taken as the ICRS, as stated" in result.stderr
@@ -41,7 +52,9 @@ def test_a_bag_is_replayed_with_what_is_stated(tmp_path, small_bench_file, bag):
         rows = list(csv.DictReader(file))
     assert len(rows) == 5
     for k, row in enumerate(rows):
-        found = Rotation.from_quat([float(row[name]) for name in ("qw", "qx", "qy", "qz")], scalar_first=True)
+        found = Rotation.from_quat(
+            [float(row[name]) for name in ("qw", "qx", "qy", "qz")], scalar_first=True
+        )
         wanted = Rotation.from_quat(propagate(ORION, RATE, k / 2), scalar_first=True)
         assert (found * wanted.inv()).magnitude() < 1e-12
 
@@ -54,4 +67,9 @@ def test_a_bag_is_converted_and_looked_at(tmp_path, bag):
 
 
 def test_a_bag_that_leaves_its_frame_open_is_refused_in_one_line(tmp_path, bag):
-    assert_refused(run_hilstar_here("convert", bag, tmp_path / "a.csv"), 2, "do not say which frame", "--reference icrs")
+    assert_refused(
+        run_hilstar_here("convert", bag, tmp_path / "a.csv"),
+        2,
+        "do not say which frame",
+        "--reference icrs",
+    )

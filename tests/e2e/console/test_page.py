@@ -32,7 +32,9 @@ STALE_S, SEEN_S = 0.25, 0.5
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
-    with bound(folder, "--console", "127.0.0.1:0", "--control", "--ledger", str(folder / "run.mcap")) as served:
+    with bound(
+        folder, "--console", "127.0.0.1:0", "--control", "--ledger", str(folder / "run.mcap")
+    ) as served:
         yield served, page_of(served), folder
 
 
@@ -53,10 +55,14 @@ def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
             with talking(sender, first=1 + 10_000 * attempt):
                 wait_for(lambda: page.health_is(True))
                 with live(page) as link:
-                    link.await_message(lambda said: said.get("state", {}).get("health", {}).get("ok"))
+                    link.await_message(
+                        lambda said: said.get("state", {}).get("health", {}).get("ok")
+                    )
             stopped_s = time.monotonic()
             with live(page) as link:
-                said = link.await_message(lambda said: "state" in said and not said["state"]["health"]["ok"])
+                said = link.await_message(
+                    lambda said: "state" in said and not said["state"]["health"]["ok"]
+                )
             if (took_s := time.monotonic() - stopped_s) < STALE_S + SEEN_S:
                 break
         assert took_s < STALE_S + SEEN_S
@@ -69,7 +75,9 @@ def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(run):
     with connected(served.port) as sender, talking(sender, q=ORION), live(page) as link:
         wait_for(lambda: page.health_is(True))
         link.want(picture=True, hz=10, grid=True)
-        truth = link.await_message(lambda said: isinstance(said, dict) and said.get("truth", {}).get("stars"))["truth"]
+        truth = link.await_message(
+            lambda said: isinstance(said, dict) and said.get("truth", {}).get("stars")
+        )["truth"]
         head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
     assert (head["w"], head["h"]) == (320, 240) and levels.dtype == np.uint8
     assert truth["frame"] == head["frame"]
@@ -78,7 +86,9 @@ def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(run):
     for x, y, *_ in shown:
         near = levels[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
         brightest = np.unravel_index(np.argmax(near), near.shape)
-        assert abs(brightest[0] - 2 + round(y) - y) <= 1 and abs(brightest[1] - 2 + round(x) - x) <= 1
+        assert (
+            abs(brightest[0] - 2 + round(y) - y) <= 1 and abs(brightest[1] - 2 + round(x) - x) <= 1
+        )
     assert {"\u03b6 Ori", "\u03b5 Ori"} & {star[4] for star in truth["stars"][:8]}
     assert len(truth["grid"]) > 4 and all(len(line["px"]) > 1 for line in truth["grid"])
 
@@ -91,12 +101,18 @@ def test_a_picture_is_the_run_s_own_and_moves_with_the_attitude(run):
         for q in (ORION, LYRA):
             with talking(sender, q=q, first=10_000 * (1 + len(seen))):
                 wait_for(lambda: page.health_is(True))
-                head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes) and len(said) > 300))
+                head, levels = picture_of(
+                    link.await_message(lambda said: isinstance(said, bytes) and len(said) > 300)
+                )
                 for _ in range(5):  # those that were on their way
-                    head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+                    head, levels = picture_of(
+                        link.await_message(lambda said: isinstance(said, bytes))
+                    )
                 seen.append((head["frame"], levels))
     assert seen[1][0] > seen[0][0]
-    assert not np.array_equal(seen[0][1], seen[1][1]) and seen[0][1].max() > 0 and seen[1][1].max() > 0
+    assert (
+        not np.array_equal(seen[0][1], seen[1][1]) and seen[0][1].max() > 0 and seen[1][1].max() > 0
+    )
 
 
 def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run):
@@ -107,11 +123,17 @@ def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run)
             assert page.control(name, "Ada", on=True) == (200, {"line": f"{name} on"})
             wait_for(lambda name=name: page.json("/state")["state"]["operator"][name], name)
             assert page.control(name, "Ada", on=False) == (200, {"line": f"{name} off"})
-        assert page.control("mark", "J%C3%B6rg", text="lamp\x1b[2J on") == (200, {"line": "mark written"})
+        assert page.control("mark", "J%C3%B6rg", text="lamp\x1b[2J on") == (
+            200,
+            {"line": "mark written"},
+        )
         wait_for(lambda: page.health_is(True))
     wait_for(lambda: any(event.kind == "mark" for event in events(folder / "run.mcap")))
     told = [(event.detail, event.who) for event in events(folder / "run.mcap") if event.who]
-    assert told[:2] == [("blank on, by Ada: blank", "Ada"), ("blank off, by Ada: the sky of the attitude again", "Ada")]
+    assert told[:2] == [
+        ("blank on, by Ada: blank", "Ada"),
+        ("blank off, by Ada: the sky of the attitude again", "Ada"),
+    ]
     assert told[-1] == ("mark, by J\u00f6rg: lamp\\x1b[2J on", "J\u00f6rg")
     assert len(told) == 11
     operators = {frame.operator for frame in frame_records(folder / "run.mcap")}
@@ -151,7 +173,9 @@ def test_a_ledger_may_be_called_anything(tmp_path):
     folder = tmp_path / os.fsdecode(b"r\xffun")
     folder.mkdir()
     ledger = folder / os.fsdecode(b"l\xfe.mcap")
-    with bound(tmp_path, "--console", "127.0.0.1:0", "--control", "--ledger", str(ledger)) as served:
+    with bound(
+        tmp_path, "--console", "127.0.0.1:0", "--control", "--ledger", str(ledger)
+    ) as served:
         page = page_of(served)
         with connected(served.port) as sender, talking(sender):
             wait_for(lambda: page.health_is(True))
@@ -167,7 +191,10 @@ def test_a_ledger_may_be_called_anything(tmp_path):
     assert told["failure"] is None
     found = run_hilstar_here("report", ledger, "-o", tmp_path / "report")
     assert found.returncode == 0, found.stderr
-    assert run_data_of((tmp_path / "report" / "report.html").read_text())["about"]["run"] == "l\\xfe.mcap"
+    assert (
+        run_data_of((tmp_path / "report" / "report.html").read_text())["about"]["run"]
+        == "l\\xfe.mcap"
+    )
 
 
 def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):
@@ -192,7 +219,9 @@ def test_metrics_are_openmetrics_with_the_run_s_counts(page):
     status, headers, data = page.ask("/metrics")
     assert status == 200 and headers["content-type"].startswith("application/openmetrics-text")
     samples = {
-        sample.name: sample.value for family in text_string_to_metric_families(data.decode()) for sample in family.samples
+        sample.name: sample.value
+        for family in text_string_to_metric_families(data.decode())
+        for sample in family.samples
     }
     counts = page.json("/state")["state"]["counts"]
     assert 0 < samples["hilstar_frames_total"] <= counts["frames"]

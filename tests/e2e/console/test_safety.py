@@ -23,7 +23,12 @@ from tests.support.waiting import PATIENCE_S, wait_for
 pytestmark = pytest.mark.e2e
 JSON = {"Content-Type": "application/json"}
 TWO_HOSTS = b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n"
-HOSTILE = (b"", b"GET /live HTTP/1.1\r\nHost: x\r\n", b"\xff" * 3000, b"POST /control/x HTTP/1.1\r\n")
+HOSTILE = (
+    b"",
+    b"GET /live HTTP/1.1\r\nHost: x\r\n",
+    b"\xff" * 3000,
+    b"POST /control/x HTTP/1.1\r\n",
+)
 TOKEN = "a-token-of-the-bench-in-room-7"
 
 
@@ -37,32 +42,66 @@ def local(tmp_path_factory):
 @pytest.fixture(scope="module")
 def open_run(tmp_path_factory):
     """A run whose page can be reached from elsewhere, and acts."""
-    with bound(tmp_path_factory.mktemp("open"), "--console", "0.0.0.0:0", "--control", "--console-name", "Stars.lab") as served:
+    with bound(
+        tmp_path_factory.mktemp("open"),
+        "--console",
+        "0.0.0.0:0",
+        "--control",
+        "--console-name",
+        "Stars.lab",
+    ) as served:
         yield served, page_of(served)
 
 
 def status_of(page: PageAddress, path: str = "/state", **headers: str) -> int:
-    return page.ask(path, headers={name.replace("_", "-"): value for name, value in headers.items()})[0]
+    return page.ask(
+        path, headers={name.replace("_", "-"): value for name, value in headers.items()}
+    )[0]
 
 
 def test_every_answer_has_a_strict_policy_and_is_kept_nowhere(local):
     _, page = local
-    for path in ("/", "/static/main.js", "/static/page.css", "/health", "/metrics", "/state", "/sky", "/none", "/static/../x"):
+    for path in (
+        "/",
+        "/static/main.js",
+        "/static/page.css",
+        "/health",
+        "/metrics",
+        "/state",
+        "/sky",
+        "/none",
+        "/static/../x",
+    ):
         _, headers, _ = page.ask(path)
-        assert headers["cache-control"] == "no-store" and headers["x-content-type-options"] == "nosniff"
+        assert (
+            headers["cache-control"] == "no-store"
+            and headers["x-content-type-options"] == "nosniff"
+        )
         policy = headers["content-security-policy"]
-        assert policy.startswith("default-src 'none'; script-src 'self'; ") and "unsafe" not in policy
+        assert (
+            policy.startswith("default-src 'none'; script-src 'self'; ") and "unsafe" not in policy
+        )
         assert "frame-ancestors 'none'" in policy and "server" not in headers
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "192.168.7.7:{port}", ""]
+    "host",
+    [
+        "evil.example",
+        "evil.example:{port}",
+        "127.0.0.1.evil.example:{port}",
+        "192.168.7.7:{port}",
+        "",
+    ],
 )
 def test_another_name_is_not_this_page(local, host):
     _, page = local
     for path in ("/", "/health", "/state"):
         assert status_of(page, path, Host=host.format(port=page.port)) == 421
-    with pytest.raises(ConnectionRefusedError, match="421"), live(page, {"Host": host.format(port=page.port) or "x"}):
+    with (
+        pytest.raises(ConnectionRefusedError, match="421"),
+        live(page, {"Host": host.format(port=page.port) or "x"}),
+    ):
         pass
 
 
@@ -72,7 +111,10 @@ def test_a_tunnel_s_port_and_localhost_are_this_machine(local):
         assert status_of(page, Host=host) == 200
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "http://localhost:{port}", "file://"])
+@pytest.mark.parametrize(
+    "origin",
+    ["http://evil.example", "null", "http://127.0.0.1:1", "http://localhost:{port}", "file://"],
+)
 def test_another_site_s_page_may_not_ask(local, origin):
     _, page = local
     origin = origin.format(port=page.port)
@@ -99,7 +141,12 @@ def test_a_control_is_a_post_of_a_little_json(open_run):
     assert ask("/control/blank")[0] == 405
     assert ask("/control/none", "POST", "{}", JSON)[0] == 404
     assert ask("/health", "POST", "{}", JSON)[0] == 405
-    assert ask("/control/blank", "POST", "on=1", {"Content-Type": "application/x-www-form-urlencoded"})[0] == 415
+    assert (
+        ask(
+            "/control/blank", "POST", "on=1", {"Content-Type": "application/x-www-form-urlencoded"}
+        )[0]
+        == 415
+    )
     assert ask("/control/blank", "POST", "on=1", {"Content-Type": "text/plain"})[0] == 415
     for body in (
         "{",
@@ -122,15 +169,21 @@ def test_a_control_is_a_post_of_a_little_json(open_run):
 def test_a_huge_body_is_refused_and_the_page_goes_on(open_run):
     _, page = open_run
     for size in (4_001, 5_000_000):
-        assert page.ask("/control/mark", "POST", b'{"text": "' + b"x" * size + b'"}', JSON)[0] == 413
+        assert (
+            page.ask("/control/mark", "POST", b'{"text": "' + b"x" * size + b'"}', JSON)[0] == 413
+        )
     head = f"POST /control/mark HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\nAuthorization: Bearer {page.token}\r\n"
     head += "Content-Type: application/json\r\n"
-    asked = raw(page.port, (head + "Content-Length: 99999999999\r\nExpect: 100-continue\r\n\r\n").encode())
+    asked = raw(
+        page.port, (head + "Content-Length: 99999999999\r\nExpect: 100-continue\r\n\r\n").encode()
+    )
     assert asked.startswith(b"HTTP/1.1 413 ")
     chunk = b"%x\r\n%s\r\n" % (1 << 16, b"y" * (1 << 16))
-    assert raw(page.port, (head + "Transfer-Encoding: chunked\r\n\r\n").encode() + 40 * chunk + b"0\r\n\r\n", 3.0).startswith(
-        b"HTTP/1.1 413 "
-    )
+    assert raw(
+        page.port,
+        (head + "Transfer-Encoding: chunked\r\n\r\n").encode() + 40 * chunk + b"0\r\n\r\n",
+        3.0,
+    ).startswith(b"HTTP/1.1 413 ")
     assert page.ask("/health")[0] == 503
 
 
@@ -154,7 +207,10 @@ def test_what_is_no_request_is_refused_or_closed(local, request_bytes):
 def test_a_request_that_comes_slowly_is_dropped(local):
     _, page = local
     begun_s = time.monotonic()
-    with socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S) as slow, contextlib.suppress(OSError):
+    with (
+        socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S) as slow,
+        contextlib.suppress(OSError),
+    ):
         while time.monotonic() - begun_s < PATIENCE_S:
             slow.sendall(b"G" if time.monotonic() - begun_s < 0.5 else b"E")
             slow.settimeout(0.5)
@@ -169,10 +225,20 @@ def test_beyond_loopback_a_token_is_made_and_needed(open_run):
     assert len(page.token) >= 40
     # the address to open, and nowhere else
     assert sum(page.token in line for line in served.lines) == 1
-    for given in ("", "Bearer", "Bearer wrong", f"Bearer {page.token}x", f"Basic {page.token}", f"Bearer {page.token[:-1]}"):
+    for given in (
+        "",
+        "Bearer",
+        "Bearer wrong",
+        f"Bearer {page.token}x",
+        f"Basic {page.token}",
+        f"Bearer {page.token[:-1]}",
+    ):
         for path in ("/state", "/health", "/metrics", "/sky"):
             assert page.ask(path, headers={"Authorization": given})[0] == 401
-        assert page.ask("/control/blank", "POST", '{"on": true}', JSON | {"Authorization": given})[0] == 401
+        assert (
+            page.ask("/control/blank", "POST", '{"on": true}', JSON | {"Authorization": given})[0]
+            == 401
+        )
     for token in ("wrong", "0" * len(page.token)):
         with pytest.raises(ConnectionRefusedError, match="401"), live(page, token=token):
             pass
@@ -185,7 +251,13 @@ def test_beyond_loopback_a_token_is_made_and_needed(open_run):
 
 def test_beyond_loopback_it_has_numbers_and_its_own_names_for_its_name(open_run):
     _, page = open_run
-    for host in (f"10.1.2.3:{page.port}", f"[fe80::1]:{page.port}", "stars.lab", "STARS.LAB:443", f"stars.lab:{page.port}"):
+    for host in (
+        f"10.1.2.3:{page.port}",
+        f"[fe80::1]:{page.port}",
+        "stars.lab",
+        "STARS.LAB:443",
+        f"stars.lab:{page.port}",
+    ):
         assert status_of(page, Host=host) == 200, host
     for host in ("evil.example", f"stars.lab.evil.example:{page.port}", "10.1.2.3:1"):
         assert status_of(page, Host=host) == 421, host
@@ -211,10 +283,17 @@ def test_two_hundred_idle_and_hostile_connections_leave_room_for_the_operator(lo
     _, page = local
     with contextlib.ExitStack() as stack:
         for k in range(200):
-            connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S))
+            connection = stack.enter_context(
+                socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S)
+            )
             with contextlib.suppress(OSError):
                 connection.sendall(
-                    (b"", b"GET /live HTTP/1.1\r\nHost: x\r\n", b"\xff" * 3000, b"POST /control/x HTTP/1.1\r\n")[k % 4]
+                    (
+                        b"",
+                        b"GET /live HTTP/1.1\r\nHost: x\r\n",
+                        b"\xff" * 3000,
+                        b"POST /control/x HTTP/1.1\r\n",
+                    )[k % 4]
                 )
         _, frames = missed_and_frames(page)
         with live(page) as link:
@@ -229,7 +308,9 @@ def test_connections_that_stay_after_their_answer_are_bounded(local):
     (pid,) = children(served.process.pid, "hilstar.server.console.server")
     with contextlib.ExitStack() as stack:
         for _ in range(300):
-            connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+            connection = stack.enter_context(
+                socket.create_connection(("127.0.0.1", page.port), timeout=10)
+            )
             connection.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode())
             assert connection.recv(12) == b"HTTP/1.1 200"
         assert len(list(Path(f"/proc/{pid}/fd").iterdir())) < 2 * MAX_CONNECTIONS
@@ -250,7 +331,20 @@ def hz(text: str) -> str:
     return f'{{"want": {{"picture": true, "hz": {text}}}}}'
 
 
-HZ = ('"fast"', "-1", "0", "-0.0", "-5e-324", "1e999", "NaN", "Infinity", "null", "true", "[8]", "9" * 3000)
+HZ = (
+    '"fast"',
+    "-1",
+    "0",
+    "-0.0",
+    "-5e-324",
+    "1e999",
+    "NaN",
+    "Infinity",
+    "null",
+    "true",
+    "[8]",
+    "9" * 3000,
+)
 NONSENSE = [
     "nonsense",
     "{}",
@@ -261,7 +355,12 @@ NONSENSE = [
     '{"want": {"picture": 1}}',
     '{"want": {"grid": ""}}',
 ]
-DEEP = ["[" * 3900, '{"want": {"x": ' + "[" * 3900, '{"want": {"picture": "' + "x" * 3000 + '"}}', "x" * 10_000]
+DEEP = [
+    "[" * 3900,
+    '{"want": {"x": ' + "[" * 3900,
+    '{"want": {"picture": "' + "x" * 3000 + '"}}',
+    "x" * 10_000,
+]
 
 
 @pytest.mark.parametrize("text", [*NONSENSE, *map(hz, HZ), *DEEP], ids=lambda text: text[:45])
@@ -277,7 +376,9 @@ def test_a_page_that_says_nonsense_is_closed_and_the_page_s_process_stays(local,
     assert children(served.process.pid, "hilstar.server.console.server") == before
 
 
-@pytest.mark.parametrize("text", ["5e-324", "1e-300", "0.001", "1e308", "123456789012345678901234567890"])
+@pytest.mark.parametrize(
+    "text", ["5e-324", "1e-300", "0.001", "1e308", "123456789012345678901234567890"]
+)
 def test_a_wish_beyond_bounds_is_one_within_them(local, text):
     served, page = local
     before = children(served.process.pid, "hilstar.server.console.server")
@@ -350,4 +451,6 @@ def test_what_cannot_be_is_refused_in_one_line():
             (("--console", "127.0.0.1:0", "--console-name", "a b"), ("--console-name",)),
             (("--control",), ("--control", "--console")),
         ):
-            assert_refused(run_hilstar_here("serve", "configs/demo.toml", "--headless", *options), 2, *words)
+            assert_refused(
+                run_hilstar_here("serve", "configs/demo.toml", "--headless", *options), 2, *words
+            )

@@ -39,7 +39,9 @@ HEALTH_S = 0.1  # the issue's; a median, for the tests beside this one may take 
 
 
 @contextlib.contextmanager
-def scpi_run(folder: Path, attitude: str, *options: str, at: str = "127.0.0.1:0") -> Iterator[tuple[Served, re.Match[str]]]:
+def scpi_run(
+    folder: Path, attitude: str, *options: str, at: str = "127.0.0.1:0"
+) -> Iterator[tuple[Served, re.Match[str]]]:
     """`hilstar serve --scpi`, once it listens, and the line that says where."""
     (folder / "bench.toml").write_text(LIVE_BENCH + attitude)
     (folder / "dark.toml").write_text(DARK)
@@ -59,7 +61,10 @@ class Instrument:
     def __init__(self, port: int) -> None:
         self._manager = pyvisa.ResourceManager("@py")
         self._resource = self._manager.open_resource(
-            f"TCPIP::127.0.0.1::{port}::SOCKET", read_termination="\n", write_termination="\r\n", open_timeout=1000 * PATIENCE_S
+            f"TCPIP::127.0.0.1::{port}::SOCKET",
+            read_termination="\n",
+            write_termination="\r\n",
+            open_timeout=1000 * PATIENCE_S,
         )
         self._resource.timeout = 1000 * PATIENCE_S
         self.write, self.ask = self._resource.write, self._resource.query
@@ -126,7 +131,9 @@ def test_an_attitude_that_is_set_is_shown_and_turns_at_the_rate_that_is_set(run,
     time.sleep(0.5)
     turn = turned_deg(first, stand.numbers("SKY:ATT?"))
     lasted_s = time.monotonic() - begun_s
-    assert turn[0] == pytest.approx(0, abs=1e-4) and turn[2] / turn[1] == pytest.approx(-0.5, rel=1e-3)
+    assert turn[0] == pytest.approx(0, abs=1e-4) and turn[2] / turn[1] == pytest.approx(
+        -0.5, rel=1e-3
+    )
     assert 0 < turn[1] < 0.5 * (lasted_s + 0.3)  # a state is written ten times a second
     assert stand.errors() == [] and run[0].count("sender's clock") == 0
 
@@ -166,13 +173,18 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
     rng = np.random.default_rng(5025)
 
     def used_mb() -> float:
-        return int(Path(f"/proc/{page}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        return (
+            int(Path(f"/proc/{page}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        )
 
     def fuzz(size: int) -> None:
         for _ in range(4):
             data = rng.integers(256, size=size // 4, dtype=np.uint8)
             data[rng.random(len(data)) < 0.02] = ord("\n")
-            with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as sender, contextlib.suppress(OSError):
+            with (
+                socket.create_connection(("127.0.0.1", port), PATIENCE_S) as sender,
+                contextlib.suppress(OSError),
+            ):
                 sender.sendall(data.tobytes() + b"\n")
                 sender.shutdown(socket.SHUT_WR)
                 while sender.recv(65536):
@@ -193,7 +205,10 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
         assert opened.ask("*IDN?").startswith("hilstar")
     for each in (unread, *idle):
         each.close()
-    assert children(served.process.pid, "hilstar.server.console.server") == [page] and served.process.poll() is None
+    assert (
+        children(served.process.pid, "hilstar.server.console.server") == [page]
+        and served.process.poll() is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -207,7 +222,10 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
     ],
 )
 def test_a_browser_is_not_listened_to(run, stand, request_line):
-    with socket.create_connection(("127.0.0.1", run[1]), PATIENCE_S) as browser, contextlib.suppress(OSError):
+    with (
+        socket.create_connection(("127.0.0.1", run[1]), PATIENCE_S) as browser,
+        contextlib.suppress(OSError),
+    ):
         for piece in (request_line[:7], request_line[7:], b"\nSKY:BLAN ON\nSKY:BLAN?\n"):
             browser.sendall(piece)
             time.sleep(0.01)  # a segment of its own
@@ -239,15 +257,24 @@ def flooding(port: int, line: bytes, stop: threading.Event) -> None:
         peer.close()
 
 
-@pytest.mark.parametrize("line", [b"*IDN?\n" * 500, b"*IDN?;" * 600 + b"\n", b"\n" * 4000], ids=["lines", "one-line", "empty"])
+@pytest.mark.parametrize(
+    "line",
+    [b"*IDN?\n" * 500, b"*IDN?;" * 600 + b"\n", b"\n" * 4000],
+    ids=["lines", "one-line", "empty"],
+)
 def test_peers_without_the_token_neither_stop_the_sky_nor_displace_its_controller(tmp_path, line):
     options = ("--console", "127.0.0.1:0")
-    with scpi_run(tmp_path, STEERED, *options, at="0.0.0.0:0") as (served, found), instrument(int(found[2])) as stand:
+    with (
+        scpi_run(tmp_path, STEERED, *options, at="0.0.0.0:0") as (served, found),
+        instrument(int(found[2])) as stand,
+    ):
         stand.write(f'SYST:AUTH "{found[3]}";:SKY:ATT 1,0,0,0')
         assert stand.ask("*OPC?") == "1"
         page = page_of(served)
         before = page.json("/state")["state"]["counts"]
-        idle = [socket.create_connection(("127.0.0.1", int(found[2])), PATIENCE_S) for _ in range(PEERS)]
+        idle = [
+            socket.create_connection(("127.0.0.1", int(found[2])), PATIENCE_S) for _ in range(PEERS)
+        ]
         stop = threading.Event()
         flood = threading.Thread(target=flooding, args=(int(found[2]), line, stop))
         flood.start()
@@ -264,7 +291,10 @@ def test_peers_without_the_token_neither_stop_the_sky_nor_displace_its_controlle
         finally:
             stop.set()
             flood.join()
-        assert after["frames"] > before["frames"] and after["stale"] == before["stale"], (before, after)
+        assert after["frames"] > before["frames"] and after["stale"] == before["stale"], (
+            before,
+            after,
+        )
         assert np.median(waits_s) < HEALTH_S
         for each in idle:
             each.close()
@@ -272,17 +302,26 @@ def test_peers_without_the_token_neither_stop_the_sky_nor_displace_its_controlle
 
 def test_another_source_is_not_steered_and_a_page_may_stand_beside(tmp_path):
     source = '[attitude]\nendpoint = "ipc:///tmp/hilstar-no-sender-there"\n'
-    with scpi_run(tmp_path, source, "--console", "127.0.0.1:0") as (served, found), instrument(int(found[2])) as stand:
+    with (
+        scpi_run(tmp_path, source, "--console", "127.0.0.1:0") as (served, found),
+        instrument(int(found[2])) as stand,
+    ):
         stand.write("SKY:ATT 1,0,0,0;RATE 0,0,0")
         assert stand.errors() == [-221, -221]
         assert np.all(stand.numbers("SKY:ATT?") == NOT_A_NUMBER)
         wait_for(lambda: int(stand.ask("STAT:QUES:COND?")) & 512, served.lines)
         stand.write("SKY:BLANK ON")
-        assert stand.ask("SKY:BLANK?") == "1" and page_of(served).json("/state")["state"]["operator"]["blank"]
+        assert (
+            stand.ask("SKY:BLANK?") == "1"
+            and page_of(served).json("/state")["state"]["operator"]["blank"]
+        )
 
 
 def test_beyond_this_machine_it_asks_for_the_token(tmp_path):
-    with scpi_run(tmp_path, STEERED, at="0.0.0.0:0") as (_, found), instrument(int(found[2])) as stand:
+    with (
+        scpi_run(tmp_path, STEERED, at="0.0.0.0:0") as (_, found),
+        instrument(int(found[2])) as stand,
+    ):
         stand.write("SKY:ATT 1,0,0,0;BLANK ON;*RST")
         assert stand.errors() == [-203, -203, -203]
         stand.write('SYST:AUTH "guess"')
@@ -295,7 +334,11 @@ def test_beyond_this_machine_it_asks_for_the_token(tmp_path):
     ("attitude", "options", "words"),
     [
         (STEERED, [], ['source = "scpi"', "add --scpi"]),
-        (STEERED + 'endpoint = "udp://127.0.0.1:1"\n', ["--scpi", "0"], ["endpoint", "--scpi HOST:PORT"]),
+        (
+            STEERED + 'endpoint = "udp://127.0.0.1:1"\n',
+            ["--scpi", "0"],
+            ["endpoint", "--scpi HOST:PORT"],
+        ),
         (STEERED + 'clock = "unix"\n', ["--scpi", "0"], ["clock", "remove it"]),
         ("", ["--scpi", "127.0.0.1:99999"], ["--scpi 127.0.0.1:99999", "127.0.0.1:5025"]),
     ],

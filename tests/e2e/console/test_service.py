@@ -42,9 +42,21 @@ class Systemd:
 
     @contextmanager
     def started(self) -> Iterator[subprocess.Popen[str]]:
-        own = {"NOTIFY_SOCKET": str(self._folder / "notify"), "WATCHDOG_USEC": str(round(WATCHDOG_S * 1e6))}
-        command = [*HILSTAR, "serve", str(self._folder / "bench.toml"), "--headless", "--console", "127.0.0.1:0"]
-        with Started(command, env=os.environ | own, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        own = {
+            "NOTIFY_SOCKET": str(self._folder / "notify"),
+            "WATCHDOG_USEC": str(round(WATCHDOG_S * 1e6)),
+        }
+        command = [
+            *HILSTAR,
+            "serve",
+            str(self._folder / "bench.toml"),
+            "--headless",
+            "--console",
+            "127.0.0.1:0",
+        ]
+        with Started(
+            command, env=os.environ | own, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        ) as process:
             try:
                 yield process
             finally:

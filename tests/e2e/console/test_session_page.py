@@ -29,14 +29,26 @@ def is_lit(said: object) -> bool:
 
 def test_a_session_shows_its_patterns_and_tells_its_steps(tmp_path):
     plant(tmp_path)
-    command = [*HILSTAR, "first-light", str(tmp_path / "bench.toml"), "-o", str(tmp_path / "s"), "--console", "127.0.0.1:0"]
+    command = [
+        *HILSTAR,
+        "first-light",
+        str(tmp_path / "bench.toml"),
+        "-o",
+        str(tmp_path / "s"),
+        "--console",
+        "127.0.0.1:0",
+    ]
     command += ["--virtual", str(tmp_path / "truth.toml"), "--patches", "0"]
-    with Started(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=os.environ) as process:
+    with Started(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=os.environ
+    ) as process:
         try:
             page = page_of(Served(process, 0))
             with live(page) as link:
                 said = link.await_message(lambda said: "hello" in said)
-                assert said["hello"]["session"] and said["hello"]["command"] == "hilstar first-light"
+                assert (
+                    said["hello"]["session"] and said["hello"]["command"] == "hilstar first-light"
+                )
                 link.want(picture=True, hz=10)
                 link.await_message(is_orientation)
                 head, levels = picture_of(link.await_message(is_lit))

@@ -12,4 +12,11 @@ for line in sys.stdin:
     solution = solver.solve_from_centroids(
         np.array(field["yx"]), field["size"], fov_estimate=field["fov_deg"], fov_max_error=1.0
     )
-    print(json.dumps({key: None if solution[key] is None else float(solution[key]) for key in ("RA", "Dec", "Roll", "FOV")}))
+    print(
+        json.dumps(
+            {
+                key: None if solution[key] is None else float(solution[key])
+                for key in ("RA", "Dec", "Roll", "FOV")
+            }
+        )
+    )

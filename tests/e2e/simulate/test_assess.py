@@ -19,12 +19,16 @@ def test_a_replayed_log_and_its_trackers_answers_give_the_budget(tmp_path: Path)
     planted = plant(scan, Sizes(fov=0.0, wild=3), np.random.default_rng(21), seconds=100.0)
     log, bench, ledger = tmp_path / "log.csv", tmp_path / "bench.toml", tmp_path / "run.mcap"
     write_telemetry(log, planted.frames_s, planted.frames_q, start_s=100.0)
-    telemetry = write_telemetry(tmp_path / "telemetry.csv", planted.tau_s, planted.reported, start_s=100.0)
+    telemetry = write_telemetry(
+        tmp_path / "telemetry.csv", planted.tau_s, planted.reported, start_s=100.0
+    )
     bench.write_text(LIVE_BENCH)
     words = ("--headless", "--speed", "max", "--step", "0.1", "--ledger", ledger)
     replay = run_hilstar_here("replay", bench, log, *words)
     assert replay.returncode == 0, replay.stderr
-    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "2")
+    run = run_hilstar_here(
+        "assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "2"
+    )
     assert run.returncode == 0, run.stderr
     found = json.loads(run.stdout)
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)

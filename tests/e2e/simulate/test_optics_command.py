@@ -20,23 +20,47 @@ def map_files(tmp_path):
     given = stack()
     fits.writeto(tmp_path / "stack.fits", given.images)
     rows = [f"{x},{y},{nm},{illumination(x, y)}" for x, y, nm, _ in given.at]
-    (tmp_path / "points.csv").write_text("\n".join(["x_px,y_px,wavelength_nm,relative_illumination", *rows]) + "\n")
+    (tmp_path / "points.csv").write_text(
+        "\n".join(["x_px,y_px,wavelength_nm,relative_illumination", *rows]) + "\n"
+    )
     return tmp_path
 
 
 def made(folder, *options):
-    return run_hilstar_here("optics", "map", folder / "stack.fits", folder / "points.csv", "-o", folder / "psf.fits", *options)
+    return run_hilstar_here(
+        "optics",
+        "map",
+        folder / "stack.fits",
+        folder / "points.csv",
+        "-o",
+        folder / "psf.fits",
+        *options,
+    )
 
 
 def test_a_map_becomes_the_tracker_s_glass(map_files):
     result = made(map_files, "--oversampling", "4", "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
-    assert (told["points"], told["wavelengths_nm"], told["focuses_um"]) == (25, [450, 550, 650, 750], [0])
+    assert (told["points"], told["wavelengths_nm"], told["focuses_um"]) == (
+        25,
+        [450, 550, 650, 750],
+        [0],
+    )
     assert told["residual"] <= 1e-3
     tracker = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12}
-    (map_files / "bench.toml").write_text(bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
-    result = run_hilstar_here("simulate", map_files / "bench.toml", *POINTING, "-o", map_files / "a.fits", "--noise", "none")
+    (map_files / "bench.toml").write_text(
+        bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}})
+    )
+    result = run_hilstar_here(
+        "simulate",
+        map_files / "bench.toml",
+        *POINTING,
+        "-o",
+        map_files / "a.fits",
+        "--noise",
+        "none",
+    )
     assert result.returncode == 0, result.stderr
     truth = fits.getdata(map_files / "a.fits", 1)
     assert np.abs(truth["x_centroid_px"] - truth["x_px"]).max() > 0.02

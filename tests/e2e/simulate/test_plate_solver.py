@@ -80,7 +80,15 @@ def centroids(image: np.ndarray, width_tolerance: float) -> np.ndarray:
         y, x = np.mgrid[window]
         total = light.sum()
         cy, cx = (light * y).sum() / total, (light * x).sum() / total
-        found.append((total, cy, cx, (light * (y - cy) ** 2).sum() / total, (light * (x - cx) ** 2).sum() / total))
+        found.append(
+            (
+                total,
+                cy,
+                cx,
+                (light * (y - cy) ** 2).sum() / total,
+                (light * (x - cx) ** 2).sum() / total,
+            )
+        )
     table = np.array(sorted(found, reverse=True))
     typical = np.median(table[:30, 3:], axis=0)
     lone = (np.abs(table[:, 3:] / typical - 1) < width_tolerance).all(axis=1)
@@ -100,7 +108,16 @@ def fields(tmp_path_factory) -> dict[str, list[np.ndarray]]:
     images: dict[str, list[np.ndarray]] = {"linear": [], "codes": []}
     for attitude in ATTITUDES:
         radec = ",".join(map(str, attitude))
-        result = run_hilstar_here("frame", "bench.toml", f"--radec={radec}", "-o", "f.fits", "--codes", "f.png", cwd=folder)
+        result = run_hilstar_here(
+            "frame",
+            "bench.toml",
+            f"--radec={radec}",
+            "-o",
+            "f.fits",
+            "--codes",
+            "f.png",
+            cwd=folder,
+        )
         assert result.returncode == 0, result.stderr
         images["linear"].append(fits.getdata(folder / "f.fits").astype(np.float64))
         images["codes"].append(srgb_light(np.array(Image.open(folder / "f.png")) / 255.0))
@@ -110,20 +127,34 @@ def fields(tmp_path_factory) -> dict[str, list[np.ndarray]]:
 def solved_fields(solver_python: Path, fields: list[np.ndarray]) -> list[dict[str, float]]:
     """What the solver makes of centroids (y, x) on 1024 x 1024 px."""
     # The solver counts from the corner of the first pixel, hilstar from its centre.
-    lines = [json.dumps({"yx": (yx + 0.5).tolist(), "size": [1024, 1024], "fov_deg": 20.0}) for yx in fields]
+    lines = [
+        json.dumps({"yx": (yx + 0.5).tolist(), "size": [1024, 1024], "fov_deg": 20.0})
+        for yx in fields
+    ]
     script = Path(__file__).with_name("plate_solve.py")
     solved = subprocess.run(
-        [solver_python, script], input="\n".join(lines), capture_output=True, text=True, timeout=PATIENCE_S, check=True
+        [solver_python, script],
+        input="\n".join(lines),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
     )
     return [json.loads(line) for line in solved.stdout.splitlines()]
 
 
-@pytest.mark.parametrize(("kind", "limit_arcsec"), [("linear", LINEAR_LIMIT_ARCSEC), ("codes", CODES_LIMIT_ARCSEC)])
+@pytest.mark.parametrize(
+    ("kind", "limit_arcsec"), [("linear", LINEAR_LIMIT_ARCSEC), ("codes", CODES_LIMIT_ARCSEC)]
+)
 def test_the_solved_attitude_is_the_commanded_one(solver_python, fields, kind, limit_arcsec):
     found = [centroids(image, WIDTH_TOLERANCE[kind])[: STARS[kind]] for image in fields[kind]]
-    for (ra, dec, roll), solution in zip(ATTITUDES, solved_fields(solver_python, found), strict=True):
+    for (ra, dec, roll), solution in zip(
+        ATTITUDES, solved_fields(solver_python, found), strict=True
+    ):
         assert solution["RA"] is not None, f"no solution at {ra}, {dec}"
-        error_arcsec = np.degrees(np.linalg.norm(unit(solution["RA"], solution["Dec"]) - unit(ra, dec))) * 3600
+        error_arcsec = (
+            np.degrees(np.linalg.norm(unit(solution["RA"], solution["Dec"]) - unit(ra, dec))) * 3600
+        )
         print(f"{kind} {ra} {dec} {roll}: {error_arcsec:.4f} arcsec", file=sys.stderr)
         assert error_arcsec < limit_arcsec
         # The roll is known less well by the ratio of the field's radius to a radian, about 6 to 10.
@@ -143,12 +174,28 @@ def test_pictures_for_basilisk_s_camera_solve_to_basilisk_s_attitude(solver_pyth
     """
     port, pose = free_port(), rotation(MOUNTING)
     attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
-    (tmp_path / "bench.toml").write_text(bench_text(FIELD, {"tracker": {"q_body_to_cam": MOUNTING}, "attitude": attitude}))
-    camera = {"cameraID": 3, "fieldOfView": np.radians(20.0), "resolution": [1024, 1024], "renderRate": 500_000_000}
+    (tmp_path / "bench.toml").write_text(
+        bench_text(FIELD, {"tracker": {"q_body_to_cam": MOUNTING}, "attitude": attitude})
+    )
+    camera = {
+        "cameraID": 3,
+        "fieldOfView": np.radians(20.0),
+        "resolution": [1024, 1024],
+        "renderRate": 500_000_000,
+    }
     camera["sigma_CB"] = pose.inv().as_mrp().tolist()
     crafts = {"chaser": [[0.3, -0.2, 0.5], [1e-4, 2e-4, -1e-4]]}
-    scenario = {"mode": "noDisplay", "port": port, "shown_s": 0.1, "stops_s": [0.5, 1.0], "camera": camera}
-    with basilisk(tmp_path, **scenario, spacecraft=crafts) as simulation, listening(tmp_path / "bench.toml", "bound") as served:
+    scenario = {
+        "mode": "noDisplay",
+        "port": port,
+        "shown_s": 0.1,
+        "stops_s": [0.5, 1.0],
+        "camera": camera,
+    }
+    with (
+        basilisk(tmp_path, **scenario, spacecraft=crafts) as simulation,
+        listening(tmp_path / "bench.toml", "bound") as served,
+    ):
         simulation.run()
         summary = interrupted(served)
     assert "other-camera" not in summary["events"]
@@ -166,7 +213,12 @@ def test_pictures_for_basilisk_s_camera_solve_to_basilisk_s_attitude(solver_pyth
         beta = truth.v_bn_n[row] / 299_792_458.0
         aberration = beta - beta @ boresight * boresight
         assert np.degrees(np.linalg.norm(aberration)) * 3600 > 2 * PICTURE_LIMIT_ARCSEC
-        error_arcsec = np.degrees(np.linalg.norm(unit(solution["RA"], solution["Dec"]) - (boresight - aberration))) * 3600
+        error_arcsec = (
+            np.degrees(
+                np.linalg.norm(unit(solution["RA"], solution["Dec"]) - (boresight - aberration))
+            )
+            * 3600
+        )
         print(f"picture {t_ns}: {error_arcsec:.4f} arcsec", file=sys.stderr)
         assert error_arcsec < PICTURE_LIMIT_ARCSEC
 

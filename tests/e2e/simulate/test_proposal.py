@@ -47,7 +47,9 @@ def measured_monitor(folder: Path) -> dict:
     """Changes to a monitor that was measured, as sRGB and without weights, and to a scale that
     was measured too.
     """
-    rows = "\n".join(f"{code},{light!r}" for code, light in enumerate(srgb_response(8).light.tolist()))
+    rows = "\n".join(
+        f"{code},{light!r}" for code, light in enumerate(srgb_response(8).light.tolist())
+    )
     (folder / "monitor.csv").write_text(f"code,w\n{rows}\n")
     (folder / "monitor.toml").write_text(NO_WEIGHTS)
     render = {"flux_at_white_e_per_s": 1e8, "quantisation": "exact"}
@@ -68,7 +70,9 @@ def test_the_change_that_is_written_makes_the_bench_pass_and_keeps_the_rest(tmp_
     assert "proposal" not in plain
     code, proposed = verified(path, "--propose", "--strict")
     assert (code, proposed["written"], path.read_text()) == (1, False, before)
-    assert proposed["proposal"]["changes"] == [{"table": "render", "key": "quantisation", "value": "exact"}]
+    assert proposed["proposal"]["changes"] == [
+        {"table": "render", "key": "quantisation", "value": "exact"}
+    ]
     assert {key: proposed[key] for key in plain} == plain
     code, written = verified(path, "--write", "--strict")
     assert (code, written["written"]) == (0, True)
@@ -82,7 +86,11 @@ def test_a_person_is_shown_the_difference(tmp_path):
     path = write_bench(tmp_path)
     result = run_hilstar_here("verify", path, "--fields", FIELDS, "--write")
     assert result.returncode == 0, result.stderr
-    for line in ('-quantisation = "round"', '+quantisation = "exact"', f"written             {path}"):
+    for line in (
+        '-quantisation = "round"',
+        '+quantisation = "exact"',
+        f"written             {path}",
+    ):
         assert line in result.stdout.splitlines()
 
 
@@ -90,7 +98,9 @@ def test_what_the_calibration_refuses_is_not_proposed(tmp_path):
     """A measured monitor without weights steals no bits, and a measured scale leaves no choice
     of full scale.
     """
-    path = write_bench(tmp_path, measured_monitor(tmp_path), more="[verify]\nflux_mag = 1e-5\ncentroid_px = 1e-5\n")
+    path = write_bench(
+        tmp_path, measured_monitor(tmp_path), more="[verify]\nflux_mag = 1e-5\ncentroid_px = 1e-5\n"
+    )
     _, summary = verified(path, "--propose")
     proposal = summary["proposal"]
     assert proposal["changes"] == []
@@ -116,12 +126,18 @@ def test_the_smallest_change_of_a_magnitude_is_proposed(tmp_path):
     (change,) = summary["proposal"]["changes"]
     assert (code, change["table"], change["key"]) == (0, "sky", "faintest_v_mag")
     milder = change["value"] + 0.5
-    path.write_text(path.read_text().replace(f"faintest_v_mag = {change['value']}", f"faintest_v_mag = {milder}"))
+    path.write_text(
+        path.read_text().replace(
+            f"faintest_v_mag = {change['value']}", f"faintest_v_mag = {milder}"
+        )
+    )
     assert not verified(path)[1]["passed"]
 
 
 def test_a_bench_that_fails_for_its_geometry_gets_no_change_of_its_light(tmp_path):
-    path = write_bench(tmp_path, {"render": {"quantisation": "exact"}}, more='[verify]\ntrue_mirror = "x"\n')
+    path = write_bench(
+        tmp_path, {"render": {"quantisation": "exact"}}, more='[verify]\ntrue_mirror = "x"\n'
+    )
     _, summary = verified(path, "--propose")
     proposal = summary["proposal"]
     assert (proposal["changes"], proposal["tried"]) == ([], 0)
@@ -135,8 +151,14 @@ def write_true_lens(folder: Path, assumed: dict | None) -> Path:
     (folder / "truth.toml").write_text(TRUE_LENS)
     changes = {}
     if assumed is not None:
-        lines = [f"{key} = {value}" for key, value in (tomllib.loads(TRUE_LENS) | assumed).items() if key != "kind"]
-        (folder / "geometry.toml").write_text("\n".join(['kind = "hilstar geometry 1"', *lines]) + "\n")
+        lines = [
+            f"{key} = {value}"
+            for key, value in (tomllib.loads(TRUE_LENS) | assumed).items()
+            if key != "kind"
+        ]
+        (folder / "geometry.toml").write_text(
+            "\n".join(['kind = "hilstar geometry 1"', *lines]) + "\n"
+        )
         changes = {"collimator": {"geometry": "geometry.toml"}}
     return write_bench(folder, changes, more=LIMIT + 'true_geometry = "truth.toml"\n')
 
@@ -144,7 +166,9 @@ def write_true_lens(folder: Path, assumed: dict | None) -> Path:
 def test_behind_a_true_lens_that_the_bench_has_the_codes_are_mended(tmp_path):
     path = write_true_lens(tmp_path, {})
     code, summary = verified(path, "--write", "--strict")
-    assert summary["proposal"]["changes"] == [{"table": "render", "key": "quantisation", "value": "exact"}]
+    assert summary["proposal"]["changes"] == [
+        {"table": "render", "key": "quantisation", "value": "exact"}
+    ]
     assert (code, verified(path)[1]["passed"]) == (0, True)
 
 

@@ -16,7 +16,9 @@ SHARE_OF_LIMIT = 0.5
 
 @pytest.mark.parametrize("name", ["demo", "office-8bit", "monitor-10bit", "microdisplay"])
 def test_a_template_passes_as_it_is(name):
-    result = run_hilstar_here("verify", ROOT / "configs" / f"{name}.toml", "--fields", "3", "--strict", "--json")
+    result = run_hilstar_here(
+        "verify", ROOT / "configs" / f"{name}.toml", "--fields", "3", "--strict", "--json"
+    )
     assert result.returncode == 0, result.stdout + result.stderr
     summary = json.loads(result.stdout)
     assert summary["stars"] > 30

@@ -31,7 +31,9 @@ FLOOR_MAG = 1e-4
 CUT_PX = 1e-4
 
 
-def verified(tmp_path: Path, verify: str = "", *options: str, replace: tuple[str, str] = ("", "")) -> tuple[int, dict]:
+def verified(
+    tmp_path: Path, verify: str = "", *options: str, replace: tuple[str, str] = ("", "")
+) -> tuple[int, dict]:
     path = tmp_path / "bench.toml"
     path.write_text(BENCH.replace(*replace) + f"[verify]\n{verify}\n")
     result = run_hilstar_here("verify", path, "--fields", FIELDS, "--json", "--strict", *options)
@@ -48,7 +50,9 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     assert summary["flux_error_mag"]["max"] < 0.02
     assert summary["centroid_error_px"]["p95"] < 0.02
     arcsec_per_px = 13e-3 / 25 * 180 * 3600 / np.pi
-    assert summary["centroid_error_arcsec"]["rms"] == pytest.approx(arcsec_per_px * summary["centroid_error_px"]["rms"])
+    assert summary["centroid_error_arcsec"]["rms"] == pytest.approx(
+        arcsec_per_px * summary["centroid_error_px"]["rms"]
+    )
     assert summary["estimator_floor"]["flux_mag"]["p95"] < FLOOR_MAG  # the worst is a blend
     assert summary["estimator_floor"]["centroid_px"]["p95"] < FLOOR_PX
     assert summary["noisy"]["flux_mag"]["rms"] > summary["flux_error_mag"]["rms"]
@@ -57,13 +61,19 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     assert summary["at_edge"] > 0
     by_each = summary["centroid_error_px_by"]
     assert list(by_each) == ["moment", "window", "wide", "fit", "box3", "box5"]
-    assert by_each[summary["centroider"]]["rms"] == pytest.approx(summary["centroid_error_px"]["rms"])
+    assert by_each[summary["centroider"]]["rms"] == pytest.approx(
+        summary["centroid_error_px"]["rms"]
+    )
     assert 0 < max(errors["p95"] for errors in by_each.values()) < 0.05
 
 
 def write_geometry_file(path: Path, lines: str) -> None:
     """A geometry file of the bench's monitor: its ideal lens, and what `lines` say otherwise."""
-    values = {"focal_length_px": 120e3 / 57.65, "principal_point_px": [319.5, 239.5], "q_cam_to_mon": [1, 0, 0, 0]}
+    values = {
+        "focal_length_px": 120e3 / 57.65,
+        "principal_point_px": [319.5, 239.5],
+        "q_cam_to_mon": [1, 0, 0, 0],
+    }
     table = "".join(f"{name} = {value}\n" for name, value in values.items() if name not in lines)
     path.write_text(f'kind = "hilstar geometry 1"\nresolution_px = [640, 480]\n{table}{lines}\n')
 
@@ -74,11 +84,20 @@ PLANTED = {
     "distortion": ("k1 = 0.6", [r"the lens distorts by 2\.\d+ px \(k1 \+0\.6\)"]),
     "strong distortion": ("k1 = -2.5\nk2 = 20", [r"the lens distorts by 1\d\.\d+ px \(k1 -2\.5\)"]),
     "decentring": ("p1 = 0.01\np2 = -0.01", [r"the lens distorts by 1\.\d+ px"]),
-    "tilt": ("tilt_deg = [1.0, -0.7]", [r"the screen is tilted by \(\+1\.0\d, -0\.7\d\) deg about its x and y axes"]),
-    "centre": ("principal_point_px = [321.0, 238.5]", [r"the field is shifted by \(-1\.39, \+0\.92\) px"]),
+    "tilt": (
+        "tilt_deg = [1.0, -0.7]",
+        [r"the screen is tilted by \(\+1\.0\d, -0\.7\d\) deg about its x and y axes"],
+    ),
+    "centre": (
+        "principal_point_px = [321.0, 238.5]",
+        [r"the field is shifted by \(-1\.39, \+0\.92\) px"],
+    ),
     "centre and distortion": (
         "principal_point_px = [334.5, 230]\nk1 = 0.6",
-        [r"the field is shifted by \(-13\.86, \+8\.78\) px", r"the lens distorts by [23]\.\d+ px \(k1 \+0\.(59|6)"],
+        [
+            r"the field is shifted by \(-13\.86, \+8\.78\) px",
+            r"the lens distorts by [23]\.\d+ px \(k1 \+0\.(59|6)",
+        ],
     ),
     "all": (
         "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]\nfocal_length_px = 2102.36",
@@ -98,8 +117,14 @@ def test_a_planted_lens_is_caught_and_the_part_that_is_wrong_is_named(tmp_path, 
     write_geometry_file(tmp_path / "true.toml", lines)
     code, summary = verified(tmp_path, 'true_geometry = "true.toml"')
     assert (code, summary["passed"]) == (1, False)
-    causes = [line for line in summary["reasons"] if not line.startswith("centroids are") and "not where the sky" not in line]
-    assert all(re.match(pattern, line) for line, pattern in zip(causes, wanted, strict=True)), causes
+    causes = [
+        line
+        for line in summary["reasons"]
+        if not line.startswith("centroids are") and "not where the sky" not in line
+    ]
+    assert all(re.match(pattern, line) for line, pattern in zip(causes, wanted, strict=True)), (
+        causes
+    )
 
 
 def test_the_planted_sizes_are_in_the_json(tmp_path):
@@ -118,7 +143,9 @@ def test_a_mirror_is_named_behind_a_real_lens_too(tmp_path):
 
 
 def test_a_bench_that_knows_its_true_lens_passes(tmp_path):
-    write_geometry_file(tmp_path / "true.toml", "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]")
+    write_geometry_file(
+        tmp_path / "true.toml", "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]"
+    )
     known = ("[collimator]", '[collimator]\ngeometry = "true.toml"')
     code, summary = verified(tmp_path, 'true_geometry = "true.toml"', replace=known)
     assert (code, summary["reasons"], summary["lost"]) == (0, [], 0)
@@ -210,7 +237,10 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
         ('true_mirror = "z"', "true_mirror"),
         ('true_geometry = "nothing.toml"', "nothing.toml"),
         ('true_geometry = "bench.toml"', "calibrate geometric"),
-        ('true_geometry = "t.toml"\ntrue_focal_length_mm = 121', "true_geometry takes the place of true_focal_length_mm"),
+        (
+            'true_geometry = "t.toml"\ntrue_focal_length_mm = 121',
+            "true_geometry takes the place of true_focal_length_mm",
+        ),
         ('true_geometry = "t.toml"\ntrue_pixel_pitch_um = 58', "true_pixel_pitch_um"),
         ('true_geometry = "t.toml"\ntrue_q_cam_to_mon = [1, 0, 0, 0]', "true_q_cam_to_mon"),
         ("true_focal_length_mm = -1", "true_focal_length_mm"),
@@ -239,12 +269,18 @@ def test_a_monitor_pixel_s_light_arrives_whole_and_where_it_belongs(twin):
     assert image.sum() == pytest.approx(1e6, rel=2e-6)
     y, x = np.mgrid[0:400, 0:400]
     scale = (57.65e-3 / 120) / (13e-3 / 25)
-    assert (image * x).sum() / image.sum() == pytest.approx(199.5 + (200 - 319.5) * scale, abs=CUT_PX)
-    assert (image * y).sum() / image.sum() == pytest.approx(199.5 + (300 - 239.5) * scale, abs=CUT_PX)
+    assert (image * x).sum() / image.sum() == pytest.approx(
+        199.5 + (200 - 319.5) * scale, abs=CUT_PX
+    )
+    assert (image * y).sum() / image.sum() == pytest.approx(
+        199.5 + (300 - 239.5) * scale, abs=CUT_PX
+    )
     # Its variance is the PSF's, a detector pixel's 1/12, and that of the square that a monitor
     # pixel is.
     wanted = 0.55**2 + 1 / 12 + scale**2 / 12
-    assert (image * (x - (image * x).sum() / image.sum()) ** 2).sum() / image.sum() == pytest.approx(wanted, rel=2e-3)
+    assert (
+        image * (x - (image * x).sum() / image.sum()) ** 2
+    ).sum() / image.sum() == pytest.approx(wanted, rel=2e-3)
 
 
 def test_the_black_level_s_glow_is_the_light_of_all_pixels(twin):

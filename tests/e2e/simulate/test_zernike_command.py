@@ -27,7 +27,9 @@ nm = 200
 
 def made(folder, text=PUPIL, *options):
     (folder / "lens.toml").write_text(text)
-    return run_hilstar_here("optics", "zernike", folder / "lens.toml", "-o", folder / "psf.fits", *options)
+    return run_hilstar_here(
+        "optics", "zernike", folder / "lens.toml", "-o", folder / "psf.fits", *options
+    )
 
 
 def test_aberrations_become_the_tracker_s_glass(tmp_path):

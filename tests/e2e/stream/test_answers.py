@@ -44,7 +44,9 @@ def reading(folder: Path, keys: str, notices: Notices | None = None) -> Iterator
         yield source
 
 
-def gathered(source: AnswersApart, count: int, again: Callable[[], object] = lambda: None) -> list[Answer]:
+def gathered(
+    source: AnswersApart, count: int, again: Callable[[], object] = lambda: None
+) -> list[Answer]:
     """So many answers; `again` sends where what was sent may have been lost before the road
     stood.
     """
@@ -78,11 +80,15 @@ def test_a_serial_line_is_read_asked_and_comes_back(tmp_path):
     tty.setraw(slave)
     port = tmp_path / "port"
     port.symlink_to(os.ttyname(slave))
-    with reading(tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50') as source:
+    with reading(
+        tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50'
+    ) as source:
         # What is written before the process has opened the port is flushed.
         assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
         os.write(master, b"\x05nonsense\0")
-        wait_for(lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal")
+        wait_for(
+            lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal"
+        )
         assert os.read(master, 2) == b"\x55\xaa"
         os.close(slave)
         os.close(master)
@@ -101,7 +107,9 @@ def test_udp_takes_each_datagram_from_who_may_send(tmp_path):
         reading(tmp_path, f'source = "udp"\nbind = "127.0.0.1:{port}"') as source,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
-        found = gathered(source, 3, lambda: [sender.sendto(packet, ("127.0.0.1", port)) for packet in PACKETS])
+        found = gathered(
+            source, 3, lambda: [sender.sendto(packet, ("127.0.0.1", port)) for packet in PACKETS]
+        )
         assert_answers(found)
 
 
@@ -125,14 +133,20 @@ def test_tcp_listens_and_takes_a_connection_after_the_former_one_closed(tmp_path
 def test_tcp_connects_to_a_tracker_that_starts_later_and_asks_it(tmp_path):
     port = free_port()
     with (
-        reading(tmp_path, f'source = "tcp"\nconnect = "127.0.0.1:{port}"\npoll_hex = "3f"\nformat = "json"') as source,
+        reading(
+            tmp_path,
+            f'source = "tcp"\nconnect = "127.0.0.1:{port}"\npoll_hex = "3f"\nformat = "json"',
+        ) as source,
         socket.create_server(("127.0.0.1", port)) as server,
     ):
         server.settimeout(PATIENCE_S)
         tracker, _ = server.accept()
         tracker.settimeout(PATIENCE_S)
         assert tracker.recv(1) == b"?"
-        tracker.sendall(json.dumps({"t_ns": 10, "q": Q, "stars": 3, "centroids": [[1, 2, 3, 4]]}).encode() + b"\n")
+        tracker.sendall(
+            json.dumps({"t_ns": 10, "q": Q, "stars": 3, "centroids": [[1, 2, 3, 4]]}).encode()
+            + b"\n"
+        )
         (answer,) = gathered(source, 1)
         assert tuple(answer.centroids[0]) == (1.0, 2.0, 3.0, 4)
         tracker.close()
@@ -142,7 +156,13 @@ def test_zeromq_takes_the_last_part(tmp_path):
     with zmq.Context() as context, context.socket(zmq.PUB) as sender:
         port = sender.bind_to_random_port("tcp://127.0.0.1")
         with reading(tmp_path, f'source = "zmq"\nendpoint = "tcp://127.0.0.1:{port}"') as source:
-            assert_answers(gathered(source, 3, lambda: [sender.send_multipart([b"topic", packet]) for packet in PACKETS]))
+            assert_answers(
+                gathered(
+                    source,
+                    3,
+                    lambda: [sender.send_multipart([b"topic", packet]) for packet in PACKETS],
+                )
+            )
 
 
 def test_a_growing_file_counts_from_the_start_on_and_again_when_it_is_made_anew(tmp_path):
@@ -179,9 +199,14 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
         else:
             with path.open("wb") as file:
                 file.truncate(64 * 10**9)
-            wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 100, "what is dropped")
+            wait_for(
+                lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 100,
+                "what is dropped",
+            )
         before_s, begun_ns = cpu_s(source), time.monotonic_ns()
-        wait_for(lambda: source.take(20) == [] and time.monotonic_ns() - begun_ns > 10**9, "a second")
+        wait_for(
+            lambda: source.take(20) == [] and time.monotonic_ns() - begun_ns > 10**9, "a second"
+        )
         # Without a rest the reader takes the whole of a core.
         assert cpu_s(source) - before_s < 0.3 * (time.monotonic_ns() - begun_ns) / 1e9
         path.unlink()
@@ -192,7 +217,9 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
 
 def cpu_s(source: AnswersApart) -> float:
     """The CPU time of the process that reads."""
-    fields = Path(f"/proc/{source._process._process.pid}/stat").read_text().rpartition(")")[2].split()
+    fields = (
+        Path(f"/proc/{source._process._process.pid}/stat").read_text().rpartition(")")[2].split()
+    )
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
@@ -204,7 +231,9 @@ def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path,
             os.write(master, rng.bytes(3000) + STREAM)
         found = gathered(source, 100)
         assert all(np.array_equal(answer.q_icrs_to_cam, Q) for answer in found)
-        wait_for(lambda: source.take(20) == [] and sum(source.refusals().values()) > 100, "refusals")
+        wait_for(
+            lambda: source.take(20) == [] and sum(source.refusals().values()) > 100, "refusals"
+        )
         assert set(source.refusals()) <= {"framing", "crc", "format"}
     os.close(slave)
     os.close(master)
@@ -215,7 +244,10 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
     dropped, and answers go on.
     """
     path, notices = tmp_path / "tracker.bin", Notices()
-    fields = ", ".join(f'{{ name = "{name}", at = {4 * k}, type = "f32" }}' for k, name in enumerate(("qw", "qx", "qy", "qz")))
+    fields = ", ".join(
+        f'{{ name = "{name}", at = {4 * k}, type = "f32" }}'
+        for k, name in enumerate(("qw", "qx", "qy", "qz"))
+    )
     keys = 'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength = 20\nchecksum = "crc32"\n'
     body = struct.pack("<4f", *Q)
     frame = body + zlib.crc32(body).to_bytes(4, "big")
@@ -228,18 +260,26 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
 
         gathered(source, 1, lambda: append(frame))
         append(rng.bytes(250_000))
-        wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10, "what is dropped")
+        wait_for(
+            lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10,
+            "what is dropped",
+        )
         (answer, *_) = gathered(source, 1, lambda: append(2 * frame))
         assert np.allclose(answer.q_icrs_to_cam, Q, atol=1e-7)
         assert notices.counts().get("receiver-failed", 0) == 0
 
 
 def test_a_road_that_is_not_there_is_refused_before_the_run(tmp_path):
-    for keys in ('source = "serial"\nport = "/dev/no-such-port"', f'source = "file"\npath = "{tmp_path}"'):
+    for keys in (
+        'source = "serial"\nport = "/dev/no-such-port"',
+        f'source = "file"\npath = "{tmp_path}"',
+    ):
         with pytest.raises(HilstarError, match=r"\[answers\]"), reading(tmp_path, keys):
             pass
     (tmp_path / "bench.toml").write_text(SMALL_BENCH)
-    assert_refused(run_hilstar_here("answers", tmp_path / "bench.toml"), 2, "has no [answers]", "bench.toml")
+    assert_refused(
+        run_hilstar_here("answers", tmp_path / "bench.toml"), 2, "has no [answers]", "bench.toml"
+    )
 
 
 def test_a_recorded_file_is_decoded_and_explained(tmp_path):
@@ -250,13 +290,23 @@ def test_a_recorded_file_is_decoded_and_explained(tmp_path):
     assert said["counts"] == {"answers": 3, "valid": 3, "framing": 1}
     assert [row["t_ns"] for row in said["answers"][:3]] == [10, 11, 12]
     explained = run_hilstar_here(*given, "--explain", "--quaternion", "0.6,0,-0.8,0").stdout
-    assert 'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }' in explained
+    assert (
+        'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }'
+        in explained
+    )
     assert_refused(run_hilstar_here(*given[:3], tmp_path / "none.bin"), 2, "none.bin")
 
 
 def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
     """A page, another program, and nobody: each at the address where a run's page usually is."""
-    shown = {"q": [0.6, 0, -0.8, 0], "ra_deg": 1, "dec_deg": 2, "roll_deg": 3, "rate_deg_s": None, "age_ms": 4}
+    shown = {
+        "q": [0.6, 0, -0.8, 0],
+        "ra_deg": 1,
+        "dec_deg": 2,
+        "roll_deg": 3,
+        "rate_deg_s": None,
+        "age_ms": 4,
+    }
     for body, marked in (
         (json.dumps({"state": {"attitude": shown}}), True),
         ('{"state": {"attitude": null}}', False),
@@ -274,7 +324,8 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
         tracker = tmp_path / "tracker.jsonl"
         tracker.touch()
         (tmp_path / "bench.toml").write_text(
-            SMALL_BENCH + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath = "tracker.jsonl"\nformat = "json"\n'
+            SMALL_BENCH
+            + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath = "tracker.jsonl"\nformat = "json"\n'
         )
         over = threading.Event()
 
@@ -285,10 +336,14 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
 
         with http.server.HTTPServer(("127.0.0.1", 0), Page) as server:
             monkeypatch.setattr("hilstar.server.console.listener.PORT", server.server_port)
-            threads = [threading.Thread(target=each) for each in (server.handle_request, answer_until_over)]
+            threads = [
+                threading.Thread(target=each) for each in (server.handle_request, answer_until_over)
+            ]
             for thread in threads:
                 thread.start()
-            found = run_hilstar_here("answers", tmp_path / "bench.toml", "--explain", "--seconds", "1").stdout
+            found = run_hilstar_here(
+                "answers", tmp_path / "bench.toml", "--explain", "--seconds", "1"
+            ).stdout
             over.set()
             for thread in threads:
                 thread.join()
@@ -308,11 +363,16 @@ def decode(data):
 
 
 @pytest.mark.parametrize("poison", [b"loop", b"sleep", b"exit"])
-def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers_come(tmp_path, caplog, poison):
+def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers_come(
+    tmp_path, caplog, poison
+):
     (tmp_path / "looping_tracker.py").write_text(LOOPING)
     keys = f'source = "udp"\nbind = "127.0.0.1:{(port := free_port())}"\nformat = "python:looping_tracker:decode"'
     to = ("127.0.0.1", port)
-    with reading(tmp_path, keys) as source, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with (
+        reading(tmp_path, keys) as source,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
         gathered(source, 1, lambda: sender.sendto(b"1", to))
         reader = source._process._process
         assert (tmp_path / "class").read_text() == str(os.SCHED_OTHER)
@@ -321,7 +381,10 @@ def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers
 
         def told() -> bool:  # as a run looks at it: fifty times a second, without waiting
             source.take()
-            return "receiver-failed" in caplog.text or "python:looping_tracker:decode) stopped" in caplog.text
+            return (
+                "receiver-failed" in caplog.text
+                or "python:looping_tracker:decode) stopped" in caplog.text
+            )
 
         wait_for(told, "the reader is ended", poll_s=0.02)
         assert source.unread and reader.poll() is not None

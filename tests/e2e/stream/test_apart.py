@@ -98,7 +98,10 @@ def nasa42_road() -> Iterator[tuple]:
         steps = itertools.count()
         host, _, port = link.endpoint.removeprefix("tcp://").rpartition(":")
         with socket.create_connection((host, int(port))) as sender:
-            yield link, lambda k: sender.sendall(message(0.1 * next(steps), Rotation.identity()).encode())
+            yield (
+                link,
+                lambda k: sender.sendall(message(0.1 * next(steps), Rotation.identity()).encode()),
+            )
 
 
 def await_packet(link, put, number: int) -> None:
@@ -130,7 +133,9 @@ def seen_late_ns(link, put) -> int:
 
 
 @pytest.mark.parametrize("road", [zmq_road, serial_road, udp_road, nasa42_road])
-@best_of_three("the sender and the lock are of one process: what it waits for a core between them counts as late")
+@best_of_three(
+    "the sender and the lock are of one process: what it waits for a core between them counts as late"
+)
 def test_a_packet_is_stamped_while_the_process_that_draws_holds_pythons_lock(road):
     with road() as (link, put):
         late_ns = seen_late_ns(link, put)
@@ -191,12 +196,20 @@ def can_bind(port: int) -> bool:
 def test_a_port_that_another_program_took_is_told_and_waited_for(caplog):
     port = free_port()
     with ZmqApart(ZmqReceiver(f"tcp://127.0.0.1:{port}", bind=True)) as link:
-        wait_for(lambda: can_bind(port), "the port, which libzmq gives back from a thread of its own")
+        wait_for(
+            lambda: can_bind(port), "the port, which libzmq gives back from a thread of its own"
+        )
         with socket.create_server(("127.0.0.1", port)):
             wait_for(lambda: link.receive(20) or "the port is in use" in caplog.text)
         with connected(port, zmq.PUB) as sender:
             wait_for(lambda: sender.send(packet(0, 0)) or link.receive(20), poll_s=0.02)
-        wait_for(lambda: not link.receive(20) and link.link_counts.lost == 0 and link.link_counts.connections == 1)
+        wait_for(
+            lambda: (
+                not link.receive(20)
+                and link.link_counts.lost == 0
+                and link.link_counts.connections == 1
+            )
+        )
 
 
 def test_the_reader_ends_with_a_process_that_is_killed():
@@ -226,7 +239,10 @@ def _lives(number: int) -> bool:
 def test_a_serial_line_that_was_unplugged_is_read_again_and_answers_go_out(tmp_path):
     with Cable(tmp_path) as cable, SerialApart(str(cable.host), 921_600) as link:
         sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(lambda: os.write(sender, cobs.encode(packet(0, 0)) + b"\0") and link.receive(20), poll_s=0.02)
+        wait_for(
+            lambda: os.write(sender, cobs.encode(packet(0, 0)) + b"\0") and link.receive(20),
+            poll_s=0.02,
+        )
         link.send(TimeRequest(7, 8))
         answer = b""
         while not answer.endswith(b"\0"):
@@ -238,7 +254,10 @@ def test_a_serial_line_that_was_unplugged_is_read_again_and_answers_go_out(tmp_p
         cable.plug()
         wait_for(lambda: not link.receive(20) and link.reconnects == 1)
         sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(lambda: os.write(sender, cobs.encode(packet(1, 0)) + b"\0") and link.receive(20), poll_s=0.02)
+        wait_for(
+            lambda: os.write(sender, cobs.encode(packet(1, 0)) + b"\0") and link.receive(20),
+            poll_s=0.02,
+        )
         os.close(sender)
         assert link.link_counts.lost == 1
         assert "receiver-failed" not in link._notices.counts()
@@ -250,8 +269,13 @@ def test_basilisks_topic_and_long_messages_pass_through():
     long = bytes(1 << 20)
     with publisher() as (sender, port):
         follower = Follower(None, Mounting(), DifferenceRates(10**9, 1.0), "attitude")
-        with ZmqApart(vizard_broadcast(f"tcp://127.0.0.1:{port}", follower, notices=notices), notices) as link:
-            wait_for(lambda: sender.send_multipart([b"SIM_UPDATE", b"", long]) or link.receive(20), poll_s=0.02)
+        with ZmqApart(
+            vizard_broadcast(f"tcp://127.0.0.1:{port}", follower, notices=notices), notices
+        ) as link:
+            wait_for(
+                lambda: sender.send_multipart([b"SIM_UPDATE", b"", long]) or link.receive(20),
+                poll_s=0.02,
+            )
             sender.send(b"SYNC_SETTINGS")
             sender.send_multipart([b"SIM_UPDATE", b"", long])
             *_, last = next_arrivals(link)
@@ -274,7 +298,10 @@ def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
                 sent_ns.append((before_ns, time.monotonic_ns()))
                 time.sleep(HELD_S)
             taken = datagrams.take(2 * count)
-            return [(each.host_ns - began, each.host_ns - ended) for each, (began, ended) in zip(taken, sent_ns, strict=True)]
+            return [
+                (each.host_ns - began, each.host_ns - ended)
+                for each, (began, ended) in zip(taken, sent_ns, strict=True)
+            ]
 
         # The kernel switches its stamps on from a work queue, some time after the socket asks for
         # them.
@@ -282,7 +309,9 @@ def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
         late_ns = held(5)
         datagrams.close()
     # The stamp is made while the datagram is sent, however long this process is held up there.
-    assert all(after_begin > -STAMP_NS and after_end < STAMP_NS for after_begin, after_end in late_ns), late_ns
+    assert all(
+        after_begin > -STAMP_NS and after_end < STAMP_NS for after_begin, after_end in late_ns
+    ), late_ns
 
 
 def test_records_come_out_whole_however_they_were_cut():
@@ -298,7 +327,11 @@ def test_records_come_out_whole_however_they_were_cut():
     whole = b"".join(map(pack, sent))
     for size in (1, 7, len(whole)):
         stream = RecordStream()
-        assert [record for at in range(0, len(whole), size) for record in stream.feed(whole[at : at + size])] == sent
+        assert [
+            record
+            for at in range(0, len(whole), size)
+            for record in stream.feed(whole[at : at + size])
+        ] == sent
     assert (late.waited_ns, timely.waited_ns) == (2, 0)
     with pytest.raises(ValueError, match="a record of"):
         list(RecordStream().feed(b"\xff" * 9))
@@ -308,7 +341,9 @@ def test_records_come_out_whole_however_they_were_cut():
 
 def test_a_reader_that_cannot_begin_is_tried_again_and_ends_nothing(caplog):
     reader = ReaderProcess(notices := Notices(), "hilstar.no_such_module")
-    wait_for(lambda: reader.wait(20) and not reader.take() and notices.counts()["receiver-failed"] >= 2)
+    wait_for(
+        lambda: reader.wait(20) and not reader.take() and notices.counts()["receiver-failed"] >= 2
+    )
     reader.close()
     assert "exit code 1" in caplog.text
 

@@ -78,7 +78,9 @@ def broadcast(tmp_path_factory) -> tuple[Truth, dict[str, list[dict]], dict]:
     return Truth(folder), ledger_topics(folder / "run.mcap"), summary
 
 
-def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_shadow_switch(broadcast):
+def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_shadow_switch(
+    broadcast,
+):
     truth, topics, summary = broadcast
     mounting = rotation(MOUNTING)
     samples = topics["/attitude"]
@@ -88,10 +90,15 @@ def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_sh
     rates = 0
     for sample in samples:
         row = truth.row(sample["t_ns"])
-        assert (rotation(sample["q"]) * (mounting * truth.body_from_n[row]).inv()).magnitude() < SAMPLE_LIMIT_RAD
+        assert (
+            rotation(sample["q"]) * (mounting * truth.body_from_n[row]).inv()
+        ).magnitude() < SAMPLE_LIMIT_RAD
         if sample["rate"] is not None:
             rates += 1
-            assert np.abs(sample["rate"] - mounting.apply(truth.omega_bn_b[row])).max() < RATE_LIMIT_RAD_S
+            assert (
+                np.abs(sample["rate"] - mounting.apply(truth.omega_bn_b[row])).max()
+                < RATE_LIMIT_RAD_S
+            )
     assert rates >= SOME / 2
 
 
@@ -127,7 +134,9 @@ def test_in_lockstep_every_step_is_one_frame(tmp_path):
     scenario = {"mode": "liveStream", "port": port, "shown_s": 0.05, "stops_s": [2.0]}
     with (
         basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER}) as simulation,
-        listening(tmp_path / "bench.toml", "bound to", "--ledger", str(tmp_path / "run.mcap")) as served,
+        listening(
+            tmp_path / "bench.toml", "bound to", "--ledger", str(tmp_path / "run.mcap")
+        ) as served,
     ):
         simulation.run()
         summary = interrupted(served)
@@ -149,7 +158,9 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
     (tmp_path / "bench.toml").write_text(bench_text({"attitude": attitude}))
     scenario = {"mode": "liveStream", "port": port, "shown_s": 0.5, "stops_s": [1.0]}
     with (
-        basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER, "target": TARGET}) as simulation,
+        basilisk(
+            tmp_path, **scenario, spacecraft={"chaser": CHASER, "target": TARGET}
+        ) as simulation,
         listening(tmp_path / "bench.toml", "bound to", "--duration", "30") as served,
     ):
         told = simulation.run(code=1)
@@ -157,7 +168,10 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
         out, err = served.communicate(timeout=PATIENCE_S)
     assert "Error processing SIM_UPDATE" in told
     assert served.returncode == 4
-    assert 'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"' in err
+    assert (
+        'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"'
+        in err
+    )
     assert json.loads(out)["packets"]["refused_by"]["format"] == 1
 
 
@@ -170,7 +184,9 @@ def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_cou
     with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:
         begun_ns = time.monotonic_ns()
         for k in range(100):
-            message = viz_message(time.monotonic_ns() - begun_ns, [craft(sigma=sigma), craft("other")], frame=k)
+            message = viz_message(
+                time.monotonic_ns() - begun_ns, [craft(sigma=sigma), craft("other")], frame=k
+            )
             sender.send_multipart([b"SIM_UPDATE", message])
             sender.send_multipart([b"SIM_UPDATE", message[:-1]])
             sender.send_multipart([b"SYNC_SETTINGS", b"not an attitude"])
@@ -178,7 +194,11 @@ def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_cou
         sender.send_multipart([b"SIM_UPDATE", b"a part too many", message])
         process.has_received(201)
         packets = interrupted(process)["packets"]
-    assert (packets["received"], packets["accepted"], packets["refused_by"]["format"]) == (201, 100, 101)
+    assert (packets["received"], packets["accepted"], packets["refused_by"]["format"]) == (
+        201,
+        100,
+        101,
+    )
 
 
 @pytest.mark.parametrize(
@@ -195,14 +215,24 @@ def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_cou
 )
 def test_keys_that_are_wrong_get_one_line(tmp_path, keys, said):
     (tmp_path / "bench.toml").write_text(bench_text({"attitude": {"source": "vizard"} | keys}))
-    assert_refused(run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--duration", "0.1"), 2, said)
+    assert_refused(
+        run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--duration", "0.1"),
+        2,
+        said,
+    )
 
 
 @pytest.mark.parametrize("velocity", [True, False])
 def test_explain_says_basilisk_s_conventions_with_an_attitude_in_its_words(tmp_path, velocity):
-    attitude = {"source": "vizard", "endpoint": f"tcp://127.0.0.1:{free_port()}", "use_velocity": velocity}
+    attitude = {
+        "source": "vizard",
+        "endpoint": f"tcp://127.0.0.1:{free_port()}",
+        "use_velocity": velocity,
+    }
     (tmp_path / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
-    result = run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--frames", "1", "--explain")
+    result = run_hilstar_here(
+        "serve", tmp_path / "bench.toml", "--headless", "--frames", "1", "--explain"
+    )
     assert result.returncode == 4  # nobody sent an attitude
     assert "sigma_BN = (-0.0399925, 0.2600642, -0.2854911) Alnilam" in result.stderr
     assert ("aberrates the stars" in result.stderr) is velocity

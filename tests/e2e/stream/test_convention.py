@@ -42,7 +42,9 @@ def run(tmp_path):
     with publisher() as (sender, port), talking(sender, 100.0, SENT):
         text = LIVE_BENCH.replace("[tracker]", f"[tracker]\nq_body_to_cam = {list(MOUNTING)}")
         bench.write_text(text + attitude_table(port, CONVENTION))
-        with Run([*HILSTAR, "serve", str(bench), "--headless", "--json", "--ledger", str(ledger)]) as process:
+        with Run(
+            [*HILSTAR, "serve", str(bench), "--headless", "--json", "--ledger", str(ledger)]
+        ) as process:
             process.has_accepted(20)
             shown = process.counts()[0]
             process.shows(shown + 10)
@@ -59,9 +61,17 @@ def test_the_sky_is_the_cameras_and_the_ledger_keeps_the_bytes_with_their_conven
     with ledger.open("rb") as file:
         head = next(iter(make_reader(file).iter_metadata())).metadata
     said = json.loads(head["raw_convention"])
-    assert said == {"scalar": "last", "direction": "cam_to_icrs", "frame": "body", "q_body_to_cam": list(MOUNTING)}
+    assert said == {
+        "scalar": "last",
+        "direction": "cam_to_icrs",
+        "frame": "body",
+        "q_body_to_cam": list(MOUNTING),
+    }
     with ledger.open("rb") as file:
-        packets = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/attitude"])]
+        packets = [
+            json.loads(message.data)
+            for _, _, message in make_reader(file).iter_messages(topics=["/attitude"])
+        ]
     for each in packets:
         assert struct.unpack_from("<4d", bytes.fromhex(each["raw"]), 16) == SENT
         assert off_rad(each["q"], TO_CAM * ICRS_TO_BODY) < SAME_RAD
@@ -70,18 +80,39 @@ def test_the_sky_is_the_cameras_and_the_ledger_keeps_the_bytes_with_their_conven
 def test_a_replay_and_a_conversion_apply_it_no_second_time(tmp_path, run):
     bench, ledger = run
     again = tmp_path / "again.mcap"
-    result = run_hilstar_here("replay", bench, ledger, "--headless", "--speed", "max", "--ledger", again)
+    result = run_hilstar_here(
+        "replay", bench, ledger, "--headless", "--speed", "max", "--ledger", again
+    )
     assert result.returncode == 0, result.stderr
     shown = [record.q for record in frame_records(again) if record.q is not None]
     assert shown
     assert max(off_rad(q, TO_CAM * ICRS_TO_BODY) for q in shown) < SAME_RAD
     assert run_hilstar_here("convert", ledger, tmp_path / "a.csv").returncode == 0
-    assert max(off_rad(sample.q_icrs_to_cam, TO_CAM * ICRS_TO_BODY) for sample in read_log(tmp_path / "a.csv")) < SAME_RAD
+    assert (
+        max(
+            off_rad(sample.q_icrs_to_cam, TO_CAM * ICRS_TO_BODY)
+            for sample in read_log(tmp_path / "a.csv")
+        )
+        < SAME_RAD
+    )
     looked = json.loads(run_hilstar_here("attitude", ledger, "--bench", bench, "--json").stdout)
     assert off_rad(looked["q_icrs_to_cam"], TO_CAM * ICRS_TO_BODY) < SAME_RAD
-    for command in (("replay", bench, ledger), ("convert", ledger, tmp_path / "b.csv"), ("attitude", ledger)):
-        for option in (("--convention", "scalar=last"), ("--mounting", "0.5,-0.5,-0.5,-0.5"), ("--reference", "icrs")):
-            assert_refused(run_hilstar_here(*command, *option), 2, f"{option[0]}: the ledger of a run", "leave it out")
+    for command in (
+        ("replay", bench, ledger),
+        ("convert", ledger, tmp_path / "b.csv"),
+        ("attitude", ledger),
+    ):
+        for option in (
+            ("--convention", "scalar=last"),
+            ("--mounting", "0.5,-0.5,-0.5,-0.5"),
+            ("--reference", "icrs"),
+        ):
+            assert_refused(
+                run_hilstar_here(*command, *option),
+                2,
+                f"{option[0]}: the ledger of a run",
+                "leave it out",
+            )
 
 
 def test_a_live_stream_is_looked_at_by_its_bench_file(tmp_path, run):
@@ -93,22 +124,44 @@ def test_a_live_stream_is_looked_at_by_its_bench_file(tmp_path, run):
     assert looked.returncode == 0, looked.stderr
     found = json.loads(looked.stdout)
     assert off_rad(found["q_icrs_to_cam"], TO_CAM * ICRS_TO_BODY) < SAME_RAD
-    assert "q_body_to_icrs turns body components into ICRS components; scalar last" in found["conventions"][0]
-    for option, key in (("--convention", "[attitude] convention"), ("--mounting", "[tracker] q_body_to_cam")):
+    assert (
+        "q_body_to_icrs turns body components into ICRS components; scalar last"
+        in found["conventions"][0]
+    )
+    for option, key in (
+        ("--convention", "[attitude] convention"),
+        ("--mounting", "[tracker] q_body_to_cam"),
+    ):
         value = "scalar=last" if option == "--convention" else "1,0,0,0"
-        assert_refused(run_hilstar_here("attitude", bench, option, value), 2, f"write it into {bench} as {key}")
+        assert_refused(
+            run_hilstar_here("attitude", bench, option, value), 2, f"write it into {bench} as {key}"
+        )
     for option in ("--kernel", "--topic", "--body", "--reference", "--epoch-utc", "--place"):
-        assert_refused(run_hilstar_here("attitude", bench, option, "x"), 2, f"{option} x: it is for a log")
+        assert_refused(
+            run_hilstar_here("attitude", bench, option, "x"), 2, f"{option} x: it is for a log"
+        )
 
 
 def test_several_heads_have_one_body_whatever_its_convention_is_otherwise(tmp_path):
     with publisher() as (sender, port), talking(sender, 50.0, SENT):
         path = heads_file(tmp_path, port)
         ledgers = [tmp_path / f"run.{name}.mcap" for name in MOUNTINGS]
-        path.write_text(path.read_text() + 'convention = { scalar = "last", direction = "cam_to_icrs" }\n')
-        command = [*HILSTAR, "serve", str(path), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
+        path.write_text(
+            path.read_text() + 'convention = { scalar = "last", direction = "cam_to_icrs" }\n'
+        )
+        command = [
+            *HILSTAR,
+            "serve",
+            str(path),
+            "--headless",
+            "--json",
+            "--ledger",
+            str(tmp_path / "run.mcap"),
+        ]
         with Run(command) as process:
-            wait_for(lambda: all(ledger.exists() and len(recorded(ledger)) > 30 for ledger in ledgers))
+            wait_for(
+                lambda: all(ledger.exists() and len(recorded(ledger)) > 30 for ledger in ledgers)
+            )
             process.send_signal(signal.SIGINT)
             summary_of(process)
     for ledger, mounting in zip(ledgers, MOUNTINGS.values(), strict=True):

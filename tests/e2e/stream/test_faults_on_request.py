@@ -34,7 +34,9 @@ electrons = 5e4
 kind = "blank"
 name = "cover"
 """
-GHOST = json.dumps({"kind": "false-star", "name": "ghost", "tracker_px": [500, 500], "electrons": 1e5}).encode()
+GHOST = json.dumps(
+    {"kind": "false-star", "name": "ghost", "tracker_px": [500, 500], "electrons": 1e5}
+).encode()
 # Each message, and what the ledger then says.
 MESSAGES = (
     (b"no JSON", ["refused"]),
@@ -52,18 +54,26 @@ def told(ledger: Path) -> list[str]:
     """
     records = [json.loads(data) for data in read_messages(ledger, "/fault")]
     events = [json.loads(data)["kind"] for data in read_messages(ledger, "/event")]
-    return [f"{each['event']} {each['name']}" for each in records] + ["refused"] * events.count("fault-refused")
+    return [f"{each['event']} {each['name']}" for each in records] + ["refused"] * events.count(
+        "fault-refused"
+    )
 
 
 def test_a_live_run_takes_faults_from_file_and_stream_and_is_replayed(tmp_path):
-    scenario, ledger, bench = tmp_path / "faults.toml", tmp_path / "run.mcap", tmp_path / "bench.toml"
+    scenario, ledger, bench = (
+        tmp_path / "faults.toml",
+        tmp_path / "run.mcap",
+        tmp_path / "bench.toml",
+    )
     scenario.write_text(SCENARIO)
     with publisher() as (attitudes, port), publisher() as (faults, fault_port):
         stream = f'[faults]\nendpoint = "tcp://127.0.0.1:{fault_port}"\n'
         bench.write_text(LIVE_BENCH + attitude_table(port, stream))
         options = ("--scenario", str(scenario), "--ledger", str(ledger))
         with listening(bench, "2 faults, 1 of them at their time", *options) as process:
-            sending = threading.Thread(target=send_until_the_end, args=(attitudes, process), daemon=True)
+            sending = threading.Thread(
+                target=send_until_the_end, args=(attitudes, process), daemon=True
+            )
             sending.start()
             until_said(process, "first attitude")
             await_subscriber(faults)
@@ -78,7 +88,9 @@ def test_a_live_run_takes_faults_from_file_and_stream_and_is_replayed(tmp_path):
     assert faulty["stream"] == {"messages": 5, "refused": 2, "dropped_unread": 0}
     pictures = []
     for name in ("first", "second"):
-        result = run_hilstar_here("replay", bench, ledger, "--headless", "--speed", "max", "-o", tmp_path / name, "--json")
+        result = run_hilstar_here(
+            "replay", bench, ledger, "--headless", "--speed", "max", "-o", tmp_path / name, "--json"
+        )
         assert json.loads(result.stdout)["faults"]["recorded"] == faulty["started"]
         pictures.append([path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))])
     assert pictures[0] == pictures[1] and len(pictures[0]) == summary["frames"]

@@ -57,7 +57,9 @@ def sending(port: int, hz: float = 100.0) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [1, 100_000])
-def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_heard_again(tmp_path, size):
+def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_heard_again(
+    tmp_path, size
+):
     """libzmq keeps a message until its last part; there is none."""
     with bound(tmp_path) as served, sending(served.port), CoreWaits(served.process.pid) as waited:
         served.await_line("the first attitude")
@@ -76,7 +78,10 @@ def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_hear
         served.process.has_accepted(served.process.accepted() + 50)
         summary = served.summary()
     assert summary["link"]["resets"] == summary["events"]["flood"] >= 2
-    assert summary["frames"] > 3 * (summary["missed_frames"] - missed_in(waited.s)), (summary, waited.s)
+    assert summary["frames"] > 3 * (summary["missed_frames"] - missed_in(waited.s)), (
+        summary,
+        waited.s,
+    )
     assert summary["packets"]["accepted"] > 50
 
 
@@ -114,7 +119,10 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
     # fast the cores are.
     assert link["rejected"] == summary["events"]["client-rejected"] > 0
     assert summary["ledger"]["failure"] is None
-    assert summary["stale_frames"] - missed_in(waited.s) < summary["frames"] / 4, (summary, waited.s)
+    assert summary["stale_frames"] - missed_in(waited.s) < summary["frames"] / 4, (
+        summary,
+        waited.s,
+    )
 
 
 def test_a_flood_of_packets_leaves_the_frames_their_time_and_is_counted(tmp_path):
@@ -134,13 +142,24 @@ while time.monotonic() < end:
     k += 1
 """
     ledger = tmp_path / "run.mcap"
-    with bound(tmp_path, "--ledger", str(ledger)) as served, CoreWaits(served.process.pid) as waited:
-        assert run_started([sys.executable, "-c", flood.replace("PORT", str(served.port))]).returncode == 0
+    with (
+        bound(tmp_path, "--ledger", str(ledger)) as served,
+        CoreWaits(served.process.pid) as waited,
+    ):
+        assert (
+            run_started([sys.executable, "-c", flood.replace("PORT", str(served.port))]).returncode
+            == 0
+        )
         summary = served.summary()
     assert summary["link"]["flooded"] > 5_000
     assert 1 <= summary["events"]["flood"] <= 3
-    assert 0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
-    assert summary["frames"] > 5 * (summary["missed_frames"] - missed_in(waited.s)), (summary, waited.s)
+    assert (
+        0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
+    )
+    assert summary["frames"] > 5 * (summary["missed_frames"] - missed_in(waited.s)), (
+        summary,
+        waited.s,
+    )
     assert ledger.stat().st_size < 20e6
 
 
@@ -155,13 +174,22 @@ def test_a_sender_of_long_messages_costs_another_s_packets_nothing(tmp_path):
             good.send(packet(next(sequence), time.monotonic_ns()))
             time.sleep(0.005)
 
-        wait_for(lambda: send() or any("the first attitude" in line for line in list(served.lines)), poll_s=0.0)
+        wait_for(
+            lambda: send() or any("the first attitude" in line for line in list(served.lines)),
+            poll_s=0.0,
+        )
         before = next(sequence)
         for number in range(200):
             if number % 10 == 0:
                 long.send_multipart([bytes(200_000)] * 100)
             send()
-        wait_for(lambda: send() or any("more than 64 parts is passed over" in line for line in list(served.lines)), poll_s=0.0)
+        wait_for(
+            lambda: (
+                send()
+                or any("more than 64 parts is passed over" in line for line in list(served.lines))
+            ),
+            poll_s=0.0,
+        )
         sent = next(sequence) - before
         summary = served.summary()
     assert summary["link"]["resets"] == 0
@@ -175,7 +203,9 @@ def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):
         with greeted(served.port, b"REQ") as dead:
             dead.sendall(part(b"", more=True) + part(packet(0, 0), more=False))
         with greeted(served.port, b"REQ") as attacker, contextlib.suppress(OSError):
-            attacker.sendall(part(b"", more=True) * 1000 + part(b"x", more=True) * 1000 + part(b"x", more=False))
+            attacker.sendall(
+                part(b"", more=True) * 1000 + part(b"x", more=True) * 1000 + part(b"x", more=False)
+            )
             served.await_line("more than 64 parts")
         with connected(served.port, zmq.REQ) as asker:
             asker.send(packet(1, 1))
@@ -196,7 +226,9 @@ def client(port: int, server: Path, own: Path | None) -> Iterator[zmq.Socket]:
     sender = context.socket(zmq.PUB)
     sender.setsockopt(zmq.LINGER, 0)
     if own is not None:
-        sender.curve_publickey, sender.curve_secretkey = zmq.auth.load_certificate(own / "client.key_secret")
+        sender.curve_publickey, sender.curve_secretkey = zmq.auth.load_certificate(
+            own / "client.key_secret"
+        )
         sender.curve_serverkey = zmq.auth.load_certificate(server / "server.key")[0]
     sender.connect(f"tcp://127.0.0.1:{port}")
     try:
@@ -222,7 +254,10 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
                 first += 1
                 sender.send(packet(first, time.monotonic_ns()))
                 time.sleep(0.01)
-                if any("first attitude" in line or "fresh again" in line for line in served.lines[told:]):
+                if any(
+                    "first attitude" in line or "fresh again" in line
+                    for line in served.lines[told:]
+                ):
                     return True
         return False
 
@@ -237,7 +272,12 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
         assert not heard(served, mine, 30_000, NOT_HEARD_S)
         with client(served.port, mine, None):  # no keys at all
             rejected = sum("was rejected" in line for line in list(served.lines))
-            wait_for(lambda: sum("was rejected" in line for line in list(served.lines)) > rejected or rejected >= 3)
+            wait_for(
+                lambda: (
+                    sum("was rejected" in line for line in list(served.lines)) > rejected
+                    or rejected >= 3
+                )
+            )
         summary = served.summary()
     assert summary["link"]["rejected"] == summary["events"]["client-rejected"] >= 3
     assert any("its key is not among those allowed" in line for line in served.lines)
@@ -256,7 +296,9 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
 def test_endpoints_that_libzmq_would_take_and_hilstar_does_not(tmp_path, endpoint, said):
     bench = tmp_path / "bench.toml"
     bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
-    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said)
+    assert_refused(
+        run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said
+    )
     to = ("--to", endpoint, "--connect", "--spin", "z,1", "--count", "1", "--wait", "0")
     assert_refused(run_hilstar_here("send", *to), 2, endpoint, said)
 
@@ -266,13 +308,34 @@ def test_binding_a_file_deletes_nothing(tmp_path):
     measured.write_text("1,2,3\n")
     bench = tmp_path / "bench.toml"
     bench.write_text(f'{LIVE_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
-    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "measured.csv", "not a socket")
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", f"ipc://{measured}"), 2, "measured.csv", "not a socket")
+    assert_refused(
+        run_hilstar_here("serve", bench, "--headless", "--duration", "1"),
+        2,
+        "measured.csv",
+        "not a socket",
+    )
+    assert_refused(
+        run_hilstar_here("send", "--spin", "z,1", "--to", f"ipc://{measured}"),
+        2,
+        "measured.csv",
+        "not a socket",
+    )
     assert measured.read_text() == "1,2,3\n"
 
 
 def test_a_free_port_is_told(tmp_path):
-    sent = run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--count", "1", "--wait", "0", "--json")
+    sent = run_hilstar_here(
+        "send",
+        "--spin",
+        "z,1",
+        "--to",
+        "tcp://127.0.0.1:*",
+        "--count",
+        "1",
+        "--wait",
+        "0",
+        "--json",
+    )
     endpoint = json.loads(sent.stdout)["link"]["endpoint"]
     assert endpoint.startswith("tcp://127.0.0.1:")
     assert int(endpoint.rpartition(":")[2]) > 0

@@ -36,13 +36,19 @@ SECONDS, STEP_S = 1.5, 0.02
 
 def tables(port: int, answers: int) -> str:
     attitude = f'[attitude]\nsource = "udp"\nbind = "127.0.0.1:{port}"\n'
-    return attitude + f'[answers]\nsource = "udp"\nbind = "127.0.0.1:{answers}"\nformat = "packet"\nclock = "host"\n'
+    return (
+        attitude
+        + f'[answers]\nsource = "udp"\nbind = "127.0.0.1:{answers}"\nformat = "packet"\nclock = "host"\n'
+    )
 
 
 @contextmanager
 def tracker(port: int) -> Iterator[np.ndarray]:
     """A tracker at rest that answers 20 times a second, off by its bias; what it answers."""
-    q = multiply(from_rotation_vector(BIAS_ARCSEC / ARCSEC_PER_RAD), np.array(ORION_Q) / np.linalg.norm(ORION_Q))
+    q = multiply(
+        from_rotation_vector(BIAS_ARCSEC / ARCSEC_PER_RAD),
+        np.array(ORION_Q) / np.linalg.norm(ORION_Q),
+    )
     stop = threading.Event()
 
     def answer() -> None:
@@ -50,7 +56,13 @@ def tracker(port: int) -> Iterator[np.ndarray]:
             sequence = 0
             while not stop.wait(0.05):
                 sequence += 1
-                packet = AnswerPacket(sequence, protocol.ANSWER_VALID, time.monotonic_ns() - 150_000_000, tuple(q), stars=9)
+                packet = AnswerPacket(
+                    sequence,
+                    protocol.ANSWER_VALID,
+                    time.monotonic_ns() - 150_000_000,
+                    tuple(q),
+                    stars=9,
+                )
                 sending.sendto(encode(packet), ("127.0.0.1", port))
 
     thread = threading.Thread(target=answer)
@@ -75,16 +87,26 @@ def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
         served.await_line("bound to")
         start = dict(zip(("q_w", "q_x", "q_y", "q_z"), ORION_Q, strict=True))
         result = simulate_fmu(
-            str(tmp_path / "display.fmu"), stop_time=SECONDS, output_interval=STEP_S, step_size=STEP_S, start_values=start
+            str(tmp_path / "display.fmu"),
+            stop_time=SECONDS,
+            output_interval=STEP_S,
+            step_size=STEP_S,
+            start_values=start,
         )
         last = result[-1]
         assert last["frame"] > 10 and last["statuses"] >= 5 and last["answers"] >= 5
         assert int(last["health"]) & (protocol.HEALTH_BLANK | protocol.HEALTH_STALE) == 0
         assert int(last["health"]) & protocol.HEALTH_CLOCK_SYNCHRONISED
-        assert off_arcsec(np.array([last[f"answered_q_{axis}"] for axis in "wxyz"]), answered) < NEAR_ARCSEC
+        assert (
+            off_arcsec(np.array([last[f"answered_q_{axis}"] for axis in "wxyz"]), answered)
+            < NEAR_ARCSEC
+        )
         assert SECONDS - 1.0 < last["answered_t_s"] < SECONDS
         with instrument(int(found[2])) as stand, Sender(f"udp://127.0.0.1:{port}") as sender:
-            wait_for(lambda: np.abs(stand.numbers("TRAC:RES?") - BIAS_ARCSEC).max() < NEAR_ARCSEC, served.lines)
+            wait_for(
+                lambda: np.abs(stand.numbers("TRAC:RES?") - BIAS_ARCSEC).max() < NEAR_ARCSEC,
+                served.lines,
+            )
 
             def passed_on() -> bool:
                 sender.send(np.array(ORION_Q), (0.0, 0.0, 0.0))
@@ -98,7 +120,10 @@ def test_its_packets_are_those_of_the_wire():
     for name in ("ATTITUDE", "TIME_REQUEST", "TIME_REPLY", "STATUS", "ANSWER"):
         assert getattr(fmu_model, name) == getattr(protocol, f"KIND_{name}")
         assert getattr(fmu_model, f"{name}_BODY").format == getattr(protocol, f"{name}_BODY").format
-    assert (fmu_model.RATE_VALID, fmu_model.ANSWER_VALID) == (protocol.FLAG_RATE_VALID, protocol.ANSWER_VALID)
+    assert (fmu_model.RATE_VALID, fmu_model.ANSWER_VALID) == (
+        protocol.FLAG_RATE_VALID,
+        protocol.ANSWER_VALID,
+    )
     assert fmu_model.unpacked(encode(TimeRequest(7, 11))) == (1, 2, 0, 7, 11)
     assert fmu_model.unpacked(b"\1\4" + bytes(38)) is None and fmu_model.unpacked(b"") is None
 
@@ -122,8 +147,15 @@ def test_a_bench_that_no_fmu_can_drive_is_refused(tmp_path, attitude, words):
 
 def test_it_sends_where_the_bench_listens_and_says_what_it_needs(tmp_path):
     bench: Path = tmp_path / "bench.toml"
-    bench.write_text(f'{LIVE_BENCH}[attitude]\nsource = "udp"\nbind = "0.0.0.0:5560"\nallow = ["10.0.0.0/8"]\n')
+    bench.write_text(
+        f'{LIVE_BENCH}[attitude]\nsource = "udp"\nbind = "0.0.0.0:5560"\nallow = ["10.0.0.0/8"]\n'
+    )
     assert run_hilstar_here("fmu", bench, "-o", tmp_path / "display.fmu").returncode == 0
     described = read_model_description(str(tmp_path / "display.fmu"))
     start = {variable.name: variable.start for variable in described.modelVariables}
-    assert (described.fmiVersion, start["address"], start["q_w"], start["t_s"]) == ("2.0", "127.0.0.1:5560", "1", "-1")
+    assert (described.fmiVersion, start["address"], start["q_w"], start["t_s"]) == (
+        "2.0",
+        "127.0.0.1:5560",
+        "1",
+        "-1",
+    )

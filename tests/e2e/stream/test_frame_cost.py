@@ -44,9 +44,17 @@ def turned(degrees: float) -> tuple[float, ...]:
 
 
 def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
-    turns = [((0.5, 0.5, -0.5, 0.5), (0.6 * r, -0.7 * r, 0.2 * r)) for r in RATES_RAD_S for _ in range(40)]
+    turns = [
+        ((0.5, 0.5, -0.5, 0.5), (0.6 * r, -0.7 * r, 0.2 * r))
+        for r in RATES_RAD_S
+        for _ in range(40)
+    ]
     attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
-    with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process, CoreWaits(process.pid) as waited:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, attitude=attitude) as process,
+        CoreWaits(process.pid) as waited,
+    ):
         process.shows()
         stream(sender, turns, 100)
         process.has_received(len(turns))
@@ -77,7 +85,11 @@ def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees)
     """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame
     shows one place or the other.
     """
-    with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process, CoreWaits(process.pid) as waited:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, attitude=MOVING) as process,
+        CoreWaits(process.pid) as waited,
+    ):
         stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
         process.send_signal(signal.SIGTERM)
         asked_s = time.monotonic()
@@ -92,7 +104,9 @@ def test_a_log_whose_rate_is_too_fast_is_refused_with_its_attitude(small_bench_f
     log = tmp_path / "log.csv"
     rows = [f"{k / 10},1,0,0,0,0,0,{57.3 if k == 3 else 0}" for k in range(10)]
     log.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]) + "\n")
-    result = run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
+    result = run_hilstar_here(
+        "replay", small_bench_file, log, "--headless", "--speed", "max", "--json"
+    )
     assert_refused(result, 2, str(log), "attitude 4", "max_rate_deg_s = 60", "rad/s")
 
 
@@ -110,7 +124,14 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
         process.send_signal(signal.SIGINT)
         served = summary_of(process)
     result = run_hilstar_here(
-        "replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=PATIENCE_S
+        "replay",
+        tmp_path / "serve.toml",
+        ledger,
+        "--headless",
+        "--speed",
+        "max",
+        "--json",
+        timeout=PATIENCE_S,
     )
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)

@@ -23,7 +23,10 @@ APART_MS = 400.0
 
 def bench(tmp_path, port, **sync):
     path = tmp_path / "bench.toml"
-    tables = {"render": {"quantisation": "round"}, "sync": {"port": port, "every_frames": EVERY, **sync}}
+    tables = {
+        "render": {"quantisation": "round"},
+        "sync": {"port": port, "every_frames": EVERY, **sync},
+    }
     path.write_text(bench_text(tables))
     return path
 
@@ -37,7 +40,9 @@ def server():
 def replayed(tmp_path, bench_file):
     log = still_log(tmp_path / "still.csv")
     kept = ("--ledger", tmp_path / "run.mcap")
-    done = run_hilstar_here("replay", bench_file, log, "--headless", "--stop", str(SECONDS), "--json", *kept)
+    done = run_hilstar_here(
+        "replay", bench_file, log, "--headless", "--stop", str(SECONDS), "--json", *kept
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout), done.stderr
 
@@ -47,7 +52,10 @@ def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_pa
         summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))
     told, pulses = summary["sync"], server.pulses()
     assert told["port"] == server.url
-    assert len(pulses) == told["pulses"] and told["pulses"] + told["skipped"] <= 1 + int(SECONDS * REFRESH_HZ) // EVERY
+    assert (
+        len(pulses) == told["pulses"]
+        and told["pulses"] + told["skipped"] <= 1 + int(SECONDS * REFRESH_HZ) // EVERY
+    )
     assert told["lost"] == 0
     assert told["pulses"] >= 2, told
     assert min(down - up for up, down in pulses) >= 20e6
@@ -76,11 +84,19 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
     assert summary["events"]["sync-lost"] == 1
     assert said.count("frames go on without their pulse") == 1
     # What the run says of its pulses is in its ledger, and in the report of that.
-    counts = {name: summary["sync"][key] for name, key in (("sent", "pulses"), ("skipped", "skipped"), ("lost", "lost"))}
-    reported = run_hilstar_here("report", tmp_path / "run.mcap", "-o", tmp_path / "report", "--json")
+    counts = {
+        name: summary["sync"][key]
+        for name, key in (("sent", "pulses"), ("skipped", "skipped"), ("lost", "lost"))
+    }
+    reported = run_hilstar_here(
+        "report", tmp_path / "run.mcap", "-o", tmp_path / "report", "--json"
+    )
     assert json.loads(reported.stdout)["pulses"] == counts
     told = run_hilstar_here("report", tmp_path / "run.mcap", "-o", tmp_path / "report").stdout
-    assert f"{counts['sent']} at their frames, {counts['skipped']} skipped, the line lost 1 times" in told
+    assert (
+        f"{counts['sent']} at their frames, {counts['skipped']} skipped, the line lost 1 times"
+        in told
+    )
     assert "only_counted" not in summary["ledger"]
 
 
@@ -100,14 +116,31 @@ def served(tmp_path, *changes):
     path.write_text(bench_text(tables, *changes))
     done = run_hilstar_here("serve", path, "--headless", "--frames", "2", "--json")
     assert done.returncode == 4, done.stderr  # nobody sends
-    return json.loads(done.stdout).get("beat"), [line for line in done.stderr.splitlines() if "refreshes" in line]
+    return json.loads(done.stdout).get("beat"), [
+        line for line in done.stderr.splitlines() if "refreshes" in line
+    ]
 
 
 def test_serve_says_a_beat_that_matters_and_nothing_of_one_that_does_not(tmp_path):
     beat, lines = served(tmp_path, {"tracker": {"exposure_s": 0.105}})
-    assert len(lines) == 1 and "[tracker] exposure_s = 0.1" in lines[0] and "1 arcsec at 1 deg/s" in lines[0]
-    assert beat["matters"] and beat["proposal"] == {"refresh_hz": pytest.approx(400 / 7), "exposure_s": 0.1, "frame_hz": None}
+    assert (
+        len(lines) == 1
+        and "[tracker] exposure_s = 0.1" in lines[0]
+        and "1 arcsec at 1 deg/s" in lines[0]
+    )
+    assert beat["matters"] and beat["proposal"] == {
+        "refresh_hz": pytest.approx(400 / 7),
+        "exposure_s": 0.1,
+        "frame_hz": None,
+    }
     assert beat["refreshes_per_exposure"] == pytest.approx(6.3)
-    assert beat["worst_arcsec"] == pytest.approx(1.0, rel=1e-6) and beat["period_s"] == pytest.approx(0.35)
+    assert beat["worst_arcsec"] == pytest.approx(1.0, rel=1e-6) and beat[
+        "period_s"
+    ] == pytest.approx(0.35)
     beat, lines = served(tmp_path)
-    assert lines == [] and beat["worst_arcsec"] == 0.0 and not beat["matters"] and beat["proposal"] is None
+    assert (
+        lines == []
+        and beat["worst_arcsec"] == 0.0
+        and not beat["matters"]
+        and beat["proposal"] is None
+    )

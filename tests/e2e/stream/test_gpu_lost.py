@@ -62,7 +62,9 @@ sys.exit(run_command(sys.argv[4:]))
 LOG_S = 4
 
 
-def planted(folder: Path, harm: str, slept_s: float, table: int = 0, quantisation: str = "round", **more):
+def planted(
+    folder: Path, harm: str, slept_s: float, table: int = 0, quantisation: str = "round", **more
+):
     """`replay --headless` (or with a window) of a log of LOG_S, with harm done in it; its
     ledger.
     """
@@ -71,7 +73,10 @@ def planted(folder: Path, harm: str, slept_s: float, table: int = 0, quantisatio
     log = still_log(folder / "still.csv", seconds=LOG_S)
     how = more.get("how", "--headless")
     command = ["replay", str(bench), str(log), how, "--json", "--ledger", str(ledger)]
-    return run_started([sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command], env=more.get("env")), ledger
+    return run_started(
+        [sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command],
+        env=more.get("env"),
+    ), ledger
 
 
 def events_of(ledger: Path) -> list[str]:
@@ -120,7 +125,9 @@ def test_after_a_sleep_that_harmed_nothing_the_run_goes_on(tmp_path):
     ran, ledger = planted(tmp_path, "nothing", 60.0)
     assert ran.returncode == 0, ran.stderr
     summary = json.loads(ran.stdout)
-    assert summary["events"] == {"resumed": 1} | {kind: n for kind, n in summary["events"].items() if kind != "resumed"}
+    assert summary["events"] == {"resumed": 1} | {
+        kind: n for kind, n in summary["events"].items() if kind != "resumed"
+    }
     assert "gpu-lost" not in summary["events"]
     assert events_of(ledger).count("resumed") == 1
 

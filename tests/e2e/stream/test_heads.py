@@ -33,8 +33,13 @@ def children(parent: int) -> dict[str, int]:
     for entry in Path("/proc").iterdir():
         try:
             words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
-            if b"--head-of" in words and int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1]) == parent:
-                found[Path(next(word for word in words if word.endswith(b".toml")).decode()).stem] = int(entry.name)
+            if (
+                b"--head-of" in words
+                and int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1]) == parent
+            ):
+                found[
+                    Path(next(word for word in words if word.endswith(b".toml")).decode()).stem
+                ] = int(entry.name)
         except (OSError, IndexError):
             continue  # it has just ended
     return found
@@ -44,7 +49,15 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
     q, lines = np.array(BODY) / np.linalg.norm(BODY), tmp_path / "said.txt"
     with publisher() as (sender, port), talking(sender, 50.0, tuple(q)), lines.open("w") as said:
         path = heads_file(tmp_path, port)
-        command = [*HILSTAR, "serve", str(path), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
+        command = [
+            *HILSTAR,
+            "serve",
+            str(path),
+            "--headless",
+            "--json",
+            "--ledger",
+            str(tmp_path / "run.mcap"),
+        ]
         with Started(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
                 wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
@@ -67,7 +80,9 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         ledger = tmp_path / f"run.{name}{again}.mcap"
         shown = [np.array(record.q) for record in frame_records(ledger) if record.q is not None]
         assert shown
-        assert max(angle_between_rad(one, multiply(np.array(mounting), q)) for one in shown) < SAME_RAD
+        assert (
+            max(angle_between_rad(one, multiply(np.array(mounting), q)) for one in shown) < SAME_RAD
+        )
     assert not children(process.pid)
 
 
@@ -78,7 +93,11 @@ def test_a_page_s_port_that_is_taken_is_found_before_a_head_begins(tmp_path):
     with socket.create_server(("127.0.0.1", second)), publisher() as (_, port):
         path = heads_file(tmp_path, port)
         options = ["--headless", "--console", f"127.0.0.1:{page}", "--duration", "5"]
-        assert_refused(run_hilstar("serve", path, *options), 2, f"--console 127.0.0.1:{second}: cannot listen there")
+        assert_refused(
+            run_hilstar("serve", path, *options),
+            2,
+            f"--console 127.0.0.1:{second}: cannot listen there",
+        )
 
 
 def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):

@@ -59,7 +59,10 @@ def messages(path: Path) -> dict[str, list[dict]]:
 
 def served(tmp_path, *options: str) -> tuple[Path, dict]:
     ledger = tmp_path / "run.mcap"
-    with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger), *options) as process:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, "--ledger", str(ledger), *options) as process,
+    ):
         process.shows()
         stream(sender, 100)
         process.has_received(110)
@@ -74,7 +77,9 @@ def test_every_packet_and_every_frame_is_there(tmp_path):
     assert len(found["/attitude"]) == summary["packets"]["received"] == 110
     assert sum(not each["accepted"] for each in found["/attitude"]) == 10
     refused = [each for each in found["/attitude"] if not each["accepted"]]
-    assert all(each["raw"] == b"wrong".hex() and each["reason"].startswith("format") for each in refused)
+    assert all(
+        each["raw"] == b"wrong".hex() and each["reason"].startswith("format") for each in refused
+    )
     for each in found["/attitude"]:
         if each["accepted"]:
             t_ns, *q = struct.unpack_from("<q4d", bytes.fromhex(each["raw"]), 8)
@@ -109,7 +114,10 @@ def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     ledger = tmp_path / "run.mcap"
     options = ["--headless", "--speed", "max"]
-    assert run_hilstar_here("replay", bench, log, *options, "-o", first, "--ledger", ledger).returncode == 0
+    assert (
+        run_hilstar_here("replay", bench, log, *options, "-o", first, "--ledger", ledger).returncode
+        == 0
+    )
     again = run_hilstar_here("replay", bench, ledger, *options, "-o", second)
     assert again.returncode == 0, again.stderr
     names = sorted(path.name for path in first.glob("*.png"))
@@ -126,9 +134,13 @@ def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
     assert len(samples) == 100
     converted = run_hilstar_here("convert", ledger, tmp_path / "run.csv")
     assert "100 attitudes" in converted.stdout
-    replayed = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json")
+    replayed = run_hilstar_here(
+        "replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json"
+    )
     assert json.loads(replayed.stdout)["frames"] == len(list(drawable_frames(ledger)))
-    refused = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1")
+    refused = run_hilstar_here(
+        "replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1"
+    )
     assert_refused(refused, 2, "run.mcap", "--step")
 
 
@@ -145,7 +157,11 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets
     # reach to half a second of it.
     within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000 - waited.s * NS_PER_S
-    assert found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (found[-1].t_ns, frames[-1].t_ns, waited.s)
+    assert found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (
+        found[-1].t_ns,
+        frames[-1].t_ns,
+        waited.s,
+    )
 
 
 def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
@@ -154,11 +170,22 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
-        command = ["serve", str(bench), "--headless", "--json", "--ledger", str(ledger), "--duration", "2"]
+        command = [
+            "serve",
+            str(bench),
+            "--headless",
+            "--json",
+            "--ledger",
+            str(ledger),
+            "--duration",
+            "2",
+        ]
         limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
         program = f"{limited}; from hilstar.cli import main; main()"
         pipe = subprocess.PIPE
-        with Started([sys.executable, "-c", program, *command], stdout=pipe, stderr=pipe, text=True) as process:
+        with Started(
+            [sys.executable, "-c", program, *command], stdout=pipe, stderr=pipe, text=True
+        ) as process:
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
@@ -188,7 +215,10 @@ def test_a_ledger_that_is_deleted_is_said_everywhere_and_ends_the_run_with_1(tmp
         served.process.send_signal(signal.SIGINT)
         assert served.process.wait(PATIENCE_S) == 1, served.lines
         told = json.loads(served.process.stdout.read())["ledger"]
-    assert (told["path"], told["failure"]) == (str(following), f"{ledger} was deleted while it was written")
+    assert (told["path"], told["failure"]) == (
+        str(following),
+        f"{ledger} was deleted while it was written",
+    )
     assert told["unrecorded"] > 0
     assert any(each["kind"] == "ledger-lost" for each in messages(following)["/event"])
     assert not ledger.exists()
@@ -196,7 +226,9 @@ def test_a_ledger_that_is_deleted_is_said_everywhere_and_ends_the_run_with_1(tmp
 
 def test_a_ledger_that_cannot_be_begun_gets_one_line(tmp_path, small_bench_file):
     for place in (tmp_path / "no" / "run.mcap", "/dev/full"):
-        result = run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1", "--ledger", place)
+        result = run_hilstar_here(
+            "serve", small_bench_file, "--headless", "--duration", "1", "--ledger", place
+        )
         assert result.returncode == 2
         assert str(place) in result.stderr
         assert "Traceback" not in result.stderr
@@ -224,7 +256,17 @@ def test_no_output_is_written_over_an_input_or_an_older_run(tmp_path, small_benc
         ["replay", bench, log, *headless, "--ledger", run],
         ["convert", log, log],
         ["convert", log, run],
-        ["serve", bench, "--headless", "--duration", "1", "--ledger", tmp_path / "other.mcap", "--ledger-split", "1 fortnight"],
+        [
+            "serve",
+            bench,
+            "--headless",
+            "--duration",
+            "1",
+            "--ledger",
+            tmp_path / "other.mcap",
+            "--ledger-split",
+            "1 fortnight",
+        ],
     ):
         assert_refused(run_hilstar_here(*command), 2)
         assert {path: path.read_bytes() for path in before} == before, command
@@ -255,7 +297,9 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
     assert counted + len(found["/attitude"]) == summary["packets"]["received"] > 1000
     assert summary["ledger"]["unrecorded"] == 0
     assert ledger.stat().st_size < 1_000_000
-    report = json.loads(run_hilstar_here("report", ledger, "-o", tmp_path / "report", "--json").stdout)
+    report = json.loads(
+        run_hilstar_here("report", ledger, "-o", tmp_path / "report", "--json").stdout
+    )
     assert sum(report["packets"].values()) == summary["packets"]["received"]
 
 

@@ -31,7 +31,9 @@ def test_a_served_run_says_what_codes_cost_and_its_ledger_keeps_it(tmp_path):
     bench, ledger = tmp_path / "serve.toml", tmp_path / "run.mcap"
     with publisher() as (sender, port):
         bench.write_text(SMALL_BENCH + attitude_table(port))
-        with Run([*HILSTAR, "serve", str(bench), "--headless", "--ledger", str(ledger), "--explain"]) as process:
+        with Run(
+            [*HILSTAR, "serve", str(bench), "--headless", "--ledger", str(ledger), "--explain"]
+        ) as process:
             await_subscriber_of(port)
             sender.send(packet(0, 0, (0.5, 0.5, -0.5, 0.5), (0.0, 0.0, 0.0)))
             process.shows(10)
@@ -40,10 +42,14 @@ def test_a_served_run_says_what_codes_cost_and_its_ledger_keeps_it(tmp_path):
     head = read_run(ledger).head
     cheap_ms, best_ms = json.loads(head["codes_ms"])
     explained = [
-        run_hilstar_here("replay", bench, ledger, "--headless", "--speed", speed, "--explain").stderr
+        run_hilstar_here(
+            "replay", bench, ledger, "--headless", "--speed", speed, "--explain"
+        ).stderr
         for speed in ("max", "realtime")
     ]
-    framed = run_hilstar_here("frame", bench, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--explain").stderr
+    framed = run_hilstar_here(
+        "frame", bench, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--explain"
+    ).stderr
     assert f"{MEASURED}{cheap_ms:g}, {best_ms:g}]" in codes_line(said)
     assert min(cheap_ms, best_ms) > 0
     assert head["quantisation"] in {"round", "exact"}
@@ -60,13 +66,19 @@ def test_a_log_is_timed_in_real_time_alone_and_not_where_a_key_says_it(tmp_path)
     bench.write_text(SMALL_BENCH)
     kept = tmp_path / "kept.mcap"
     lines = [
-        codes_line(run_hilstar_here("replay", bench, log, "--headless", "--speed", speed, "--explain", *more).stderr)
+        codes_line(
+            run_hilstar_here(
+                "replay", bench, log, "--headless", "--speed", speed, "--explain", *more
+            ).stderr
+        )
         for speed, more in (("realtime", ()), ("max", ("--ledger", kept)))
     ]
     assert MEASURED in lines[0] and TABULATED in lines[1]
     assert json.loads(read_run(kept).head["codes_ms"]) is None
     bench.write_text(SMALL_BENCH + "[render]\ncodes_ms = [1.5, 400]\n")
     for speed in ("realtime", "max"):
-        text = run_hilstar_here("replay", bench, log, "--headless", "--speed", speed, "--explain").stderr
+        text = run_hilstar_here(
+            "replay", bench, log, "--headless", "--speed", speed, "--explain"
+        ).stderr
         assert chosen_codes(text) == "round"
         assert "takes 400 ms of 16.7 (round 1.5)" in codes_line(text)

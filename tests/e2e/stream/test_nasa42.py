@@ -81,7 +81,11 @@ def server() -> Iterator[socket.socket]:
 def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
     ledger = tmp_path / "run.mcap"
     with server() as listener:
-        bench = bench_of(tmp_path, f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"', 'spacecraft = "SC[0]"')
+        bench = bench_of(
+            tmp_path,
+            f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"',
+            'spacecraft = "SC[0]"',
+        )
         with listening(bench, "connecting to tcp://", "--ledger", str(ledger)) as process:
             connection, _ = listener.accept()
             with connection:
@@ -104,7 +108,9 @@ def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
 
 def turning(seconds: float) -> Rotation:
     """The body after so long: v_B of v_N."""
-    return Rotation.from_rotvec(-RATE_RAD_S * seconds) * Rotation.from_euler("zyx", [84, 20, 30], degrees=True)
+    return Rotation.from_rotvec(-RATE_RAD_S * seconds) * Rotation.from_euler(
+        "zyx", [84, 20, 30], degrees=True
+    )
 
 
 def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp_path):
@@ -115,7 +121,9 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
             load(bench_of(tmp_path)) as bench,
             Nasa42Link(f"tcp://127.0.0.1:{port}", reader) as link,
         ):
-            steps = (message(k * STEP_S, turning(k * STEP_S), RATE_RAD_S).encode() for k in range(10**6))
+            steps = (
+                message(k * STEP_S, turning(k * STEP_S), RATE_RAD_S).encode() for k in range(10**6)
+            )
 
             def simulate() -> None:
                 connection, _ = listener.accept()
@@ -124,14 +132,20 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
 
             simulator = threading.Thread(target=simulate)
             simulator.start()
-            summary, frames = serve_until(bench, link, lambda shown, run: len(attitudes(shown)) > 60)
+            summary, frames = serve_until(
+                bench, link, lambda shown, run: len(attitudes(shown)) > 60
+            )
     simulator.join()
     shown = attitudes(frames)
     assert len(shown) > 60
     assert summary.packets.refused == 0
     for t_ns, attitude in shown:
-        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning((t_ns - BEGIN_NS) / 1e9)
-        assert (Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()).magnitude() < FOLLOWED_RAD
+        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(
+            (t_ns - BEGIN_NS) / 1e9
+        )
+        assert (
+            Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()
+        ).magnitude() < FOLLOWED_RAD
 
 
 def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(tmp_path):
@@ -143,7 +157,9 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
     with (
         server() as listener,
         load(bench_of(tmp_path, "lockstep = true")) as bench,
-        Nasa42Lockstep(f"tcp://127.0.0.1:{listener.getsockname()[1]}", MessageReader(0, Mounting(MOUNTING))) as link,
+        Nasa42Lockstep(
+            f"tcp://127.0.0.1:{listener.getsockname()[1]}", MessageReader(0, Mounting(MOUNTING))
+        ) as link,
     ):
 
         def simulate() -> None:
@@ -153,13 +169,17 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
 
         simulator = threading.Thread(target=simulate)
         simulator.start()
-        summary = serve(bench, link, Limit(frames=200), lambda shown: drawn.append((shown.t_ns, shown.attitude)))
+        summary = serve(
+            bench, link, Limit(frames=200), lambda shown: drawn.append((shown.t_ns, shown.attitude))
+        )
         simulator.join()
     assert [(t_ns - BEGIN_NS) // 36_000_000_000 for t_ns, _ in drawn] == list(range(200))
     assert summary.packets.refused == 1
     for k, (_, attitude) in enumerate(drawn):
         expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(float(k))
-        assert (Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()).magnitude() < FOLLOWED_RAD
+        assert (
+            Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()
+        ).magnitude() < FOLLOWED_RAD
 
 
 def test_42_may_be_the_client_and_come_back_and_nobody_else_gets_in(tmp_path):
@@ -180,7 +200,12 @@ def test_42_may_be_the_client_and_come_back_and_nobody_else_gets_in(tmp_path):
 
 
 def test_what_is_wrong_is_refused_by_reason_and_the_display_goes_on(tmp_path):
-    wrong = [b"[ENDMSG]\n", b"\0" * 500 + b"\n[EOF]\n", MESSAGES[0].replace(b"qn", b"q"), b"A" * 200_000 + b"\n[ENDMSG]\n"]
+    wrong = [
+        b"[ENDMSG]\n",
+        b"\0" * 500 + b"\n[EOF]\n",
+        MESSAGES[0].replace(b"qn", b"q"),
+        b"A" * 200_000 + b"\n[ENDMSG]\n",
+    ]
     with server() as listener:
         bench = bench_of(tmp_path, f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"')
         with listening(bench, "connecting to") as process:
@@ -200,12 +225,18 @@ def test_what_is_wrong_is_refused_by_reason_and_the_display_goes_on(tmp_path):
 
 def test_an_address_that_is_not_listed_is_not_let_in():
     reader = MessageReader(0, Mounting())
-    with Nasa42Link("tcp://127.0.0.1:*", reader, bind=True, allowed=AllowedSenders(["127.0.0.3"])) as link:
+    with Nasa42Link(
+        "tcp://127.0.0.1:*", reader, bind=True, allowed=AllowedSenders(["127.0.0.3"])
+    ) as link:
         port = int(link.endpoint.rpartition(":")[2])
-        with socket.create_connection(("127.0.0.1", port), source_address=("127.0.0.2", 0), timeout=PATIENCE_S) as stranger:
+        with socket.create_connection(
+            ("127.0.0.1", port), source_address=("127.0.0.2", 0), timeout=PATIENCE_S
+        ) as stranger:
             wait_for(lambda: link.receive(1) or link.link_counts.rejected, "the stranger")
             assert stranger.recv(1) == b""
-        with socket.create_connection(("127.0.0.1", port), source_address=("127.0.0.3", 0), timeout=PATIENCE_S) as listed:
+        with socket.create_connection(
+            ("127.0.0.1", port), source_address=("127.0.0.3", 0), timeout=PATIENCE_S
+        ) as listed:
             listed.sendall(MESSAGES[0])
             arrived = []
             wait_for(lambda: arrived.extend(link.receive(1)) or arrived, "the message")
@@ -226,17 +257,23 @@ def test_an_address_that_is_not_listed_is_not_let_in():
     ],
 )
 def test_keys_that_are_wrong_get_one_line(tmp_path, lines, said):
-    result = run_hilstar_here("serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1")
+    result = run_hilstar_here(
+        "serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1"
+    )
     assert_refused(result, 2, said)
 
 
 def test_a_port_in_use_gets_one_line():
     with server() as listener, pytest.raises(InputError, match="in use"):
-        Nasa42Link(f"tcp://127.0.0.1:{listener.getsockname()[1]}", MessageReader(0, Mounting()), bind=True)
+        Nasa42Link(
+            f"tcp://127.0.0.1:{listener.getsockname()[1]}", MessageReader(0, Mounting()), bind=True
+        )
 
 
 def test_explain_says_42_s_conventions_with_an_attitude_in_its_words(tmp_path):
-    bench = bench_of(tmp_path, f'endpoint = "tcp://127.0.0.1:{free_port()}"', mounting=(1.0, 0.0, 0.0, 0.0))
+    bench = bench_of(
+        tmp_path, f'endpoint = "tcp://127.0.0.1:{free_port()}"', mounting=(1.0, 0.0, 0.0, 0.0)
+    )
     result = run_hilstar_here("serve", bench, "--headless", "--frames", "1", "--explain")
     assert result.returncode == 4  # nobody sent an attitude
     assert "scalar last" in result.stderr

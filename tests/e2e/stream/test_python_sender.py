@@ -45,7 +45,9 @@ def test_both_ways_the_status_comes_back_and_the_simulation_s_own_clock_is_known
     with Cable(tmp_path) as cable:
         bench = tmp_path / "bench.toml"
         where = (
-            f'source = "serial"\nport = "{cable.host}"\nbaud = 921600' if road == "serial" else f'source = "udp"\nport = {port}'
+            f'source = "serial"\nport = "{cable.host}"\nbaud = 921600'
+            if road == "serial"
+            else f'source = "udp"\nport = {port}'
         )
         bench.write_text(f"{SMALL_BENCH}\n[attitude]\n{where}\n")
         to = f"serial:{cable.sender}@921600" if road == "serial" else f"udp://127.0.0.1:{port}"
@@ -56,7 +58,9 @@ def test_both_ways_the_status_comes_back_and_the_simulation_s_own_clock_is_known
             assert sender.wait()
 
             def synchronised() -> bool:
-                return sender.status is not None and bool(sender.status.health & HEALTH_CLOCK_SYNCHRONISED)
+                return sender.status is not None and bool(
+                    sender.status.health & HEALTH_CLOCK_SYNCHRONISED
+                )
 
             sent = stream(sender, synchronised)
             time.sleep(0.2)
@@ -72,8 +76,16 @@ def test_with_keys_it_is_let_in_on_either_side_of_the_connection(tmp_path, conne
     assert run_hilstar_here("keys", "-o", tmp_path / "keys").returncode == 0
     keys = tmp_path / "keys"
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    ours = {"server_key": keys / "server.key"} if connect else {"allowed_clients": keys / "allowed_clients"}
-    theirs = 'allowed_clients = "keys/allowed_clients"' if connect else 'curve_server_key = "keys/server.key"'
+    ours = (
+        {"server_key": keys / "server.key"}
+        if connect
+        else {"allowed_clients": keys / "allowed_clients"}
+    )
+    theirs = (
+        'allowed_clients = "keys/allowed_clients"'
+        if connect
+        else 'curve_server_key = "keys/server.key"'
+    )
     mine, its = ("client", "server") if connect else ("server", "client")
     lines = [
         f'endpoint = "{endpoint}"',
@@ -85,7 +97,9 @@ def test_with_keys_it_is_let_in_on_either_side_of_the_connection(tmp_path, conne
     bench.write_text("\n".join([SMALL_BENCH, "[attitude]", *lines, ""]))
     with (
         listening(bench, "bound to" if connect else "waiting for a sender at") as process,
-        hilstar.Sender(endpoint, connect=connect, secret_key=keys / f"{mine}.key_secret", **ours) as sender,
+        hilstar.Sender(
+            endpoint, connect=connect, secret_key=keys / f"{mine}.key_secret", **ours
+        ) as sender,
     ):
         assert sender.wait()
         assert sender.status is None
@@ -120,4 +134,9 @@ def test_a_road_that_is_none_is_refused():
 
 def test_a_simulator_that_imports_it_brings_no_renderer_and_no_catalogue():
     code = "import sys, hilstar; hilstar.Sender; print(*({'moderngl', 'glfw', 'astropy', 'matplotlib'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "\n"
+    )

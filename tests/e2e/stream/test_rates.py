@@ -58,7 +58,9 @@ def as_json_uncounted(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float
 
 
 @contextmanager
-def turning(sender: zmq.Socket, rate: Callable[[], tuple[float, ...]], form=as_packet, hz: float = 100.0) -> Iterator[int]:
+def turning(
+    sender: zmq.Socket, rate: Callable[[], tuple[float, ...]], form=as_packet, hz: float = 100.0
+) -> Iterator[int]:
     """A sender that turns by TURN_RAD_S and says `rate`; when it began, ns."""
     from_ns, sequences = time.monotonic_ns(), itertools.count(1)
 
@@ -83,22 +85,33 @@ def run_of(small_bench_file, tmp_path, check: str, form=as_packet) -> tuple[list
         told_at: list[int] = []
 
         def enough(frames: list[Shown], run: Running) -> bool:
-            if not told_at and (run.loop.notices.active or (check == "off" and len(frames) > FRAMES_AFTER)):
+            if not told_at and (
+                run.loop.notices.active or (check == "off" and len(frames) > FRAMES_AFTER)
+            ):
                 told_at.append(len(frames) + 5)
             return bool(told_at) and len(frames) > told_at[0] + FRAMES_AFTER
 
         summary, shown = serve_until(bench, link, enough)
     after = [frame for frame in shown[told_at[0] :] if frame.attitude is not None]
-    errors = [angle_between_rad(attitude(f.t_ns, from_ns), f.attitude.q_icrs_to_cam) * ARCSEC_PER_RAD for f in after]
+    errors = [
+        angle_between_rad(attitude(f.t_ns, from_ns), f.attitude.q_icrs_to_cam) * ARCSEC_PER_RAD
+        for f in after
+    ]
     return errors, msgspec.to_builtins(summary)
 
 
 @pytest.mark.parametrize("form", [as_packet, as_json, as_json_uncounted])
-def test_a_rate_in_deg_s_is_told_and_the_quaternions_turn_is_drawn(small_bench_file, tmp_path, form, caplog):
+def test_a_rate_in_deg_s_is_told_and_the_quaternions_turn_is_drawn(
+    small_bench_file, tmp_path, form, caplog
+):
     errors, summary = run_of(small_bench_file, tmp_path, "use-quaternions", form)
     assert summary["packets"]["refused"] == 0
     assert summary["events"]["rates-wrong"] == 1
-    assert [line for line in caplog.messages if "rates are wrong" in line and "in deg/s; send rad/s" in line]
+    assert [
+        line
+        for line in caplog.messages
+        if "rates are wrong" in line and "in deg/s; send rad/s" in line
+    ]
     assert np.median(errors) < MAX_OWN_ARCSEC
 
 
@@ -116,14 +129,23 @@ def test_terminal_health_and_ledger_say_it_and_its_end(tmp_path):
         page = page_of(served)
         with connected(served.port) as sender, turning(sender, lambda: rates[0]):
             served.await_line("probably because they are in deg/s; send rad/s")
-            wait_for(lambda: any("rates are wrong" in reason for reason in page.json("/health")["reasons"]))
+            wait_for(
+                lambda: any(
+                    "rates are wrong" in reason for reason in page.json("/health")["reasons"]
+                )
+            )
             rates[0] = tuple(TURN_RAD_S)
             served.await_line("rates are those of their quaternions again")
             wait_for(lambda: page.health_is(True))
         served.process.terminate()
         served.process.wait()
-    found = [msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")]
-    assert [event.kind for event in found if event.kind.startswith("rates")] == ["rates-wrong", "rates-right"]
+    found = [
+        msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")
+    ]
+    assert [event.kind for event in found if event.kind.startswith("rates")] == [
+        "rates-wrong",
+        "rates-right",
+    ]
 
 
 def test_a_rate_over_the_limit_is_taken_once_the_packets_show_its_unit(tmp_path):
@@ -147,12 +169,16 @@ def test_a_rate_over_the_limit_is_taken_once_the_packets_show_its_unit(tmp_path)
 
 def test_in_lockstep_it_is_told_though_no_rate_is_drawn_by(tmp_path):
     port = free_port()
-    with serving(tmp_path, port, attitude="lockstep = true") as process, connected(port, zmq.REQ) as asker:
+    with (
+        serving(tmp_path, port, attitude="lockstep = true") as process,
+        connected(port, zmq.REQ) as asker,
+    ):
         for k in range(100):
             t_ns = k * 10_000_000
             asker.send(packet(k, t_ns, attitude(t_ns, 0), AS_DEG_S))
             asker.recv()
         until_said(
-            process, "send rad/s: the quaternions turn at 0.5 deg/s, the rates say 0.5 rad/s (28.6 deg/s); nothing is drawn"
+            process,
+            "send rad/s: the quaternions turn at 0.5 deg/s, the rates say 0.5 rad/s (28.6 deg/s); nothing is drawn",
         )
         process.kill()

@@ -50,7 +50,9 @@ def cable(tmp_path) -> Iterator[Cable]:
 @pytest.fixture
 def bench_file(tmp_path, cable):
     path = tmp_path / "serial.toml"
-    path.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
+    path.write_text(
+        f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n'
+    )
     return path
 
 
@@ -97,7 +99,11 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
     rate predicts in 100 ms.
     """
     rate = np.radians([0.0, 0.0, 20.0])
-    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
+    with (
+        load(bench_file) as bench,
+        SerialLink(str(cable.host), BAUD) as link,
+        SerialSender(str(cable.sender), BAUD) as road,
+    ):
         faults = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), road.put)
         stop = threading.Event()
         samples = spin_samples(rate, 200.0, START_DEG)
@@ -119,17 +125,25 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
     # The first one, too, is on the turn from the start, however long the display took to begin.
     start = from_radec_roll_deg(*START_DEG)
     turned_s = angle_between_rad(start, first) / np.linalg.norm(rate)
-    assert angle_between_rad(first, propagate(start, rate, turned_s)) < PREDICTED_RAD * (1 + 10 * turned_s)
+    assert angle_between_rad(first, propagate(start, rate, turned_s)) < PREDICTED_RAD * (
+        1 + 10 * turned_s
+    )
 
 
 def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
     """A second and a half of packets in the kernel's buffer and at the sender, which had to wait
     for room.
     """
-    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
+    with (
+        load(bench_file) as bench,
+        SerialLink(str(cable.host), BAUD) as link,
+        SerialSender(str(cable.sender), BAUD) as road,
+    ):
         stop = threading.Event()
         faults = BadCable(Faults(0, 0, 0), np.random.default_rng(7), road.put)
-        sender = threading.Thread(target=send, args=(faults, spin_samples(np.zeros(3), 200.0, START_DEG), stop))
+        sender = threading.Thread(
+            target=send, args=(faults, spin_samples(np.zeros(3), 200.0, START_DEG), stop)
+        )
         sender.start()
         time.sleep(1.5)
         shown = []
@@ -146,7 +160,9 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
     assert summary["receive_latency_ms"]["p50"] < 30
 
 
-def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, bench_file):
+def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(
+    tmp_path, cable, bench_file
+):
     with listening(bench_file, "reading serial:") as process:
         process.shows()
         shown_s = time.monotonic()
@@ -174,7 +190,9 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
     assert summary["frames"] + summary["missed_frames"] >= 60 * lasted_s - 2
 
 
-def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(cable, bench_file):
+def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(
+    cable, bench_file
+):
     # an answer would end the garbage
     bench_file.write_text(bench_file.read_text() + "time_requests = false\n")
     with listening(bench_file, "reading serial:") as process:
@@ -193,11 +211,21 @@ def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     bench = tmp_path / "bench.toml"
     for port, code, said in (("/dev/ttyNowhere", 3, "plug it in"), ("/dev/null", 2, "ttyUSB0")):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
-        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), code, port, said)
+        assert_refused(
+            run_hilstar_here("serve", bench, "--headless", "--duration", "1"), code, port, said
+        )
     bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\n')
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "port")
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 3, "ttyNowhere")
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")
+    assert_refused(
+        run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"),
+        3,
+        "ttyNowhere",
+    )
+    assert_refused(
+        run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"),
+        2,
+        "serial:/dev/ttyX@BAUD",
+    )
 
 
 @best_of_three("a busy machine writes less than a flood to its pty")

@@ -16,11 +16,27 @@ import zmq
 from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
-from tests.support.senders import await_subscriber, connected, free_port, packet, publisher, publishing
+from tests.support.senders import (
+    await_subscriber,
+    connected,
+    free_port,
+    packet,
+    publisher,
+    publishing,
+)
 from tests.support.servers import serving, summary_of
 from tests.support.waiting import CoreWaits, missed_in, wait_for
 
-SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
+SUMMARY_KEYS = {
+    "frames",
+    "duration_s",
+    "fps",
+    "frame_ms",
+    "attitude_age_ms",
+    "packets",
+    "stars_drawn",
+    "clipped",
+}
 SUMMARY_KEYS |= {
     "capped",
     "given_up",
@@ -48,7 +64,11 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
     """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes
     of no form.
     """
-    with publisher() as (sender, port), serving(tmp_path, port) as process, CoreWaits(process.pid) as waited:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port) as process,
+        CoreWaits(process.pid) as waited,
+    ):
         process.shows()
         start = time.monotonic_ns()
         for k in range(1000):
@@ -69,7 +89,13 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
     packets = summary["packets"]
     assert packets["accepted"] == 1000
     assert packets["received"] == 1500
-    assert packets["refused_by"] == {"crc": 100, "norm": 100, "nan": 100, "time": 100, "format": 100}
+    assert packets["refused_by"] == {
+        "crc": 100,
+        "norm": 100,
+        "nan": 100,
+        "time": 100,
+        "format": 100,
+    }
     assert packets["refused"] == 500
     # A frame or a missed one for each sixtieth of the five seconds, whatever else the machine had
     # to do.
@@ -97,7 +123,9 @@ def test_a_clean_stream_is_refused_nothing(tmp_path):
 def test_json_and_multipart_messages_are_taken(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         sender.send(json.dumps({"t_ns": 1_000_000, "q": [1, 0, 0, 0], "rate": [0, 0, 0]}).encode())
-        sender.send_multipart([b"attitude", json.dumps({"t_ns": 2_000_000, "q": [1, 0, 0, 0]}).encode()])
+        sender.send_multipart(
+            [b"attitude", json.dumps({"t_ns": 2_000_000, "q": [1, 0, 0, 0]}).encode()]
+        )
         sender.send_multipart([b"topic", b"more", packet(3, 3_000_000)])
         sender.send(b'{"t_ns": 4000000, "q": [NaN, 0, 0, 0]}')
         process.has_received(4)
@@ -133,7 +161,9 @@ def test_a_sender_that_closes_and_comes_back_is_heard_again(tmp_path):
         sender.close(linger=0)
         time.sleep(0.3)  # it is away for a while
         again = publishing(context)
-        wait_for(lambda: binds(again, port), "the port, which libzmq gives back from a thread of its own")
+        wait_for(
+            lambda: binds(again, port), "the port, which libzmq gives back from a thread of its own"
+        )
         await_subscriber(again)
         again.send(packet(1, 2_000_000))
         process.has_received(2)
@@ -168,7 +198,10 @@ def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale
     where that was asked.
     """
     attitude = f'stale_after_ms = 100\nmax_extrapolation_ms = 50\non_stale = "{on_stale}"'
-    with publisher() as (sender, port), serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process,
+    ):
         process.shows()
         sender.send(packet(0, 0, q=tuple(from_radec_roll_deg(84, -1, 0))))
         summary = summary_of(process)
@@ -183,7 +216,16 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
     port = free_port()
     with serving(tmp_path, port, attitude="bind = true") as process:
         sent = run_hilstar(
-            "send", "--spin", "z,1.5", "--rate", "200", "--count", "300", "--to", f"tcp://127.0.0.1:{port}", "--connect"
+            "send",
+            "--spin",
+            "z,1.5",
+            "--rate",
+            "200",
+            "--count",
+            "300",
+            "--to",
+            f"tcp://127.0.0.1:{port}",
+            "--connect",
         )
         assert sent.returncode == 0, sent.stderr
         assert "300 packets sent" in sent.stderr
@@ -197,7 +239,9 @@ def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n5,1,0,0,0\n6,0.9999,0.01,0,0.0099\n")
     port = free_port()
     with serving(tmp_path, port) as process:
-        sent = run_hilstar("send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}")
+        sent = run_hilstar(
+            "send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}"
+        )
         assert "101 packets sent" in sent.stderr
         process.has_received(101)
         process.send_signal(signal.SIGINT)
@@ -213,7 +257,9 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
                 time.sleep(0.005)
             # What arrives before the first frame teaches the clock nothing; a loaded machine takes
             # seconds to draw that.
-            while start_ns and "the first attitude has come" not in (line := process.stderr.readline()):
+            while start_ns and "the first attitude has come" not in (
+                line := process.stderr.readline()
+            ):
                 assert line, "serve ended before its first frame"
             time.sleep(0.5)  # between the two runs
         process.has_received(100)
@@ -225,10 +271,16 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
 
 def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
     with publisher() as (_, port):
-        small_bench_file.write_text(SMALL_BENCH + f'[attitude]\nbind = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
+        small_bench_file.write_text(
+            SMALL_BENCH + f'[attitude]\nbind = true\nendpoint = "tcp://127.0.0.1:{port}"\n'
+        )
         result = run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1")
         assert_refused(result, 2, f"127.0.0.1:{port}", "in use")
-        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
+        assert_refused(
+            run_hilstar_here("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"),
+            2,
+            "in use",
+        )
 
 
 def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
@@ -236,11 +288,14 @@ def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
     wrong: each gets its answer.
     """
     port = free_port()
-    with serving(tmp_path, port, attitude="lockstep = true") as process, connected(port, zmq.REQ) as asker:
+    with (
+        serving(tmp_path, port, attitude="lockstep = true") as process,
+        connected(port, zmq.REQ) as asker,
+    ):
         for k in range(50):
             asker.send(packet(k, k * 3_600_000_000_000))
-            version, kind, health, frame, light_ns, age_ns, sequence, accepted, refused, crc = struct.unpack(
-                "<BBHIqqIIII", body := asker.recv()
+            version, kind, health, frame, light_ns, age_ns, sequence, accepted, refused, crc = (
+                struct.unpack("<BBHIqqIIII", body := asker.recv())
             )
             assert (version, kind, frame, sequence, accepted, refused) == (1, 4, k, k, k + 1, 0)
             assert (light_ns, age_ns) == (k * 3_600_000_000_000, 0)
@@ -254,7 +309,10 @@ def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
         assert json.loads(asker.recv())["refused"]["reason"] == "norm"
         asker.send(b"nonsense")
         assert struct.unpack("<BBHI", asker.recv()[:8])[3] == 50
-        asker.send(struct.pack("<BBHIq", 1, 2, 0, 9, 77) + struct.pack("<I", zlib.crc32(struct.pack("<BBHIq", 1, 2, 0, 9, 77))))
+        asker.send(
+            struct.pack("<BBHIq", 1, 2, 0, 9, 77)
+            + struct.pack("<I", zlib.crc32(struct.pack("<BBHIq", 1, 2, 0, 9, 77)))
+        )
         assert struct.unpack("<BBHIqqq", asker.recv()[:-4])[:5] == (1, 3, 0, 9, 77)
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
@@ -272,12 +330,21 @@ def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
 @pytest.mark.parametrize("line", ["bind = true", "bind = false", "lockstep = true"])
 @pytest.mark.parametrize("host", ["*", "192.0.2.1", "0.0.0.0", "[::]"])
 def test_beyond_loopback_nothing_is_bound_or_connected_without_keys(small_bench_file, host, line):
-    small_bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://{host}:5599"\n{line}\n')
-    assert_refused(run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"), 2, "hilstar keys", "5599")
+    small_bench_file.write_text(
+        f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://{host}:5599"\n{line}\n'
+    )
+    assert_refused(
+        run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"),
+        2,
+        "hilstar keys",
+        "5599",
+    )
 
 
 def test_send_beyond_loopback_needs_keys_too():
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://*:5599"), 2, "hilstar keys")
+    assert_refused(
+        run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://*:5599"), 2, "hilstar keys"
+    )
 
 
 def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
@@ -293,8 +360,25 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
     with serving(tmp_path, port, attitude=keys) as process:
         for directory, waits in (("strange", "1"), ("mine", "10")):
             client = tmp_path / directory / "client.key_secret"
-            options = ["--secret-key", client, "--server-key", tmp_path / "mine" / "server.key", "--wait", waits]
-            to = ["--to", f"tcp://127.0.0.1:{port}", "--connect", "--spin", "z,1", "--count", "40", "--rate", "200"]
+            options = [
+                "--secret-key",
+                client,
+                "--server-key",
+                tmp_path / "mine" / "server.key",
+                "--wait",
+                waits,
+            ]
+            to = [
+                "--to",
+                f"tcp://127.0.0.1:{port}",
+                "--connect",
+                "--spin",
+                "z,1",
+                "--count",
+                "40",
+                "--rate",
+                "200",
+            ]
             assert run_hilstar("send", *to, *options).returncode == 0
         plain = run_hilstar("send", *to, "--wait", "1")
         assert "no listener" in plain.stderr
@@ -308,14 +392,19 @@ def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.key_secret").write_text("nothing")
     for line, said in (
-        ('curve_secret_key = "bad.key_secret"\ncurve_server_key = "bad.key_secret"', "not a key file"),
+        (
+            'curve_secret_key = "bad.key_secret"\ncurve_server_key = "bad.key_secret"',
+            "not a key file",
+        ),
         ('curve_secret_key = "missing"\ncurve_server_key = "missing"', "no such key file"),
         ('curve_secret_key = "bad.key_secret"', "curve_server_key"),
         ('curve_server_key = "bad.key_secret"', "curve_secret_key"),
         ('bind = true\ncurve_secret_key = "bad.key_secret"', "allowed_clients"),
     ):
         small_bench_file.write_text(f"{SMALL_BENCH}\n[attitude]\n{line}\n")
-        assert_refused(run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"), 2, said)
+        assert_refused(
+            run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"), 2, said
+        )
 
 
 def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
@@ -330,7 +419,9 @@ def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
         while time.monotonic() < end:
             sender.send(message)
             with Path(f"/proc/{process.pid}/status").open() as status:
-                most_kb = max(most_kb, *(int(line.split()[1]) for line in status if line.startswith("VmRSS")))
+                most_kb = max(
+                    most_kb, *(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
+                )
         sender.close(linger=0)
         process.send_signal(signal.SIGINT)
         summary = summary_of(process, code=4)  # none of them is an attitude

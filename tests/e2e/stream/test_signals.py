@@ -45,12 +45,21 @@ WITH_LOCK = STUCK.format("sum(range(10_000_000_000))")  # as a driver that draws
 
 def program(*words: str | Path, before: str = "") -> list[str]:
     """The command, and Python that is run before it."""
-    return [sys.executable, "-c", f"{before}\nfrom hilstar.__main__ import main\nmain()", *map(str, words)]
+    return [
+        sys.executable,
+        "-c",
+        f"{before}\nfrom hilstar.__main__ import main\nmain()",
+        *map(str, words),
+    ]
 
 
 @contextmanager
-def running(command: list[str], begin: type[subprocess.Popen] = Started, **more) -> Iterator[subprocess.Popen]:
-    with begin(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, **more) as process:
+def running(
+    command: list[str], begin: type[subprocess.Popen] = Started, **more
+) -> Iterator[subprocess.Popen]:
+    with begin(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, **more
+    ) as process:
         try:
             yield process
         finally:
@@ -62,12 +71,17 @@ def test_a_hang_up_ends_nothing_under_nohup(tmp_path):
     """SIGHUP stays ignored where it was on entry."""
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port):
-        command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
+        command = program(
+            "serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger
+        )
         with running(command, ignored=(signal.SIGHUP,)) as process:
             assert process.stderr is not None and process.stderr.readline()
             process.send_signal(signal.SIGHUP)
             wait_for(
-                lambda: sender.send(packet(0, time.monotonic_ns())) or (ledger.exists() and ledger.stat().st_size > 10_000)
+                lambda: (
+                    sender.send(packet(0, time.monotonic_ns()))
+                    or (ledger.exists() and ledger.stat().st_size > 10_000)
+                )
             )
             assert process.poll() is None
             code, out, err = ends(process, signal.SIGTERM)
@@ -113,11 +127,16 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
     """
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port):
-        command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
+        command = program(
+            "serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger
+        )
         with running(command, ignored=(signal.SIGINT,)) as process:
             assert process.stderr is not None and process.stderr.readline()
             wait_for(
-                lambda: sender.send(packet(0, time.monotonic_ns())) or (ledger.exists() and ledger.stat().st_size > 10_000)
+                lambda: (
+                    sender.send(packet(0, time.monotonic_ns()))
+                    or (ledger.exists() and ledger.stat().st_size > 10_000)
+                )
             )
             code, out, err = ends(process, number)
     assert code == 0, err
@@ -154,7 +173,15 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
         "_moderngl.make_uniform = told"
     )
     with running(
-        program("frame", small_bench_file, "--radec", "84,-1,0", "--codes", tmp_path / "c.png", before=before)
+        program(
+            "frame",
+            small_bench_file,
+            "--radec",
+            "84,-1,0",
+            "--codes",
+            tmp_path / "c.png",
+            before=before,
+        )
     ) as process:
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 128 + signal.SIGINT, err
@@ -173,7 +200,9 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
         "    print('drawn', flush=True)\n"
         "benchmark.METHODS = (('callback', 'calls Python', lambda: draw),)"
     )
-    with running(program("benchmark", "-o", tmp_path / "times", before=before), text=True) as process:
+    with running(
+        program("benchmark", "-o", tmp_path / "times", before=before), text=True
+    ) as process:
         out, err = process.communicate(timeout=2 * PATIENCE_S)
     assert process.returncode == 128 + signal.SIGINT, err
     assert (out, err.splitlines()[-1]) == ("drawn\n", "hilstar: stopped")
@@ -191,7 +220,8 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
         "HostClock.wait_until = told"
     )
     with running(
-        program("serve", serve_file(tmp_path, free_port()), "--headless", "--json", before=before), text=True
+        program("serve", serve_file(tmp_path, free_port()), "--headless", "--json", before=before),
+        text=True,
     ) as process:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == NO_ATTITUDE, err
@@ -201,7 +231,9 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
 def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")
-    with running(program("replay", small_bench_file, log, "--headless", before=WITHOUT_LOCK)) as process:
+    with running(
+        program("replay", small_bench_file, log, "--headless", before=WITHOUT_LOCK)
+    ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
         process.send_signal(signal.SIGTERM)
         time.sleep(0.2)
@@ -216,7 +248,14 @@ def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_pa
     and the exit code is 1.
     """
     still = "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
-    command = ["serve", str(serve_file(tmp_path, free_port())), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
+    command = [
+        "serve",
+        str(serve_file(tmp_path, free_port())),
+        "--headless",
+        "--json",
+        "--ledger",
+        str(tmp_path / "run.mcap"),
+    ]
     with running(program(*command, before=still)) as process:
         assert process.stderr is not None
         # said after two seconds of frames
@@ -251,14 +290,17 @@ def full_pipe() -> Iterator[int]:
 def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_path):
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), full_pipe() as log:
-        command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
+        command = program(
+            "serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger
+        )
         with Started(command, stdout=subprocess.PIPE, stderr=log) as process:
             try:
                 grown = [10_000, 30_000]  # and on
                 for size in grown:
                     wait_for(
                         lambda size=size: (
-                            sender.send(b"refused, which is said") or (ledger.exists() and ledger.stat().st_size > size)
+                            sender.send(b"refused, which is said")
+                            or (ledger.exists() and ledger.stat().st_size > size)
                         )
                     )
                 with CoreWaits(process.pid) as waited:
@@ -297,7 +339,9 @@ def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
     port = free_port()
     context = zmq.Context()
     wrong, right = context.socket(zmq.DEALER), context.socket(zmq.REQ)
-    with running(program("serve", serve_file(tmp_path, port, "lockstep = true"), "--headless", "--json")) as process:
+    with running(
+        program("serve", serve_file(tmp_path, port, "lockstep = true"), "--headless", "--json")
+    ) as process:
         try:
             assert process.stderr is not None and process.stderr.readline()
             for asker in (wrong, right):
@@ -333,10 +377,18 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
     deaf.connect(f"tcp://127.0.0.1:{port}")
     far, near = os.openpty()
     try:
-        for to, rate in ((f"tcp://127.0.0.1:{port}", "10000"), (f"serial:{os.ttyname(near)}@115200", "1000")):
-            with running(program("send", "--spin", "z,1", "--rate", rate, "--to", to, "--json")) as process:
+        for to, rate in (
+            (f"tcp://127.0.0.1:{port}", "10000"),
+            (f"serial:{os.ttyname(near)}@115200", "1000"),
+        ):
+            with running(
+                program("send", "--spin", "z,1", "--rate", rate, "--to", to, "--json")
+            ) as process:
                 wait_for(lambda process=process: has_handlers(process))
-                assert process.stderr is not None and b"waiting for a listener" in process.stderr.readline()
+                assert (
+                    process.stderr is not None
+                    and b"waiting for a listener" in process.stderr.readline()
+                )
                 time.sleep(1.0)  # up to ten thousand packets: nothing more goes in
                 code, out, err = ends(process, signal.SIGTERM)
             assert code == 0, err
@@ -349,7 +401,11 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
 
 
 def ctrl_c_is_blocked(worker: int) -> bool:
-    (line,) = (line for line in Path(f"/proc/{worker}/status").read_text().splitlines() if line.startswith("SigBlk"))
+    (line,) = (
+        line
+        for line in Path(f"/proc/{worker}/status").read_text().splitlines()
+        if line.startswith("SigBlk")
+    )
     return bool(int(line.split()[1], 16) & 1 << signal.SIGINT - 1)
 
 
@@ -359,7 +415,9 @@ def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},1,0,0,0\n" for t in range(5000)))
     out = tmp_path / "out"
     for number in (signal.SIGTERM, signal.SIGKILL):
-        with running(program("simulate", small_bench_file, "--log", log, "-o", out / str(number))) as process:
+        with running(
+            program("simulate", small_bench_file, "--log", log, "-o", out / str(number))
+        ) as process:
             wait_for(lambda number=number: list((out / str(number)).glob("*.fits")))
             assert workers_of(process) and all(map(ctrl_c_is_blocked, workers_of(process)))
             code, _, err = ends(process, number)
@@ -382,9 +440,14 @@ def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
     }
 
 
-@pytest.mark.parametrize("name", ["send", "demo", "replay", "verify", "benchmark", "study", "lockstep"])
+@pytest.mark.parametrize(
+    "name", ["send", "demo", "replay", "verify", "benchmark", "study", "lockstep"]
+)
 def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_bench_file, name):
-    for number, later_s, begin in ((signal.SIGTERM, 0.0, subprocess.Popen), (signal.SIGINT, 1.5, Started)):
+    for number, later_s, begin in (
+        (signal.SIGTERM, 0.0, subprocess.Popen),
+        (signal.SIGINT, 1.5, Started),
+    ):
         with running(program(*other_commands(tmp_path, small_bench_file)[name]), begin) as process:
             wait_for(lambda process=process: has_handlers(process))
             time.sleep(later_s)
@@ -397,7 +460,11 @@ def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
     """Else the first socket or file would be the standard error, and take its lines."""
     out = tmp_path / "frame.fits"
     command = program("frame", small_bench_file, "--radec", "84,-1,0", "-o", out)
-    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        ["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command],
+        timeout=PATIENCE_S,
+        check=False,
+    )
     assert result.returncode == 0
     assert out.read_bytes().startswith(b"SIMPLE")
 
@@ -405,15 +472,29 @@ def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
 def test_with_stderr_closed_stdout_holds_no_line_of_it(tmp_path):
     command = program("attitude", tmp_path / "no.csv", "--json")
     result = subprocess.run(
-        ["bash", "-c", 'exec "$@" 2>&-', "bash", *command], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        ["bash", "-c", 'exec "$@" 2>&-', "bash", *command],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert (result.returncode, result.stdout) == (2, "")
 
 
 def test_a_run_with_all_standard_streams_closed_shows_its_frames(tmp_path):
     command = program(
-        "serve", serve_file(tmp_path, free_port()), "--headless", "--frames", "2", "--ledger", tmp_path / "run.mcap"
+        "serve",
+        serve_file(tmp_path, free_port()),
+        "--headless",
+        "--frames",
+        "2",
+        "--ledger",
+        tmp_path / "run.mcap",
     )
-    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        ["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command],
+        timeout=PATIENCE_S,
+        check=False,
+    )
     assert result.returncode == NO_ATTITUDE
     assert (tmp_path / "run.mcap").stat().st_size > 0

@@ -74,7 +74,11 @@ def test_a_sender_that_hangs_is_stale_in_every_frame_and_nothing_flickers(small_
     predicted, and stale to the end.
     """
     rate = (0.0, 0.0, 0.0174533)
-    with publisher() as (sender, port), ZmqReceiver(f"tcp://127.0.0.1:{port}") as link, load(small_bench_file) as bench:
+    with (
+        publisher() as (sender, port),
+        ZmqReceiver(f"tcp://127.0.0.1:{port}") as link,
+        load(small_bench_file) as bench,
+    ):
         stop, hangs = threading.Event(), threading.Event()
 
         def enough(frames: list[Shown], run: Running) -> bool:
@@ -131,7 +135,10 @@ def test_two_senders_on_one_port_are_told_apart_and_the_first_is_shown(tmp_path)
 
 
 def test_a_shared_clock_is_said_in_the_summary(tmp_path):
-    with publisher() as (sender, port), serving(tmp_path, port, attitude='clock = "shared"') as process:
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, attitude='clock = "shared"') as process,
+    ):
         with talking(sender):
             until_said(process, "first attitude")
             time.sleep(0.5)

@@ -47,8 +47,17 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
                 seen = ESCAPES.sub("", raw.decode(errors="ignore"))
 
     with publisher() as (sender, port):
-        command = [*HILSTAR, "serve", str(bench_for(tmp_path, port)), "--headless", "--ledger", str(tmp_path / "run.mcap")]
-        with Started(command, stdout=theirs, stderr=theirs, env={**os.environ, "COLUMNS": "120"}) as process:
+        command = [
+            *HILSTAR,
+            "serve",
+            str(bench_for(tmp_path, port)),
+            "--headless",
+            "--ledger",
+            str(tmp_path / "run.mcap"),
+        ]
+        with Started(
+            command, stdout=theirs, stderr=theirs, env={**os.environ, "COLUMNS": "120"}
+        ) as process:
             os.close(theirs)
             try:
                 read_until("none yet: the frames are blank")
@@ -64,7 +73,11 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
                 process.kill()
     os.close(ours)
     events = [line for line in seen.splitlines() if line.startswith("hilstar: ")]
-    for words in ("the first attitude has come", "the attitude is stale", "packet refused (format)"):
+    for words in (
+        "the first attitude has come",
+        "the attitude is stale",
+        "packet refused (format)",
+    ):
         assert any(words in line for line in events), events
     assert all(EVENT_TIME.match(line) for line in events if "attitude" in line or "refused" in line)
 
@@ -73,12 +86,15 @@ def test_elsewhere_a_plain_line_comes_now_and_then(tmp_path, monkeypatch):
     monkeypatch.setattr(run_status, "PLAIN_EACH_S", 0.4)
     begun_s = time.monotonic()
     with publisher() as (sender, port), talking(sender):
-        result = run_hilstar_here("serve", bench_for(tmp_path, port), "--headless", "--duration", "2.5")
+        result = run_hilstar_here(
+            "serve", bench_for(tmp_path, port), "--headless", "--duration", "2.5"
+        )
     assert result.returncode == 0, result.stderr
     told = [line for line in result.stderr.splitlines() if "; packets " in line]
     assert 2 <= len(told) <= (time.monotonic() - begun_s) / 0.4, result.stderr
     assert re.search(
-        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 150 \([\d.]+/s\)", told[-1]
+        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 150 \([\d.]+/s\)",
+        told[-1],
     )
     received = int(re.search(r"packets (\d+) received", told[-1])[1])
     assert received > 50, "200 a second are sent"
@@ -86,26 +102,37 @@ def test_elsewhere_a_plain_line_comes_now_and_then(tmp_path, monkeypatch):
 
 def test_a_replay_tells_its_frames_too(tmp_path, small_bench_file, monkeypatch):
     monkeypatch.setattr(run_status, "PLAIN_EACH_S", 0.3)
-    result = run_hilstar_here("replay", small_bench_file, still_log(tmp_path / "log.csv", 1.0), "--headless")
+    result = run_hilstar_here(
+        "replay", small_bench_file, still_log(tmp_path / "log.csv", 1.0), "--headless"
+    )
     assert result.returncode == 0, result.stderr
-    assert re.search(r"attitude RA 84\.0570.*frames \d+ of 61 .*source replaying .*log\.csv", result.stderr)
+    assert re.search(
+        r"attitude RA 84\.0570.*frames \d+ of 61 .*source replaying .*log\.csv", result.stderr
+    )
 
 
 def test_a_run_whose_packets_were_all_refused_says_why_and_what_to_change(tmp_path):
     """Its last line was that no attitude came, and to start the sender."""
     with publisher() as (sender, port), serving(tmp_path, port) as process:
-        with repeating(lambda: sender.send(packet(0, time.monotonic_ns(), q=(84.0, -1.2, 0.0, 0.0))), 0.01):
+        with repeating(
+            lambda: sender.send(packet(0, time.monotonic_ns(), q=(84.0, -1.2, 0.0, 0.0))), 0.01
+        ):
             process.has_refused(20)
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 4
     last = err.splitlines()[-1]
-    assert re.fullmatch(r"all \d+ packets from tcp://127.0.0.1:\d+ were refused, \d+ for norm: send unit quaternions, .*", last)
+    assert re.fullmatch(
+        r"all \d+ packets from tcp://127.0.0.1:\d+ were refused, \d+ for norm: send unit quaternions, .*",
+        last,
+    )
     assert "connected to the sender" in err
 
 
 def test_a_run_that_never_had_an_attitude_says_so_at_its_end(tmp_path):
-    result = run_hilstar_here("serve", bench_for(tmp_path, free_port()), "--headless", "--duration", "0.3")
+    result = run_hilstar_here(
+        "serve", bench_for(tmp_path, free_port()), "--headless", "--duration", "0.3"
+    )
     assert result.returncode == 4
     assert "no attitude came from tcp://127.0.0.1" in result.stderr.splitlines()[-1]
     assert result.stderr.startswith("waiting for a sender at tcp://127.0.0.1:")

@@ -27,7 +27,9 @@ FRAMES = 60
 SHARED = 1e-3  # of pixels where codes differ: two paths may share one
 
 
-def test_a_live_run_is_replayed_from_its_ledger_code_for_code_and_from_its_middle_in_light(tmp_path):
+def test_a_live_run_is_replayed_from_its_ledger_code_for_code_and_from_its_middle_in_light(
+    tmp_path,
+):
     """Stars come and go at the edges, and the first frames are blank: no attitude has come."""
     path, port, ledger = tmp_path / "bench.toml", free_port(), tmp_path / "run.mcap"
     render = {"quantisation": "temporal", "motion": "on"}
@@ -40,16 +42,27 @@ def test_a_live_run_is_replayed_from_its_ledger_code_for_code_and_from_its_middl
     with load(path) as bench:
         notices, stop = Notices(), threading.Event()
         kept = LedgerSwitch(Ledger(ledger, bench, notices))
-        with UdpLink(bound_place(None, port, None), AllowedSenders(), notices) as link, UdpSender(link.endpoint) as road:
+        with (
+            UdpLink(bound_place(None, port, None), AllowedSenders(), notices) as link,
+            UdpSender(link.endpoint) as road,
+        ):
             cable = BadCable(Faults(), np.random.default_rng(1), road.put)
-            sender = threading.Thread(target=send, args=(cable, spin_samples(RATE_RAD_S, 100.0, START_DEG), stop))
+            sender = threading.Thread(
+                target=send, args=(cable, spin_samples(RATE_RAD_S, 100.0, START_DEG), stop)
+            )
             threading.Timer(0.1, sender.start).start()
-            serve(bench, link, Limit(frames=FRAMES), into(codes), Outlet(ledger=kept, notices=notices))
+            serve(
+                bench, link, Limit(frames=FRAMES), into(codes), Outlet(ledger=kept, notices=notices)
+            )
             stop.set()
             sender.join()
         kept.end()
         replay(bench, plan_play(ledger, Wanted(speed=float("inf")), bench.config), into(again))
-        replay(bench, plan_play(ledger, Wanted(speed=float("inf"), start_s=0.5), bench.config), into(later))
+        replay(
+            bench,
+            plan_play(ledger, Wanted(speed=float("inf"), start_s=0.5), bench.config),
+            into(later),
+        )
     assert codes.keys() == again.keys() and len(codes) == FRAMES
     assert all(np.array_equal(codes[number], again[number]) for number in codes)
     assert max(levels.max() for levels in codes.values()) > 0
@@ -57,7 +70,10 @@ def test_a_live_run_is_replayed_from_its_ledger_code_for_code_and_from_its_middl
     # From the middle stars begin anew: other codes about the same light, all but a few within a
     # level.
     apart = np.concatenate(
-        [np.abs(codes[number].astype(int) - later[number])[codes[number] != later[number]] for number in later]
+        [
+            np.abs(codes[number].astype(int) - later[number])[codes[number] != later[number]]
+            for number in later
+        ]
     )
     assert len(apart) > 100
     assert np.mean(apart > 1) < SHARED

@@ -62,9 +62,13 @@ def serial_line() -> Iterator[tuple[int, str]]:
 def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_path: Path) -> None:
     ledger = tmp_path / "run.mcap"
     with serial_line() as (line, name):
-        answers = f'[answers]\nsource = "serial"\nformat = "json"\nport = "{name}"\nwrong_arcsec = 600'
+        answers = (
+            f'[answers]\nsource = "serial"\nformat = "json"\nport = "{name}"\nwrong_arcsec = 600'
+        )
         options = ("--console", "127.0.0.1:0", "--ledger", str(ledger))
-        with bound(tmp_path, *options, attitude=f'bind = true\nclock = "shared"\n{answers}') as served:
+        with bound(
+            tmp_path, *options, attitude=f'bind = true\nclock = "shared"\n{answers}'
+        ) as served:
             page = page_of(served)
             with stub_tracker(served.port, line, **STUB) as stub:
                 delays_s, told = follow(page, ANSWERS)
@@ -74,7 +78,9 @@ def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_p
             # A machine that stands still delays some: what the program does is the rule.
             assert np.median(delays_s) < SHOWN_WITHIN_S
             assert told["stars"] == 9 and told["availability"] > 0.8
-            wait_for(lambda: any("has not answered" in why for why in page.json("/health")["reasons"]))
+            wait_for(
+                lambda: any("has not answered" in why for why in page.json("/health")["reasons"])
+            )
             summary = served.summary()
     records = list(answer_records(ledger))
     assert [record.raw[:2] for record in records] == ["7b"] * len(records)  # {
@@ -83,7 +89,9 @@ def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_p
     wrong = [number for number, record in enumerate(records) if record.verdict == "wrong"]
     assert summary["answers"]["wrong"] == len(wrong) == len(planted["wild"]) > 0
     assert {record.verdict for record in records} <= {"right", "wrong", "unpaired"}
-    assessed = run_hilstar_here("assess", ledger, "-o", tmp_path / "budget", "--json", "--display-attitudes", "0")
+    assessed = run_hilstar_here(
+        "assess", ledger, "-o", tmp_path / "budget", "--json", "--display-attitudes", "0"
+    )
     assert assessed.returncode == 0, assessed.stderr
     found = json.loads(assessed.stdout)
     # Four sigmas of the mean of so many answers, and of 2 ms of a clock at 1 deg/s.

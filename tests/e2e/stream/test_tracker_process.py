@@ -19,7 +19,13 @@ import zmq
 
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
-from hilstar.basics.rotation import conjugate, from_radec_roll_deg, multiply, propagate, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_radec_roll_deg,
+    multiply,
+    propagate,
+    to_rotation_vector,
+)
 from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
@@ -51,8 +57,16 @@ def display(tmp_path_factory):
     """A replay that sends its frames: the bench file, and the endpoint."""
     folder, endpoint = tmp_path_factory.mktemp("display"), f"tcp://127.0.0.1:{free_port()}"
     (folder / "bench.toml").write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
-    command = [*HILSTAR, "replay", str(folder / "bench.toml"), str(log(folder / "log.csv", 300.0)), "--headless"]
-    with Started([*command, "--frames", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    command = [
+        *HILSTAR,
+        "replay",
+        str(folder / "bench.toml"),
+        str(log(folder / "log.csv", 300.0)),
+        "--headless",
+    ]
+    with Started(
+        [*command, "--frames", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
         yield folder / "bench.toml", endpoint
         process.terminate()
         process.wait(PATIENCE_S)
@@ -61,7 +75,9 @@ def display(tmp_path_factory):
 def tracker(display, *options):
     bench, endpoint = display
     command = [*HILSTAR, "tracker", str(bench), "--watch", endpoint, *options]
-    return Started([*map(str, command), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Started(
+        [*map(str, command), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def summary(process):
@@ -70,12 +86,28 @@ def summary(process):
     return json.loads(out)
 
 
-def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_and_what_was_planted(display, tmp_path):
+def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_and_what_was_planted(
+    display, tmp_path
+):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.bind(("127.0.0.1", 0))
         ear.setblocking(False)
-        told = ("--answer", f"udp://127.0.0.1:{ear.getsockname()[1]}", "--format", "json", "--duration", 3)
-        planted = ("--bias", ",".join(map(str, BIAS)), "--clock-offset", 7, "--record", tmp_path / "answers.csv")
+        told = (
+            "--answer",
+            f"udp://127.0.0.1:{ear.getsockname()[1]}",
+            "--format",
+            "json",
+            "--duration",
+            3,
+        )
+        planted = (
+            "--bias",
+            ",".join(map(str, BIAS)),
+            "--clock-offset",
+            7,
+            "--record",
+            tmp_path / "answers.csv",
+        )
         with tracker(display, *told, *planted) as process:
             found = summary(process)
         answers = [json.loads(ear.recv(65536)) for _ in range(found["answers"])]
@@ -90,16 +122,34 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
     # The turn from answer to answer is that of the log, about the same axes.
     first, last = answers[1], answers[-1]
     seconds = (last["t_ns"] - first["t_ns"]) / 1e9
-    turned = to_rotation_vector(multiply(np.array(last["q"]), conjugate(np.array(first["q"])))) / seconds
-    assert np.linalg.norm(turned) == pytest.approx(SPIN_RAD_S, abs=2 * max(OWN_ARCSEC) / ARCSEC / seconds)
+    turned = (
+        to_rotation_vector(multiply(np.array(last["q"]), conjugate(np.array(first["q"])))) / seconds
+    )
+    assert np.linalg.norm(turned) == pytest.approx(
+        SPIN_RAD_S, abs=2 * max(OWN_ARCSEC) / ARCSEC / seconds
+    )
 
 
 def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(display):
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
-    planted = ("--silent", "1s@1s", "--babble", "--wrong", "50%", "--latency", "0.5", "--solver", "truth", "--seed", 2)
+    planted = (
+        "--silent",
+        "1s@1s",
+        "--babble",
+        "--wrong",
+        "50%",
+        "--latency",
+        "0.5",
+        "--solver",
+        "truth",
+        "--seed",
+        2,
+    )
     line = f"serial:{os.ttyname(theirs)}@921600"
-    with tracker(display, "--answer", line, "--format", "json", "--duration", 3, *planted) as process:
+    with tracker(
+        display, "--answer", line, "--format", "json", "--duration", 3, *planted
+    ) as process:
         heard = b""
         while process.poll() is None or select.select([ours], [], [], 0)[0]:
             if select.select([ours], [], [], 0.05)[0]:
@@ -119,7 +169,9 @@ def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display
     exposure after that one follows.
     """
     solver = f"{sys.executable} {ROOT / 'examples' / 'star_solver.py'} {{image}} {25e3 / 13}"
-    with tracker(display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver) as process:
+    with tracker(
+        display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver
+    ) as process:
         found = summary(process)
     assert found["modes"]["lost in space"] >= 1
     assert found["modes"]["tracking"] >= 1
@@ -131,7 +183,9 @@ def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():
     some.
     """
     head = FrameHead(0, 0, 4096, 256, 8)
-    big = ShownFrame(head, np.arange(4096 * 256, dtype=np.uint32), np.ones(4096 * 256, dtype=np.uint8))
+    big = ShownFrame(
+        head, np.arange(4096 * 256, dtype=np.uint32), np.ones(4096 * 256, dtype=np.uint8)
+    )
     context = zmq.Context()
     asleep = context.socket(zmq.SUB)
     asleep.setsockopt(zmq.RCVHWM, 1)
@@ -165,7 +219,15 @@ def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():
 )
 def test_what_is_wrong_gets_one_line(tmp_path, options, said):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    words = ["tracker", tmp_path / "bench.toml", "--watch", "tcp://127.0.0.1:1", "--answer", "udp://127.0.0.1:9", *options]
+    words = [
+        "tracker",
+        tmp_path / "bench.toml",
+        "--watch",
+        "tcp://127.0.0.1:1",
+        "--answer",
+        "udp://127.0.0.1:9",
+        *options,
+    ]
     assert_refused(run_hilstar_here(*words), 2, said)
 
 
@@ -179,5 +241,11 @@ def test_what_is_wrong_gets_one_line(tmp_path, options, said):
     ],
 )
 def test_frames_that_cannot_be_counted_or_sent_get_one_line(tmp_path, asked, said):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"attitude": {"source": "udp", "bind": f"127.0.0.1:{free_port()}"}}))
-    assert_refused(run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--frames", *asked), 2, said)
+    (tmp_path / "bench.toml").write_text(
+        bench_text(TWIN, {"attitude": {"source": "udp", "bind": f"127.0.0.1:{free_port()}"}})
+    )
+    assert_refused(
+        run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--frames", *asked),
+        2,
+        said,
+    )

@@ -55,11 +55,25 @@ def sent(to: str, *options: str) -> dict:
 
 def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_talk(tmp_path):
     port = free_port()
-    options = ["--spin", "z,1", "--rate", "200", "--count", "300", "--to", f"udp://[::1]:{port}", "--json"]
-    with Started([*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as sender:
+    options = [
+        "--spin",
+        "z,1",
+        "--rate",
+        "200",
+        "--count",
+        "300",
+        "--to",
+        f"udp://[::1]:{port}",
+        "--json",
+    ]
+    with Started(
+        [*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as sender:
         assert sender.stderr is not None
         assert "waiting for a listener" in sender.stderr.readline()
-        with listening(bench_of(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}") as process:
+        with listening(
+            bench_of(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}"
+        ) as process:
             told = json.loads(sender.communicate(timeout=PATIENCE_S)[0])
             process.has_received(300)
             summary = interrupted(process)
@@ -73,9 +87,13 @@ def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_
 
 def test_lost_corrupted_and_reordered_datagrams_add_up(tmp_path):
     port = free_port()
-    with listening(bench_of(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to") as process:
+    with listening(
+        bench_of(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to"
+    ) as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
-        told = sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "400", "--count", "400", *faults)
+        told = sent(
+            f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "400", "--count", "400", *faults
+        )
         process.has_received(told["sent"])
         summary = interrupted(process)
     packets = summary["packets"]
@@ -91,7 +109,9 @@ def as_json(data: bytes) -> bytes:
     event = decode(data)
     if not isinstance(event, AttitudeSample) or event.rate_cam_rad_s is None:
         return data
-    return json.dumps({"t_ns": event.t_ns, "q": [*event.q_icrs_to_cam], "rate": [*event.rate_cam_rad_s]}).encode()
+    return json.dumps(
+        {"t_ns": event.t_ns, "q": [*event.q_icrs_to_cam], "rate": [*event.rate_cam_rad_s]}
+    ).encode()
 
 
 @pytest.mark.parametrize("form", [bytes, as_json], ids=["packets", "JSON"])
@@ -118,7 +138,9 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
 
         stop = threading.Event()
         cable = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), put)
-        sender = threading.Thread(target=send, args=(cable, spin_samples(RATE_RAD_S, 200.0, START_DEG), stop))
+        sender = threading.Thread(
+            target=send, args=(cable, spin_samples(RATE_RAD_S, 200.0, START_DEG), stop)
+        )
         sender.start()
 
         def enough(frames: list[Shown], run: Running) -> bool:
@@ -137,19 +159,33 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
     assert set(summary["events"]) <= {"first-attitude", *A_BUSY_MACHINE_S}
     first_ns, first = shown[0]
     for t_ns, q in shown:
-        assert angle_between_rad(q, propagate(first, RATE_RAD_S, (t_ns - first_ns) / 1e9)) < PREDICTED_RAD
+        assert (
+            angle_between_rad(q, propagate(first, RATE_RAD_S, (t_ns - first_ns) / 1e9))
+            < PREDICTED_RAD
+        )
 
 
 GOOD = packet(1, 1_000_000)
 WRONG = {
-    "format": [b"", b"\0", GOOD[:-1], GOOD + b"\0", bytes(1400), bytes(65_000), b"{" * 65_000, b'{"t_ns": 1}'],
+    "format": [
+        b"",
+        b"\0",
+        GOOD[:-1],
+        GOOD + b"\0",
+        bytes(1400),
+        bytes(65_000),
+        b"{" * 65_000,
+        b'{"t_ns": 1}',
+    ],
     "crc": [b"\xff" * 64, GOOD[:30] + bytes([GOOD[30] ^ 8]) + GOOD[31:], GOOD[:-1] + b"\0"],
     "nan": [packet(1, 2_000_000, q=(float("nan"), 0, 0, 1))],
     "norm": [packet(1, 2_000_000, q=(2, 0, 0, 0))],
 }
 
 
-def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malformed_datagrams_by_reason(tmp_path):
+def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malformed_datagrams_by_reason(
+    tmp_path,
+):
     port = free_port()
     bench = bench_of(tmp_path, f'bind = "127.0.0.1:{port}"', 'allow = ["127.0.0.1", "10.0.0.0/8"]')
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json"]
@@ -193,7 +229,18 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malform
 
 def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_path):
     port = free_port()
-    command = [*HILSTAR, "send", "--spin", "z,0", "--radec", "30,40,50", "--rate", "50", "--to", f"udp://127.0.0.1:{port}"]
+    command = [
+        *HILSTAR,
+        "send",
+        "--spin",
+        "z,0",
+        "--radec",
+        "30,40,50",
+        "--rate",
+        "50",
+        "--to",
+        f"udp://127.0.0.1:{port}",
+    ]
     with Started(command, stderr=subprocess.PIPE, text=True) as sender:
         try:
             result = run_hilstar_here("attitude", bench_of(tmp_path, f"port = {port}"), "--json")
@@ -222,7 +269,11 @@ def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
 def unread_bytes(port: int) -> int:
     """What waits in the kernel for whoever is bound to a UDP port."""
     rows = (line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:])
-    return sum(int(row[4].partition(":")[2], 16) for row in rows if int(row[1].partition(":")[2], 16) == port)
+    return sum(
+        int(row[4].partition(":")[2], 16)
+        for row in rows
+        if int(row[1].partition(":")[2], 16) == port
+    )
 
 
 def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
@@ -234,11 +285,18 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     flood += "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _ in range(500)]"
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
         process.shows()
-        with subprocess.Popen([sys.executable, "-c", flood, str(port)], stdin=subprocess.PIPE) as sender:
+        with subprocess.Popen(
+            [sys.executable, "-c", flood, str(port)], stdin=subprocess.PIPE
+        ) as sender:
             until_said(process, "packets per second")
             sender.communicate(timeout=PATIENCE_S)
         wait_for(lambda: unread_bytes(port) == 0, "the flood is read")
-        assert sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "100", "--count", "20")["sent"] == 20
+        assert (
+            sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "100", "--count", "20")[
+                "sent"
+            ]
+            == 20
+        )
         process.has_accepted(20)
         summary = interrupted(process)
     assert summary["packets"]["accepted"] == 20
@@ -271,7 +329,9 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     ],
 )
 def test_keys_that_are_wrong_or_disagree_get_one_line(tmp_path, lines, said):
-    result = run_hilstar_here("serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1")
+    result = run_hilstar_here(
+        "serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1"
+    )
     assert_refused(result, 2, "udp.toml: [attitude]", said)
 
 
@@ -279,19 +339,35 @@ def test_keys_of_udp_are_refused_on_another_road(tmp_path):
     for line in ('bind = "127.0.0.1:5560"', 'allow = ["127.0.0.1"]'):
         bench = bench_of(tmp_path, line)
         bench.write_text(bench.read_text().replace('"udp"', '"zmq"'))
-        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "udp")
+        assert_refused(
+            run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "udp"
+        )
     bench = bench_of(tmp_path, "port = 5560")
     bench.write_text(bench.read_text().replace('"udp"', '"serial"'))
-    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "/dev/ttyUSB0")
+    assert_refused(
+        run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "/dev/ttyUSB0"
+    )
 
 
 def test_a_port_in_use_an_address_of_another_machine_and_a_wrong_target_get_one_line(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         bench = bench_of(tmp_path, f"port = {other.getsockname()[1]}")
-        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "in use")
+        assert_refused(
+            run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "in use"
+        )
     bench = bench_of(tmp_path, 'bind = "192.0.2.1:5560"', 'allow = ["192.0.2.2"]')
-    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "not an address of this machine")
+    assert_refused(
+        run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"),
+        2,
+        "not an address of this machine",
+    )
     for target in ("udp://", "udp://127.0.0.1", "udp://127.0.0.1:0", "udp://::1:5560"):
-        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", target), 2, "udp://HOST:PORT")
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "udp://127.0.0.1:5560", "--connect"), 2, "--connect")
+        assert_refused(
+            run_hilstar_here("send", "--spin", "z,1", "--to", target), 2, "udp://HOST:PORT"
+        )
+    assert_refused(
+        run_hilstar_here("send", "--spin", "z,1", "--to", "udp://127.0.0.1:5560", "--connect"),
+        2,
+        "--connect",
+    )

@@ -42,7 +42,9 @@ def turning(sender: zmq.Socket, sent: Sent) -> Iterator[None]:
     def say() -> None:
         t_ns = time.time_ns()
         q = propagate(np.array(ORION), TURN_RAD_S, (t_ns - from_ns) / 1e9)
-        sender.send(json.dumps(sent(t_ns, q, tuple(TURN_RAD_S)) | {"sequence": next(sequences)}).encode())
+        sender.send(
+            json.dumps(sent(t_ns, q, tuple(TURN_RAD_S)) | {"sequence": next(sequences)}).encode()
+        )
 
     with repeating(say, 0.01):
         yield
@@ -63,15 +65,30 @@ def reasons_say(page, words: str) -> bool:
 
 def test_a_clock_ahead_is_said_while_it_lasts_and_counts_as_wrong_after_it(tmp_path):
     ledger, ahead_ns = tmp_path / "run.mcap", [AHEAD_NS]
-    with bound(tmp_path, "--console", "127.0.0.1:0", "--ledger", str(ledger), "--strict", attitude=CLOCK_UNIX) as served:
+    with bound(
+        tmp_path,
+        "--console",
+        "127.0.0.1:0",
+        "--ledger",
+        str(ledger),
+        "--strict",
+        attitude=CLOCK_UNIX,
+    ) as served:
         page = page_of(served)
         with (
             connected(served.port) as sender,
-            turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns + ahead_ns[0], "q": q.tolist(), "rate": rate}),
+            turning(
+                sender,
+                lambda t_ns, q, rate: {"t_ns": t_ns + ahead_ns[0], "q": q.tolist(), "rate": rate},
+            ),
         ):
             wait_for(lambda: reasons_say(page, "0.100 s ahead of CLOCK_REALTIME"))
-            assert 'hilstar_wrong_sky{kind="clock-not-shared"} 1.0' in page.ask("/metrics")[2].decode()
-            assert [each["kind"] for each in page.json("/state")["state"]["wrong_sky"]] == ["clock-not-shared"]
+            assert (
+                'hilstar_wrong_sky{kind="clock-not-shared"} 1.0' in page.ask("/metrics")[2].decode()
+            )
+            assert [each["kind"] for each in page.json("/state")["state"]["wrong_sky"]] == [
+                "clock-not-shared"
+            ]
             ahead_ns[0] = 0
             served.await_line("agrees with CLOCK_REALTIME (Unix time) of this machine again")
             wait_for(lambda: page.health_is(True))
@@ -79,15 +96,30 @@ def test_a_clock_ahead_is_said_while_it_lasts_and_counts_as_wrong_after_it(tmp_p
             code, summary = ended(served)
     assert code == 1 and not summary["verdict"]["strict"]
     assert [one["kind"] for one in summary["wrong_sky"]["conditions"]] == ["clock-not-shared"]
-    assert 0 < summary["wrong_sky"]["seconds"] == summary["verdict"]["wrong_sky_s"] < summary["duration_s"]
+    assert (
+        0
+        < summary["wrong_sky"]["seconds"]
+        == summary["verdict"]["wrong_sky_s"]
+        < summary["duration_s"]
+    )
     found = report(ledger, tmp_path / "report")
     assert found.wrong_sky.seconds == pytest.approx(summary["wrong_sky"]["seconds"], abs=0.2)
     assert 0 < found.wrong_frames <= found.frames - found.right_frames
     again = run_hilstar_here(
-        "replay", str(tmp_path / "serve.toml"), str(ledger), "--headless", "--speed", "max", "--json", "--strict"
+        "replay",
+        str(tmp_path / "serve.toml"),
+        str(ledger),
+        "--headless",
+        "--speed",
+        "max",
+        "--json",
+        "--strict",
     )
     told = json.loads(again.stdout)
-    assert again.returncode == 1 and told["events"]["clock-not-shared"] == told["events"]["clock-shared"] == 1
+    assert (
+        again.returncode == 1
+        and told["events"]["clock-not-shared"] == told["events"]["clock-shared"] == 1
+    )
 
 
 def test_a_conjugate_is_said_with_the_line_to_write(tmp_path):
@@ -95,9 +127,14 @@ def test_a_conjugate_is_said_with_the_line_to_write(tmp_path):
         page = page_of(served)
         with (
             connected(served.port) as sender,
-            turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": conjugate(q).tolist(), "rate": rate}),
+            turning(
+                sender,
+                lambda t_ns, q, rate: {"t_ns": t_ns, "q": conjugate(q).tolist(), "rate": rate},
+            ),
         ):
-            wait_for(lambda: reasons_say(page, '[attitude] convention = { direction = "cam_to_icrs" }'))
+            wait_for(
+                lambda: reasons_say(page, '[attitude] convention = { direction = "cam_to_icrs" }')
+            )
 
 
 def test_what_only_a_person_can_judge_is_said_at_the_first_attitude(tmp_path):
@@ -106,11 +143,18 @@ def test_what_only_a_person_can_judge_is_said_at_the_first_attitude(tmp_path):
     """
     with bound(tmp_path, "--console", "127.0.0.1:0") as served:
         page = page_of(served)
-        with connected(served.port) as sender, turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}):
+        with (
+            connected(served.port) as sender,
+            turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}),
+        ):
             served.await_line(
                 "the first attitude points at RA 84.000, Dec -1.000, roll 0.000 deg; the brightest star in view is"
             )
-            wait_for(lambda: "Alnilam, ε Ori, V 1.69, in Orion" in page.json("/state")["state"]["pointing"])
+            wait_for(
+                lambda: (
+                    "Alnilam, ε Ori, V 1.69, in Orion" in page.json("/state")["state"]["pointing"]
+                )
+            )
 
 
 def test_units_lost_packets_and_three_decimals_are_notices(tmp_path):
@@ -125,18 +169,29 @@ def test_units_lost_packets_and_three_decimals_are_notices(tmp_path):
                 t_ns = time.time_ns()
                 q = np.round(propagate(np.array(ORION), TURN_RAD_S, (t_ns - from_ns) / 1e9), 3)
                 if k % 10:
-                    sender.send(json.dumps({"t_ns": t_ns // 1000, "q": q.tolist(), "sequence": k}).encode())
+                    sender.send(
+                        json.dumps({"t_ns": t_ns // 1000, "q": q.tolist(), "sequence": k}).encode()
+                    )
 
             with repeating(say, 0.01):
-                served.await_line("it is in microseconds, not in nanoseconds; send nanoseconds: multiply by 1000")
-                served.await_line("the quaternions come in steps of 0.001: each attitude is off by 206 arcsec rms")
+                served.await_line(
+                    "it is in microseconds, not in nanoseconds; send nanoseconds: multiply by 1000"
+                )
+                served.await_line(
+                    "the quaternions come in steps of 0.001: each attitude is off by 206 arcsec rms"
+                )
                 wait_for(lambda: page.json("/state")["state"]["counts"]["lost"] > 3)
         _, summary = ended(served)
-    assert summary["packets"]["lost"] > 3 and summary["wrong_sky"] == {"seconds": 0.0, "conditions": []}
+    assert summary["packets"]["lost"] > 3 and summary["wrong_sky"] == {
+        "seconds": 0.0,
+        "conditions": [],
+    }
 
 
 def frames_of_log(path: Path, count: int) -> Path:
-    path.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{k / 10},0.5,0.5,-0.5,0.5\n" for k in range(count)))
+    path.write_text(
+        "t_s,qw,qx,qy,qz\n" + "".join(f"{k / 10},0.5,0.5,-0.5,0.5\n" for k in range(count))
+    )
     return path
 
 
@@ -152,8 +207,13 @@ def test_a_log_in_another_convention_is_a_wrong_sky_for_all_of_it(tmp_path, smal
     with log.open("w") as file:
         for k in range(200):
             q = conjugate(propagate(np.array(ORION), TURN_RAD_S, k / 50))
-            file.write(json.dumps({"t_ns": k * 20_000_000, "q": q.tolist(), "rate": TURN_RAD_S.tolist()}) + "\n")
+            file.write(
+                json.dumps({"t_ns": k * 20_000_000, "q": q.tolist(), "rate": TURN_RAD_S.tolist()})
+                + "\n"
+            )
     found = run_hilstar_here("replay", small_bench_file, log, *UNPACED, "--strict", "--json")
     told = json.loads(found.stdout)
-    assert found.returncode == 1 and [one["kind"] for one in told["wrong_sky"]["conditions"]] == ["convention-wrong"]
+    assert found.returncode == 1 and [one["kind"] for one in told["wrong_sky"]["conditions"]] == [
+        "convention-wrong"
+    ]
     assert '{ direction = "cam_to_icrs" }' in told["wrong_sky"]["conditions"][0]["text"]

@@ -15,7 +15,12 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import from_rotation_vector, multiply, to_matrix
 from hilstar.basics.toml_tables import toml_text
-from hilstar.display.calibration import CalibrationHead, NotesTable, add_uniformity, write_calibration
+from hilstar.display.calibration import (
+    CalibrationHead,
+    NotesTable,
+    add_uniformity,
+    write_calibration,
+)
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.response import srgb_response
 from hilstar.optics.camera import Camera, Lens
@@ -30,10 +35,22 @@ PANELS = (
     ("office monitor", (233.0, 311.0), ((1280, 1024), (1920, 1080), (1920, 1200), (2560, 1440))),
 )
 PANEL_WEIGHTS = (0.25, 0.1, 0.2, 0.15, 0.05, 0.25)
-DETECTORS_PX = ((256, 256), (512, 512), (640, 480), (1024, 1024), (1280, 1024), (2048, 2048), (2592, 1944), (4096, 4096))
+DETECTORS_PX = (
+    (256, 256),
+    (512, 512),
+    (640, 480),
+    (1024, 1024),
+    (1280, 1024),
+    (2048, 2048),
+    (2592, 1944),
+    (4096, 4096),
+)
 DETECTOR_WEIGHTS = (0.12, 0.16, 0.1, 0.22, 0.1, 0.18, 0.07, 0.05)
 # Of small benches, which a test can afford.
-SMALL_PANELS_PX, SMALL_DETECTORS_PX = ((400, 300), (480, 320), (640, 480)), ((160, 160), (200, 150), (256, 256))
+SMALL_PANELS_PX, SMALL_DETECTORS_PX = (
+    ((400, 300), (480, 320), (640, 480)),
+    ((160, 160), (200, 150), (256, 256)),
+)
 FOCAL_MM, TRACKER_PITCH_UM, PSF_PX = (20.0, 150.0), (2.2, 15.0), (0.35, 3.0)
 F_NUMBERS, COLLIMATORS_MM = (1.0, 4.0), (12.0, 4000.0)
 TRACKER_FIELD_DEG, MAX_SCREEN_DEG = (0.5, 60.0), 80.0
@@ -132,7 +149,11 @@ class DrawnBench:
         table: dict[str, Any] = {}
         for part in ("panel", "detector", "mounting"):
             for key, value in dataclasses.asdict(getattr(self, part)).items():
-                text = " x ".join(f"{each:.6g}" for each in value) if isinstance(value, tuple) else value
+                text = (
+                    " x ".join(f"{each:.6g}" for each in value)
+                    if isinstance(value, tuple)
+                    else value
+                )
                 table[f"{part}_{key}"] = text
         own = ("collimator_mm", "seen", "exposure_s", "faintest_v_mag", "photodiode")
         return table | {key: getattr(self, key) for key in own} | {"pixel_ratio": self.pixel_ratio}
@@ -146,13 +167,26 @@ def drawn_bench(seed: int, number: int, *, is_small: bool = False) -> DrawnBench
     while True:
         panel, detector = _panel(rng), _detector(rng)
         if is_small:
-            panel = dataclasses.replace(panel, size_px=SMALL_PANELS_PX[rng.integers(len(SMALL_PANELS_PX))])
-            detector = dataclasses.replace(detector, size_px=SMALL_DETECTORS_PX[rng.integers(len(SMALL_DETECTORS_PX))])
+            panel = dataclasses.replace(
+                panel, size_px=SMALL_PANELS_PX[rng.integers(len(SMALL_PANELS_PX))]
+            )
+            detector = dataclasses.replace(
+                detector, size_px=SMALL_DETECTORS_PX[rng.integers(len(SMALL_DETECTORS_PX))]
+            )
         seen = _log_uniform(rng, SEEN)
         field = math.prod(detector.tangents)
         screen_mm2 = math.prod(panel.size_px) * panel.pitch_um**2 / 4e6
         collimator_mm = math.sqrt(seen * screen_mm2 / field)
-        bench = DrawnBench(panel, detector, _mounting(rng, detector), collimator_mm, seen, 0.1, 6.0, bool(rng.random() < 0.5))
+        bench = DrawnBench(
+            panel,
+            detector,
+            _mounting(rng, detector),
+            collimator_mm,
+            seen,
+            0.1,
+            6.0,
+            bool(rng.random() < 0.5),
+        )
         if _is_built(bench):
             return _with_sky(bench)
 
@@ -160,7 +194,9 @@ def drawn_bench(seed: int, number: int, *, is_small: bool = False) -> DrawnBench
 def _is_built(bench: DrawnBench) -> bool:
     """Whether lenses of such fields and lengths are sold."""
     low_deg, high_deg = TRACKER_FIELD_DEG
-    width_deg, height_deg = (2 * math.degrees(math.atan(tangent)) for tangent in bench.detector.tangents)
+    width_deg, height_deg = (
+        2 * math.degrees(math.atan(tangent)) for tangent in bench.detector.tangents
+    )
     width_px, height_px = bench.panel.size_px
     diagonal_mm = math.hypot(width_px, height_px) * bench.panel.pitch_um / 1000
     screen_deg = 2 * math.degrees(math.atan(diagonal_mm / 2 / bench.collimator_mm))
@@ -285,7 +321,11 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
         "read_noise_e": detector.read_noise_e,
         "dark_e_per_s": 20,
     }
-    monitor = {"resolution_px": list(panel.size_px), "pixel_pitch_um": panel.pitch_um, "refresh_hz": REFRESH_HZ}
+    monitor = {
+        "resolution_px": list(panel.size_px),
+        "pixel_pitch_um": panel.pitch_um,
+        "refresh_hz": REFRESH_HZ,
+    }
     monitor |= {"bits": panel.bits, "calibration": panel.stated_law}
     monitor |= {"photodiode_px": 40 if bench.photodiode else 0}
     sky = {"epoch_jyear": 2026.0, "faintest_v_mag": bench.faintest_v_mag}
@@ -302,7 +342,11 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
     _write_true_light(panel, mounting, folder)
     size_px = panel.size_px if mounting.rotate_deg % 180 == 0 else panel.size_px[::-1]
     _write_true_lens(bench, size_px, folder)
-    true_sensor = sensor | {"prnu": 0.005, "hot_pixel_fraction": detector.hot_pixels, "device_seed": 1}
+    true_sensor = sensor | {
+        "prnu": 0.005,
+        "hot_pixel_fraction": detector.hot_pixels,
+        "device_seed": 1,
+    }
     truth = tables | {
         "tracker": tracker | {"psf_sigma_px": [detector.psf_px] * 2},
         "tracker.detector": true_sensor,
@@ -314,8 +358,13 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
             "rotate_deg": mounting.rotate_deg,
             "panel_delay_ms": mounting.delay_ms,
         },
-        "collimator": {"focal_length_mm": round(bench.collimator_mm, 2), "geometry": "true-lens.toml"},
-        "render": {"flux_at_white_e_per_s": _white_e_per_s(folder) * 10 ** (-0.4 * mounting.white_mag)},
+        "collimator": {
+            "focal_length_mm": round(bench.collimator_mm, 2),
+            "geometry": "true-lens.toml",
+        },
+        "render": {
+            "flux_at_white_e_per_s": _white_e_per_s(folder) * 10 ** (-0.4 * mounting.white_mag)
+        },
     }
     (folder / "truth.toml").write_text(toml_text(truth))
     return folder / "bench.toml", folder / "truth.toml"
@@ -331,7 +380,9 @@ def _white_e_per_s(folder: Path) -> float:
 
 
 def _write_true_light(panel: Panel, mounting: Mounting, folder: Path) -> None:
-    head = CalibrationHead("photometric", "planted", "2026-11-28", "none", "relative", panel.bits, "true-response.csv")
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-28", "none", "relative", panel.bits, "true-response.csv"
+    )
     path = folder / "true-light.toml"
     write_calibration(path, head, {"w": true_light(panel)}, 0.0, NotesTable())
     if panel.fall:
@@ -349,4 +400,6 @@ def _write_true_lens(bench: DrawnBench, size_px: tuple[int, int], folder: Path) 
     tilt_a_deg, tilt_b_deg = mounting.tilt_deg
     lens = Lens(tilt_rad=(math.radians(tilt_a_deg), math.radians(tilt_b_deg)))
     centre = ((size_px[0] - 1) / 2, (size_px[1] - 1) / 2)
-    write_geometry(folder / "true-lens.toml", Camera(size_px, focal_px, centre, to_matrix(q), lens), q, NOTES)
+    write_geometry(
+        folder / "true-lens.toml", Camera(size_px, focal_px, centre, to_matrix(q), lens), q, NOTES
+    )

@@ -26,7 +26,17 @@ from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor
 from tests.support.any_bench.draw import DrawnBench, true_light
 
-STEPS = ("orientation", "focus", "warm-up", "geometry", "uniformity", "photometry", "scale", "latency", "verify")
+STEPS = (
+    "orientation",
+    "focus",
+    "warm-up",
+    "geometry",
+    "uniformity",
+    "photometry",
+    "scale",
+    "latency",
+    "verify",
+)
 MAX_SIGMAS = 4.0
 # the file was wrong: any other end without a step is a fault of the program or the machine
 REFUSED_CODE = 2
@@ -35,7 +45,12 @@ PLACES = 41  # along each side of the screen
 DECADES = (1e-1, 1e-2, 1e-3)
 # Outcomes, the best first.
 VERIFIED, TOO_WIDE, REFUSED = "calibrated and verified", "calibrated, star too wide", "refused"
-NOT_VERIFIED, FAILED, LATER, WRONG = "calibrated, not verified", "step failed", "failed later", "wrong figure"
+NOT_VERIFIED, FAILED, LATER, WRONG = (
+    "calibrated, not verified",
+    "step failed",
+    "failed later",
+    "wrong figure",
+)
 HEAVY, TRACEBACK = "over 2 GB", "traceback"
 OUTCOMES = (VERIFIED, TOO_WIDE, REFUSED, NOT_VERIFIED, FAILED, LATER, HEAVY, WRONG, TRACEBACK)
 GOOD_OUTCOMES = (VERIFIED, TOO_WIDE, REFUSED)
@@ -91,13 +106,17 @@ class Comparison:
     sigmas: float | None = None
 
 
-def in_screen(monitor: Monitor, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+def in_screen(
+    monitor: Monitor, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Pixels of the screen that show pixels (n,) of the image."""
     width, height = monitor.resolution_px
     for _ in range(monitor.rotate_deg // 90):
         x_px, y_px = height - 1 - y_px, x_px
         width, height = height, width
-    return (width - 1 - x_px if monitor.flip_x else x_px), (height - 1 - y_px if monitor.flip_y else y_px)
+    return (width - 1 - x_px if monitor.flip_x else x_px), (
+        height - 1 - y_px if monitor.flip_y else y_px
+    )
 
 
 def in_image(monitor: Monitor, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -128,11 +147,15 @@ class SeenScreen:
         """The screen by both files, on a grid over what the true tracker sees of it."""
         tracker = tracker_camera(truth.config.tracker, truth.folder)
         width, height = truth.config.monitor.resolution_px
-        columns, rows = np.meshgrid(np.linspace(0, width - 1, PLACES), np.linspace(0, height - 1, PLACES))
+        columns, rows = np.meshgrid(
+            np.linspace(0, width - 1, PLACES), np.linspace(0, height - 1, PLACES)
+        )
         true_x, true_y = _tracker_px(truth, columns.ravel(), rows.ravel())
         inside = tracker.contains_px(true_x, true_y)
         if inside.sum() < PLACES:  # a small part of the screen: a grid over that
-            ends = tracker.rays(*np.meshgrid(*(np.linspace(0, size - 1, PLACES) for size in tracker.resolution_px)))
+            ends = tracker.rays(
+                *np.meshgrid(*(np.linspace(0, size - 1, PLACES) for size in tracker.resolution_px))
+            )
             camera = bench_camera(truth.config, truth.folder)
             columns, rows = camera.project(ends.reshape(-1, 3) @ camera.cam_to_image.T)
             on_screen = camera.contains_px(columns, rows)
@@ -142,7 +165,12 @@ class SeenScreen:
         columns, rows = columns.ravel()[inside], rows.ravel()[inside]
         own = in_image(bench.config.monitor, *in_screen(truth.config.monitor, columns, rows))
         bench_px = np.stack(_tracker_px(bench, *own))
-        return cls(bench_px, np.stack([true_x[inside], true_y[inside]]), _light(bench, *own), _light(truth, columns, rows))
+        return cls(
+            bench_px,
+            np.stack([true_x[inside], true_y[inside]]),
+            _light(bench, *own),
+            _light(truth, columns, rows),
+        )
 
     @property
     def off_px(self) -> FloatArray:
@@ -157,8 +185,13 @@ class SeenScreen:
         return np.asarray(magnitude(self.bench_light / self.truth_light))
 
 
-def _tracker_px(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    monitor, tracker = bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder)
+def _tracker_px(
+    file: BenchFile, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    monitor, tracker = (
+        bench_camera(file.config, file.folder),
+        tracker_camera(file.config.tracker, file.folder),
+    )
     return tracker.project(monitor.rays(x_px, y_px) @ tracker.cam_to_image.T)
 
 
@@ -180,13 +213,20 @@ def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> di
     compared: dict[str, Comparison] = {}
     if "focus" in done:
         found, error = done["focus"]["psf_sigma_px"], done["focus"]["psf_sigma_error_px"]
-        compared["focus"] = Comparison(found, drawn.detector.psf_px, _sigmas(found - drawn.detector.psf_px, error))
+        compared["focus"] = Comparison(
+            found, drawn.detector.psf_px, _sigmas(found - drawn.detector.psf_px, error)
+        )
     if "warm-up" in done:
-        found, error = done["warm-up"]["drift_percent_per_h"], done["warm-up"]["drift_error_percent_per_h"]
+        found, error = (
+            done["warm-up"]["drift_percent_per_h"],
+            done["warm-up"]["drift_error_percent_per_h"],
+        )
         compared["warm-up"] = Comparison(found, 0.0, _sigmas(found, error))
     if "latency" in done:
         found, planted = done["latency"]["panel_delay_ms"], drawn.mounting.delay_ms
-        compared["latency"] = Comparison(found, planted, _sigmas(found - planted, done["latency"]["error_ms"]))
+        compared["latency"] = Comparison(
+            found, planted, _sigmas(found - planted, done["latency"]["error_ms"])
+        )
     if "photometry" in done:
         compared |= _response(drawn, folder, done["photometry"])
     if not {"geometry", "uniformity", "scale"} & done.keys():
@@ -194,12 +234,18 @@ def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> di
     bench, truth = read_bench_file(folder / "bench.toml"), read_bench_file(folder / "truth.toml")
     screen = SeenScreen.of(bench, truth)
     if "geometry" in done:
-        arcsec_a_px = ARCSEC_PER_RAD / tracker_camera(truth.config.tracker, truth.folder).focal_length_px
+        arcsec_a_px = (
+            ARCSEC_PER_RAD / tracker_camera(truth.config.tracker, truth.folder).focal_length_px
+        )
         off_arcsec = float(np.sqrt(np.nanmean(screen.off_px**2))) * arcsec_a_px
-        compared["geometry"] = Comparison(off_arcsec, 0.0, _sigmas(off_arcsec, done["geometry"]["error_rms_arcsec"]))
+        compared["geometry"] = Comparison(
+            off_arcsec, 0.0, _sigmas(off_arcsec, done["geometry"]["error_rms_arcsec"])
+        )
     if "uniformity" in done:
         scatter = float(np.nanstd(screen.off_mag))
-        compared["uniformity"] = Comparison(scatter, 0.0, _sigmas(scatter, done["uniformity"]["map_error_mag"]))
+        compared["uniformity"] = Comparison(
+            scatter, 0.0, _sigmas(scatter, done["uniformity"]["map_error_mag"])
+        )
     if "scale" in done:
         off_mag = float(np.nanmean(screen.off_mag))
         compared["scale"] = Comparison(off_mag, 0.0, _sigmas(off_mag, done["scale"]["error_mag"]))
@@ -249,12 +295,18 @@ def held_by_certificate(found: Mapping[str, Any]) -> dict[str, tuple[int, int]]:
     return counts
 
 
-def outcome_of(results: Mapping[str, CommandResult], compared: Mapping[str, Comparison]) -> tuple[str, str]:
+def outcome_of(
+    results: Mapping[str, CommandResult], compared: Mapping[str, Comparison]
+) -> tuple[str, str]:
     """The outcome of a bench, and the words for it."""
-    return _fault(results, compared) or _first_day(results) or _afterwards(results) or (VERIFIED, "")
+    return (
+        _fault(results, compared) or _first_day(results) or _afterwards(results) or (VERIFIED, "")
+    )
 
 
-def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparison]) -> tuple[str, str] | None:
+def _fault(
+    results: Mapping[str, CommandResult], compared: Mapping[str, Comparison]
+) -> tuple[str, str] | None:
     """What must never happen: a traceback, a figure beyond its sigmas, a command that takes too
     much memory.
     """
@@ -263,7 +315,10 @@ def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparis
             return TRACEBACK, f"{name}: {result.last_line}"
     wrong = {name: one for name, one in compared.items() if abs(one.sigmas or 0.0) > MAX_SIGMAS}
     if wrong:
-        parts = (f"{name} {one.found:.4g}, not {one.planted:.4g}: {one.sigmas:+.1f} sigmas" for name, one in wrong.items())
+        parts = (
+            f"{name} {one.found:.4g}, not {one.planted:.4g}: {one.sigmas:+.1f} sigmas"
+            for name, one in wrong.items()
+        )
         return WRONG, "; ".join(parts)
     for name, result in results.items():
         if result.memory_mb > MAX_MEMORY_MB:
@@ -295,7 +350,11 @@ def _without_steps(session: CommandResult) -> tuple[str, str]:
     """A session that ended before its first step was recorded."""
     if session.code == REFUSED_CODE:
         return REFUSED, session.last_line
-    end = f"stopped after {session.seconds:.0f} s" if session.code is None else f"ended with {session.code}"
+    end = (
+        f"stopped after {session.seconds:.0f} s"
+        if session.code is None
+        else f"ended with {session.code}"
+    )
     return FAILED, f"{end}: {session.last_line}"
 
 
@@ -330,14 +389,35 @@ def row_of(drawn: DrawnBench, folder: Path, results: Mapping[str, CommandResult]
     row: dict[str, Any] = {"outcome": outcome, "words": words} | drawn.planted()
     for name in STEPS:
         step = steps.get(name, {})
-        row |= {f"{name}_verdict": step.get("verdict", ""), f"{name}_s": step.get("seconds"), f"{name}_line": step.get("line")}
-    for name in ("focus", "warm-up", "geometry", "uniformity", "photometry", "black", "scale", "latency"):
+        row |= {
+            f"{name}_verdict": step.get("verdict", ""),
+            f"{name}_s": step.get("seconds"),
+            f"{name}_line": step.get("line"),
+        }
+    for name in (
+        "focus",
+        "warm-up",
+        "geometry",
+        "uniformity",
+        "photometry",
+        "black",
+        "scale",
+        "latency",
+    ):
         one = compared.get(name)
         row[f"{name}_found"] = None if one is None else one.found
         row[f"{name}_planted"] = None if one is None else one.planted
         row[f"{name}_sigmas"] = None if one is None else one.sigmas
     held = held_by_certificate(results[CERTIFY].found) if CERTIFY in results else {}
-    for quantity in ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency"):
+    for quantity in (
+        "flux",
+        "place_along",
+        "place_across",
+        "attitude_x",
+        "attitude_y",
+        "attitude_z",
+        "latency",
+    ):
         counts = held.get(quantity)
         row[f"certified_{quantity}"] = None if counts is None else f"{counts[0]} of {counts[1]}"
     for name in COMMANDS:

@@ -42,7 +42,9 @@ POLL_S = 0.02
 MB = 1024.0  # of ru_maxrss, kB
 
 
-def run_bench(seed: int, number: int, folder: Path, limit_s: float = LIMIT_S, *, keep: bool = False) -> dict[str, Any]:
+def run_bench(
+    seed: int, number: int, folder: Path, limit_s: float = LIMIT_S, *, keep: bool = False
+) -> dict[str, Any]:
     """The row of a bench: taken from `folder` where it is there, else of the commands that are
     still to run.
     """
@@ -71,14 +73,22 @@ def _write_whole(path: Path, text: str) -> None:
 def _all_results(drawn: DrawnBench, folder: Path, limit_s: float) -> dict[str, CommandResult]:
     """All commands; those after a session that failed are not run."""
     virtual = ("--virtual", "truth.toml")
-    results = {FIRST_LIGHT: _result(folder, limit_s, FIRST_LIGHT, "bench.toml", "-o", SESSION, *virtual, "--json")}
+    results = {
+        FIRST_LIGHT: _result(
+            folder, limit_s, FIRST_LIGHT, "bench.toml", "-o", SESSION, *virtual, "--json"
+        )
+    }
     session = results[FIRST_LIGHT]
     steps = {step["name"]: step["verdict"] for step in session.found.get("steps", [])}
     if not steps or any(verdict == "failed" for name, verdict in steps.items() if name != "verify"):
         return results
     results[VERIFY] = _result(folder, limit_s, VERIFY, "bench.toml", "--json")
-    shutil.rmtree(folder / "certificate", ignore_errors=not (folder / RESULTS / f"{CERTIFY}.json").exists())
-    results[CERTIFY] = _result(folder, limit_s, CERTIFY, "bench.toml", "-o", "certificate", *virtual, "--quick", "--json")
+    shutil.rmtree(
+        folder / "certificate", ignore_errors=not (folder / RESULTS / f"{CERTIFY}.json").exists()
+    )
+    results[CERTIFY] = _result(
+        folder, limit_s, CERTIFY, "bench.toml", "-o", "certificate", *virtual, "--quick", "--json"
+    )
     results |= _live_results(drawn, folder, limit_s)
     if (folder / LEDGER).exists():
         results[ASSESS] = _result(folder, limit_s, ASSESS, LEDGER, "-o", "budget", "--json")
@@ -102,7 +112,9 @@ def _ended(folder: Path, limit_s: float, commands: dict[str, Sequence[str]]) -> 
     running: dict[str, subprocess.Popen[bytes]] = {}
     for name, words in commands.items():
         with (folder / f"{name}.out").open("wb") as out, (folder / f"{name}.err").open("wb") as err:
-            running[name] = subprocess.Popen([*HILSTAR, name, *words], cwd=folder, env=environment, stdout=out, stderr=err)
+            running[name] = subprocess.Popen(
+                [*HILSTAR, name, *words], cwd=folder, env=environment, stdout=out, stderr=err
+            )
     ended: dict[str, CommandResult] = {}
     stopped: set[str] = set()
     while len(ended) < len(running):
@@ -137,7 +149,10 @@ def _live_results(drawn: DrawnBench, folder: Path, limit_s: float) -> dict[str, 
     names = (SERVE, SEND, TRACKER)
     paths = [folder / RESULTS / f"{name}.json" for name in names]
     if all(path.exists() for path in paths):
-        return {name: CommandResult(**json.loads(path.read_text())) for name, path in zip(names, paths, strict=True)}
+        return {
+            name: CommandResult(**json.loads(path.read_text()))
+            for name, path in zip(names, paths, strict=True)
+        }
     attitude, frames, answers = (_free_port() for _ in range(3))
     tables = f'\n[attitude]\nendpoint = "tcp://127.0.0.1:{attitude}"\n'
     tables += f'\n[answers]\nsource = "udp"\nclock = "host"\nbind = "127.0.0.1:{answers}"\n'
@@ -146,12 +161,53 @@ def _live_results(drawn: DrawnBench, folder: Path, limit_s: float) -> dict[str, 
     turn_deg_s = min(TURN_PX_S * px_deg, MAX_TURN_DEG_S)
     bias = ",".join(f"{each * px_deg * 3600:.3f}" for each in BIAS_PX)
     watched = f"tcp://127.0.0.1:{frames}"
-    run = (LIVE, "--headless", "--duration", str(SERVED_S), "--frames", watched, "--ledger", LEDGER, "--overwrite", "--json")
-    spin = ("--spin", f"0.3,0.5,0.8,{turn_deg_s:.6f}", "--radec", "84.057,-1.2,0", "--rate", str(SEND_HZ))
-    sent = (*spin, "--to", f"tcp://127.0.0.1:{attitude}", "--duration", str(SERVED_S), "--wait", str(SENT_S), "--json")
-    looks = (LIVE, "--watch", watched, "--answer", f"udp://127.0.0.1:{answers}", "--solver", "truth")
+    run = (
+        LIVE,
+        "--headless",
+        "--duration",
+        str(SERVED_S),
+        "--frames",
+        watched,
+        "--ledger",
+        LEDGER,
+        "--overwrite",
+        "--json",
+    )
+    spin = (
+        "--spin",
+        f"0.3,0.5,0.8,{turn_deg_s:.6f}",
+        "--radec",
+        "84.057,-1.2,0",
+        "--rate",
+        str(SEND_HZ),
+    )
+    sent = (
+        *spin,
+        "--to",
+        f"tcp://127.0.0.1:{attitude}",
+        "--duration",
+        str(SERVED_S),
+        "--wait",
+        str(SENT_S),
+        "--json",
+    )
+    looks = (
+        LIVE,
+        "--watch",
+        watched,
+        "--answer",
+        f"udp://127.0.0.1:{answers}",
+        "--solver",
+        "truth",
+    )
     ended = _ended(
-        folder, limit_s, {SERVE: run, SEND: sent, TRACKER: (*looks, "--bias", bias, "--duration", str(TRACKED_S), "--json")}
+        folder,
+        limit_s,
+        {
+            SERVE: run,
+            SEND: sent,
+            TRACKER: (*looks, "--bias", bias, "--duration", str(TRACKED_S), "--json"),
+        },
     )
     return dict(zip(names, ended, strict=True))
 

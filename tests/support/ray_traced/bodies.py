@@ -129,7 +129,9 @@ def columns(body: Body, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     root = 1 - e2 * up[:, 2] ** 2
     meridian, across = a * (1 - e2) / root**1.5, a / root**0.5
     north = np.stack([np.zeros(len(d)), np.zeros(len(d)), np.ones(len(d))], axis=1) - up[:, 2:] * up
-    cos2 = np.einsum("ij,ij->i", along, north) ** 2 / np.maximum(np.einsum("ij,ij->i", north, north), 1e-12)
+    cos2 = np.einsum("ij,ij->i", along, north) ** 2 / np.maximum(
+        np.einsum("ij,ij->i", north, north), 1e-12
+    )
     radius = 1 / (cos2 / meridian + (1 - cos2) / across)
     table = _log_columns(body)
     return height, up, np.exp(np.interp(height, TABLE_KM, table)) * np.sqrt(radius / a)
@@ -169,7 +171,9 @@ def _above(places: np.ndarray, body: Body) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(HEIGHT_ROUNDS):
         cos_u = 1 / np.sqrt(1 + tan_u**2)
         sin_u = tan_u * cos_u
-        tan_phi = (z + (a * a - c * c) / c * sin_u**2 * sin_u) / (rho - (a * a - c * c) / a * cos_u**2 * cos_u)
+        tan_phi = (z + (a * a - c * c) / c * sin_u**2 * sin_u) / (
+            rho - (a * a - c * c) / a * cos_u**2 * cos_u
+        )
         tan_u = tan_phi * c / a
     cos_phi = 1 / np.sqrt(1 + tan_phi**2)
     sin_phi = tan_phi * cos_phi

@@ -18,7 +18,12 @@ BLOCK = 1 << 14  # rays at once: they stay in a cache
 
 
 def image(
-    body: Body, rays: Directions, resolution_px: tuple[int, int], rng: np.random.Generator, across: int = 4, at_limb: int = 24
+    body: Body,
+    rays: Directions,
+    resolution_px: tuple[int, int],
+    rng: np.random.Generator,
+    across: int = 4,
+    at_limb: int = 24,
 ) -> np.ndarray:
     """Of radiance times solid angle, each pixel's (height, width); `rays` gives the directions
     (n, 3) of pixels (n,), (n,).
@@ -75,7 +80,12 @@ def solid_angles(rays: Directions, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _sampled(
-    body: Body, rays: Directions, x: np.ndarray, y: np.ndarray, across: int, rng: np.random.Generator
+    body: Body,
+    rays: Directions,
+    x: np.ndarray,
+    y: np.ndarray,
+    across: int,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Mean, lowest and highest radiance of pixels (n,), and whether the limb crosses them."""
     cells = (np.arange(across) - (across - 1) / 2) / across
@@ -108,14 +118,19 @@ def _kernel(size: int, sigma_px: float) -> np.ndarray:
     """
 
     def twice(t: float) -> float:  # the integral of the integral of a Gaussian
-        return t * (1 + erf(t / (sigma_px * 2**0.5))) / 2 + sigma_px * np.exp(-((t / sigma_px) ** 2) / 2) / (2 * np.pi) ** 0.5
+        return (
+            t * (1 + erf(t / (sigma_px * 2**0.5))) / 2
+            + sigma_px * np.exp(-((t / sigma_px) ** 2) / 2) / (2 * np.pi) ** 0.5
+        )
 
     reach = [twice(n + 1.0) - 2 * twice(float(n)) + twice(n - 1.0) for n in range(size)]
     apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
     return np.array(reach)[apart]
 
 
-def edge_px(picture: np.ndarray, places: np.ndarray, outward: np.ndarray, reach_px: float = 5.0) -> np.ndarray:
+def edge_px(
+    picture: np.ndarray, places: np.ndarray, outward: np.ndarray, reach_px: float = 5.0
+) -> np.ndarray:
     """How far outward of places (n, 2) on a limb an image falls to half of what it has `reach_px`
     inside, px.
 

@@ -16,9 +16,18 @@ def kvn(rows, version="1.0", **keywords):
     meta = {"OBJECT_NAME": "X", "OBJECT_ID": "X", "REF_FRAME_A": "ICRF", "REF_FRAME_B": "SC_BODY_1"}
     if version == "1.0":
         meta |= {"ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "LAST"}
-    meta |= {"TIME_SYSTEM": "UTC", "START_TIME": EPOCHS[0], "STOP_TIME": EPOCHS[1], "ATTITUDE_TYPE": "QUATERNION"} | keywords
+    meta |= {
+        "TIME_SYSTEM": "UTC",
+        "START_TIME": EPOCHS[0],
+        "STOP_TIME": EPOCHS[1],
+        "ATTITUDE_TYPE": "QUATERNION",
+    } | keywords
     lines = [f"CCSDS_AEM_VERS = {version}", "CREATION_DATE = 2024-01-01T00:00:00", "ORIGINATOR = X"]
-    lines += ["META_START", *(f"{key} = {value}" for key, value in meta.items() if value is not None), "META_STOP"]
+    lines += [
+        "META_START",
+        *(f"{key} = {value}" for key, value in meta.items() if value is not None),
+        "META_STOP",
+    ]
     return "\n".join([*lines, "DATA_START", *rows, "DATA_STOP"]) + "\n"
 
 

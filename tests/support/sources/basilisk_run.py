@@ -46,7 +46,11 @@ def camera_message(camera: dict[str, Any], parent: str) -> messaging.CameraConfi
 def save_picture(viz: Any, stem: str) -> None:
     """What the camera's image message points to."""
     image = viz.opnavImageOutMsgs[0].read()
-    data = (ctypes.c_char * image.imageBufferLength).from_address(int(image.imagePointer)) if image.valid else b""
+    data = (
+        (ctypes.c_char * image.imageBufferLength).from_address(int(image.imagePointer))
+        if image.valid
+        else b""
+    )
     Path(f"{stem}-{image.timeTag}.png").write_bytes(bytes(data))
 
 
@@ -77,7 +81,12 @@ def run(scenario: dict[str, Any]) -> None:
         sim.ExecuteSimulation()
         if scenario.get("camera"):
             save_picture(viz, scenario["pictures"])
-    columns = {"t_ns": truth.times(), "sigma_bn": truth.sigma_BN, "omega_bn_b": truth.omega_BN_B, "v_bn_n": truth.v_BN_N}
+    columns = {
+        "t_ns": truth.times(),
+        "sigma_bn": truth.sigma_BN,
+        "omega_bn_b": truth.omega_BN_B,
+        "v_bn_n": truth.v_BN_N,
+    }
     columns["r_bn_n"] = truth.r_BN_N
     np.savez(scenario["truth"], **columns)
 

@@ -35,12 +35,19 @@ def report() -> dict[int, dict[str, FloatArray]]:
             for name, value in row.items():
                 stem = name.replace("_x", "").replace("_y", "").replace("_z", "").replace("_w", "")
                 columns.setdefault(stem, []).append(float(value))
-            rows[BEGIN_NS + round(columns.pop("t_s")[0] * 1e9)] = {name: np.array(each) for name, each in columns.items()}
+            rows[BEGIN_NS + round(columns.pop("t_s")[0] * 1e9)] = {
+                name: np.array(each) for name, each in columns.items()
+            }
     return rows
 
 
 def message(
-    seconds_of_day: float, n_to_b: Rotation, rate: FloatArray | None = None, *, old: bool = False, number: int = 0
+    seconds_of_day: float,
+    n_to_b: Rotation,
+    rate: FloatArray | None = None,
+    *,
+    old: bool = False,
+    number: int = 0,
 ) -> str:
     """A message of 8 April 2024: vectors turn from N to B by `n_to_b`; rate in B, rad/s. 42's q is
     then that of B to N.
@@ -52,6 +59,12 @@ def message(
     left, right, end = ("", "", "[EOF]\n\n") if old else ("[", "]", "[ENDMSG]\n")
     lines = [f"TIME 2024-099-{int(minute // 60):02d}:{int(minute % 60):02d}:{second:012.9f}\n"]
     if rate is not None:
-        lines.append(f"SC[{number}].B[0].wn = {left}" + " ".join(f"{c:18.12e}" for c in rate) + f"{right}\n")
-    lines.append(f"SC[{number}].B[0].qn = {left}" + " ".join(f"{c:18.12e}" for c in (x, y, z, w)) + f"{right}\n")
+        lines.append(
+            f"SC[{number}].B[0].wn = {left}" + " ".join(f"{c:18.12e}" for c in rate) + f"{right}\n"
+        )
+    lines.append(
+        f"SC[{number}].B[0].qn = {left}"
+        + " ".join(f"{c:18.12e}" for c in (x, y, z, w))
+        + f"{right}\n"
+    )
     return "".join(lines) + end

@@ -13,7 +13,12 @@ START_NS = utc_ns(STATION_UTC)
 STATION = TleOrbit(STATION_TLE, "station.tle")
 
 
-def segment(seconds: Iterable[float], ahead_s: float = 0.0, day_of_year: bool = False, **keywords: str | None) -> str:
+def segment(
+    seconds: Iterable[float],
+    ahead_s: float = 0.0,
+    day_of_year: bool = False,
+    **keywords: str | None,
+) -> str:
     """One segment of the station's orbit at these seconds after START_NS, in a scale that is so
     far ahead of UTC.
     """
@@ -30,7 +35,10 @@ def segment(seconds: Iterable[float], ahead_s: float = 0.0, day_of_year: bool = 
         stamp = np.datetime64(t_ns + round(ahead_s * 1e9), "ns")
         text = str(stamp)
         if day_of_year:
-            day = (stamp.astype("datetime64[D]") - stamp.astype("datetime64[Y]").astype("datetime64[D]")).astype(int) + 1
+            day = (
+                stamp.astype("datetime64[D]")
+                - stamp.astype("datetime64[Y]").astype("datetime64[D]")
+            ).astype(int) + 1
             text = f"{text[:4]}-{day:03d}{text[10:]}"
         place, velocity = STATION.state(t_ns)
         rows.append(" ".join([text, *(f"{number:.9f}" for number in (*place, *velocity))]))

@@ -37,7 +37,11 @@ Sent = tuple[str, str, int, Any]
 @functools.lru_cache
 def store(name: str) -> Typestore:
     """ROS's types of a release: noetic, humble, jazzy."""
-    stores = {"noetic": Stores.ROS1_NOETIC, "humble": Stores.ROS2_HUMBLE, "jazzy": Stores.ROS2_JAZZY}
+    stores = {
+        "noetic": Stores.ROS1_NOETIC,
+        "humble": Stores.ROS2_HUMBLE,
+        "jazzy": Stores.ROS2_JAZZY,
+    }
     types = get_typestore(stores[name])
     if name == "noetic":
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
@@ -55,7 +59,9 @@ class Make:
         return self.types[name](**fields)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        stamp = self._new("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        stamp = self._new(
+            "builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+        )
         counter = {"seq": 0} if self.release == "noetic" else {}
         return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **counter)
 
@@ -69,7 +75,9 @@ class Make:
 
     def pose(self, q: Numbers) -> Any:
         return self._new(
-            POSE, position=self._new("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0), orientation=self.quaternion(q)
+            POSE,
+            position=self._new("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0),
+            orientation=self.quaternion(q),
         )
 
     def transform(self, q: Numbers) -> Any:
@@ -77,12 +85,22 @@ class Make:
 
     def transform_stamped(self, stamp_ns: int, parent: str, child: str, q: Numbers) -> Any:
         head = self.header(stamp_ns, parent)
-        return self._new(TRANSFORM_STAMPED, header=head, child_frame_id=child, transform=self.transform(q))
+        return self._new(
+            TRANSFORM_STAMPED, header=head, child_frame_id=child, transform=self.transform(q)
+        )
 
     def tf(self, *transforms: Any) -> Any:
         return self._new(TF, transforms=list(transforms))
 
-    def imu(self, stamp_ns: int, frame: str, q: Numbers, rate: Numbers, covariance0: float = 0.01, rate0: float = 0.01) -> Any:
+    def imu(
+        self,
+        stamp_ns: int,
+        frame: str,
+        q: Numbers,
+        rate: Numbers,
+        covariance0: float = 0.01,
+        rate0: float = 0.01,
+    ) -> Any:
         return self._new(
             IMU,
             header=self.header(stamp_ns, frame),
@@ -95,19 +113,37 @@ class Make:
         )
 
     def odometry(self, stamp_ns: int, frame: str, child: str, q: Numbers, rate: Numbers) -> Any:
-        pose = self._new("geometry_msgs/msg/PoseWithCovariance", pose=self.pose(q), covariance=np.zeros(36))
-        twist = self._new("geometry_msgs/msg/Twist", linear=self.vector((1, 0, 0)), angular=self.vector(rate))
-        twists = self._new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36))
-        return self._new(ODOMETRY, header=self.header(stamp_ns, frame), child_frame_id=child, pose=pose, twist=twists)
+        pose = self._new(
+            "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(q), covariance=np.zeros(36)
+        )
+        twist = self._new(
+            "geometry_msgs/msg/Twist", linear=self.vector((1, 0, 0)), angular=self.vector(rate)
+        )
+        twists = self._new(
+            "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+        )
+        return self._new(
+            ODOMETRY,
+            header=self.header(stamp_ns, frame),
+            child_frame_id=child,
+            pose=pose,
+            twist=twists,
+        )
 
-    def of(self, kind: str, stamp_ns: int, frame: str, child: str, q: Numbers, rate: Numbers) -> Any:
+    def of(
+        self, kind: str, stamp_ns: int, frame: str, child: str, q: Numbers, rate: Numbers
+    ) -> Any:
         """A message of any of the types, with the same orientation of `child` in `frame`."""
         with_covariance = "geometry_msgs/msg/PoseWithCovariance"
         makers: dict[str, Callable[[], Any]] = {
             Q: lambda: self.quaternion(q),
-            QUATERNION_STAMPED: lambda: self._new(kind, header=self.header(stamp_ns, frame), quaternion=self.quaternion(q)),
+            QUATERNION_STAMPED: lambda: self._new(
+                kind, header=self.header(stamp_ns, frame), quaternion=self.quaternion(q)
+            ),
             POSE: lambda: self.pose(q),
-            POSE_STAMPED: lambda: self._new(kind, header=self.header(stamp_ns, frame), pose=self.pose(q)),
+            POSE_STAMPED: lambda: self._new(
+                kind, header=self.header(stamp_ns, frame), pose=self.pose(q)
+            ),
             POSE_COVARIANCE: lambda: self._new(
                 kind,
                 header=self.header(stamp_ns, frame),
@@ -123,7 +159,10 @@ class Make:
 
 
 def write_bag1(
-    path: Path, sent: Iterable[Sent], compression: Literal["none", "bz2", "lz4"] = "none", chunk: int = 1 << 16
+    path: Path,
+    sent: Iterable[Sent],
+    compression: Literal["none", "bz2", "lz4"] = "none",
+    chunk: int = 1 << 16,
 ) -> Path:
     """A bag of ROS 1."""
     types = store("noetic")
@@ -149,7 +188,9 @@ def write_bag2(
 ) -> Path:
     """The directory of a bag of ROS 2."""
     types = store(release)
-    writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3)
+    writer = Writer2(
+        path, version=9, storage_plugin=StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    )
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     connections: dict[tuple[str, str], Any] = {}
     with writer:
@@ -186,7 +227,11 @@ def write_mcap(
                 name = kind if version == 2 else kind.replace("/msg/", "/")
                 schema = writer.register_schema(name, encodings[0], text.encode())
                 channels[topic, kind] = writer.register_channel(topic, encodings[1], schema)
-            data = types.serialize_cdr(message, kind) if version == 2 else types.serialize_ros1(message, kind)
+            data = (
+                types.serialize_cdr(message, kind)
+                if version == 2
+                else types.serialize_ros1(message, kind)
+            )
             writer.add_message(channels[topic, kind], time_ns, bytes(data), time_ns)
         writer.finish()
     return path

@@ -93,7 +93,9 @@ class Motion:
         self._spin_rad_s = 0.02
 
     def turn(self, seconds):
-        swing = Rotation.from_rotvec(self._swing_rad * np.sin(self._swing_rad_s * seconds) * np.array([1.0, 0.0, 0.0]))
+        swing = Rotation.from_rotvec(
+            self._swing_rad * np.sin(self._swing_rad_s * seconds) * np.array([1.0, 0.0, 0.0])
+        )
         spin = Rotation.from_rotvec(self._spin_rad_s * seconds * np.array([0.0, 0.6, 0.8]))
         return self._first * swing * self._axis * spin
 
@@ -101,7 +103,11 @@ class Motion:
         """rad/s in the structure's components, by a difference of fourth order: h^4 w^5 / 30 =
         1e-15, rounding 1e-13.
         """
-        one, two = ((self.turn(seconds - n * h).inv() * self.turn(seconds + n * h)).as_rotvec() / (2 * n * h) for n in (1, 2))
+        one, two = (
+            (self.turn(seconds - n * h).inv() * self.turn(seconds + n * h)).as_rotvec()
+            / (2 * n * h)
+            for n in (1, 2)
+        )
         return (4 * one - two) / 3
 
     def quaternion(self, seconds):
@@ -132,7 +138,9 @@ def new_ck(path):
         spiceypy.ckcls(handle)
 
 
-def write_segment(handle, kind, motion, times, body=BODY, reference="J2000", rates=True, starts=None, subtype=1):
+def write_segment(
+    handle, kind, motion, times, body=BODY, reference="J2000", rates=True, starts=None, subtype=1
+):
     """One segment of a type at times in seconds; `starts` are those of the intervals that it
     interpolates in.
     """
@@ -162,7 +170,9 @@ def packets_of(motion, times, subtype):
     q_dot = np.array([(motion.quaternion(t + h) * _sign(motion, t + h, p) - motion.quaternion(t - h) * _sign(motion, t - h, p))
                       / (2 * h) for t, p in zip(times, q, strict=True)])  # fmt: skip
     rate = np.array([motion.reference_rate(t) for t in times])
-    bend = np.array([(motion.reference_rate(t + h) - motion.reference_rate(t - h)) / (2 * h) for t in times])
+    bend = np.array(
+        [(motion.reference_rate(t + h) - motion.reference_rate(t - h)) / (2 * h) for t in times]
+    )
     return {
         0: np.hstack([q, q_dot]),
         1: q,
@@ -184,7 +194,18 @@ def write_type_2(handle, steps, body=BODY, reference="J2000"):
     rate = np.array([step[3] for step in steps])
     s_per_tick = np.full(len(steps), 1.0 / TICKS_PER_S)
     spiceypy.ckw02(
-        handle, starts[0], stops[-1], body, reference, "made by a test", len(steps), starts, stops, q, rate, s_per_tick
+        handle,
+        starts[0],
+        stops[-1],
+        body,
+        reference,
+        "made by a test",
+        len(steps),
+        starts,
+        stops,
+        q,
+        rate,
+        s_per_tick,
     )
 
 
@@ -219,7 +240,9 @@ def write_texts(folder, **texts):
     """Text kernels beside a CK: leap seconds and the clock, unless `texts` (file stem to text)
     says otherwise.
     """
-    files = {"leap.tls": LEAP_SECONDS, "clock.tsc": clock_kernel()} | {name.replace("_", "."): t for name, t in texts.items()}
+    files = {"leap.tls": LEAP_SECONDS, "clock.tsc": clock_kernel()} | {
+        name.replace("_", "."): t for name, t in texts.items()
+    }
     for name, text in files.items():
         if text is not None:
             (folder / name).write_text(text)

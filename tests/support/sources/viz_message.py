@@ -56,7 +56,10 @@ def _library() -> dict[str, type[Any]]:
                 made.type = getattr(kinds, f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"viz.{name}")) for name in FIELDS}
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"viz.{name}"))
+        for name in FIELDS
+    }
 
 
 _CLASSES = _library()
@@ -70,7 +73,9 @@ def viz_message(
     bodies: list[dict[str, Any]] | None = None,
 ) -> bytes:
     """A VizMessage; without a time where `t_ns` is None."""
-    whole = _CLASSES["VizMessage"](spacecraft=spacecraft or [], cameras=cameras or [], celestialBodies=bodies or [])
+    whole = _CLASSES["VizMessage"](
+        spacecraft=spacecraft or [], cameras=cameras or [], celestialBodies=bodies or []
+    )
     if t_ns is not None:
         whole.currentTime.frameNumber, whole.currentTime.simTimeElapsed = frame, t_ns
     return whole.SerializeToString()
@@ -78,4 +83,9 @@ def viz_message(
 
 def craft(name: str = "sat", sigma: Any = (0.1, 0.2, 0.3), **more: Any) -> dict[str, Any]:
     """A spacecraft of such a message."""
-    return {"spacecraftName": name, "rotation": list(sigma), "position": [7e6, 0, 0], "velocity": [0, 7.5e3, 0]} | more
+    return {
+        "spacecraftName": name,
+        "rotation": list(sigma),
+        "position": [7e6, 0, 0],
+        "velocity": [0, 7.5e3, 0],
+    } | more

@@ -37,7 +37,9 @@ class Cable:
             path.unlink(missing_ok=True)
             path.symlink_to(os.ttyname(slave))
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._relay, args=(*self._masters, self._stop), daemon=True)
+        self._thread = threading.Thread(
+            target=self._relay, args=(*self._masters, self._stop), daemon=True
+        )
         self._thread.start()
 
     @staticmethod
@@ -61,6 +63,11 @@ class Cable:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         if self._masters:
             self.pull()

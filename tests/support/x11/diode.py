@@ -22,8 +22,15 @@ class Diode:
     late.
     """
 
-    def __init__(self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
-        self._file, self._line, self._added_s, self._device = screen.file, line, added_ms / 1e3, device_clock
+    def __init__(
+        self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False
+    ) -> None:
+        self._file, self._line, self._added_s, self._device = (
+            screen.file,
+            line,
+            added_ms / 1e3,
+            device_clock,
+        )
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -32,7 +39,10 @@ class Diode:
             self._watch()
 
     def _watch(self) -> None:
-        with self._file.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as frame:
+        with (
+            self._file.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as frame,
+        ):
             head = np.frombuffer(frame[:100], ">u4")
             begin, height, row_bytes, colours = (int(head[k]) for k in (0, 5, 12, 19))
             place = begin + 12 * colours + (height - 4) * row_bytes + 4 * 4
@@ -42,7 +52,11 @@ class Diode:
                 if (frame[place] > 127) != level:
                     seen_s = time.monotonic()
                     level = not level
-                    stamp = f",{(seen_s - started_s + 1000 + self._added_s) * 1e6:.0f}" if self._device else ""
+                    stamp = (
+                        f",{(seen_s - started_s + 1000 + self._added_s) * 1e6:.0f}"
+                        if self._device
+                        else ""
+                    )
                     # the line itself is late, the stamp is not
                     time.sleep(0.001 if self._device else self._added_s)
                     os.write(out, f"{int(level)}{stamp}\n".encode())

@@ -71,14 +71,21 @@ class Client:
         code = self._x11.XKeysymToKeycode(self._display, self._x11.XStringToKeysym(key.encode()))
         for kind in (KEY_PRESS, KEY_RELEASE):
             event = Event()
-            event.key = KeyEvent(kind, 0, 1, self._display, self.window(), self._root, 0, 0, (1, 1, 1, 1), 0, code, 1)
+            event.key = KeyEvent(
+                kind, 0, 1, self._display, self.window(), self._root, 0, 0, (1, 1, 1, 1), 0, code, 1
+            )
             self._send(event, KEY_MASKS[kind])
 
     def close_window(self) -> None:
         """As a window manager's close button does (ICCCM, WM_DELETE_WINDOW)."""
-        protocols, delete = (self._x11.XInternAtom(self._display, name, 0) for name in (b"WM_PROTOCOLS", b"WM_DELETE_WINDOW"))
+        protocols, delete = (
+            self._x11.XInternAtom(self._display, name, 0)
+            for name in (b"WM_PROTOCOLS", b"WM_DELETE_WINDOW")
+        )
         event = Event()
-        event.client = ClientMessage(CLIENT_MESSAGE, 0, 1, self._display, self.window(), protocols, 32, (delete, 0, 0, 0, 0))
+        event.client = ClientMessage(
+            CLIENT_MESSAGE, 0, 1, self._display, self.window(), protocols, 32, (delete, 0, 0, 0, 0)
+        )
         self._send(event, 0)
 
     def unmap(self) -> None:
@@ -98,7 +105,9 @@ class Client:
 
     def cover(self, width: int, height: int) -> int:
         """A window of ours over the corner of the screen."""
-        window = self._x11.XCreateSimpleWindow(self._display, self._root, 0, 0, width, height, 0, 0, 0)
+        window = self._x11.XCreateSimpleWindow(
+            self._display, self._root, 0, 0, width, height, 0, 0, 0
+        )
         self._x11.XMapRaised(self._display, window)
         self._x11.XSync(self._display, 0)
         return window
@@ -142,7 +151,11 @@ def client(display: str) -> Iterator[Client]:
         ("XMapWindow", ctypes.c_int, [pointer, number]),
         ("XMapRaised", ctypes.c_int, [pointer, number]),
         ("XMoveWindow", ctypes.c_int, [pointer, number, ctypes.c_int, ctypes.c_int]),
-        ("XCreateSimpleWindow", number, [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2]),
+        (
+            "XCreateSimpleWindow",
+            number,
+            [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2],
+        ),
         ("XKillClient", ctypes.c_int, [pointer, number]),
         ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
     ):

@@ -48,7 +48,9 @@ class Screen:
         data = self.file.read_bytes()
         head = np.frombuffer(data[:100], ">u4")
         begin, width, height, row_bytes, colours = (int(head[k]) for k in (0, 4, 5, 12, 19))
-        pixels = np.frombuffer(data, np.uint8, count=row_bytes * height, offset=begin + 12 * colours)
+        pixels = np.frombuffer(
+            data, np.uint8, count=row_bytes * height, offset=begin + 12 * colours
+        )
         return pixels.reshape(height, row_bytes // 4, 4)[:, :width, 2::-1]
 
 
@@ -58,7 +60,19 @@ def xvfb(folder: Path, screen: str = SCREEN) -> Iterator[Screen]:
     free.
     """
     read, write = os.pipe()
-    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", screen, "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
+    command = [
+        "Xvfb",
+        "-displayfd",
+        str(write),
+        "-screen",
+        "0",
+        screen,
+        "-fbdir",
+        str(folder),
+        "-nolisten",
+        "tcp",
+        "-noreset",
+    ]
     with (folder / "server.log").open("wb") as told:
         process = subprocess.Popen(command, pass_fds=(write,), stdout=told, stderr=told)
     os.close(write)
@@ -80,8 +94,17 @@ class Shown:
     """`hilstar replay` of one attitude in a window, until it is stopped."""
 
     def __init__(self, screen: Screen, bench_file: Path, *options: str) -> None:
-        command = [*HILSTAR, "replay", str(bench_file), str(bench_file.parent / "still.csv"), "--json", *options]
-        self._process = Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env)
+        command = [
+            *HILSTAR,
+            "replay",
+            str(bench_file),
+            str(bench_file.parent / "still.csv"),
+            "--json",
+            *options,
+        ]
+        self._process = Started(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env
+        )
         self._screen = screen
 
     def __enter__(self) -> Shown:
@@ -123,7 +146,10 @@ def codes_of(bench_file: Path) -> np.ndarray:
     3).
     """
     path = bench_file.parent / "codes.png"
-    assert run_hilstar_here("frame", bench_file, "--quaternion", ATTITUDE, "--codes", path).returncode == 0
+    assert (
+        run_hilstar_here("frame", bench_file, "--quaternion", ATTITUDE, "--codes", path).returncode
+        == 0
+    )
     with Image.open(path) as picture:
         codes = np.array(picture)
     return codes if codes.ndim == 3 else np.repeat(codes[:, :, None], 3, axis=2)
@@ -139,7 +165,9 @@ def lines_over(codes: np.ndarray, keys: str) -> np.ndarray:
     dx, dy = columns - 320, rows - 240
     wanted = codes.copy()
     if "g" in keys:
-        wanted[(dx % 100 == 0) | (dy % 100 == 0)] = np.maximum(96, wanted[(dx % 100 == 0) | (dy % 100 == 0)])
+        wanted[(dx % 100 == 0) | (dy % 100 == 0)] = np.maximum(
+            96, wanted[(dx % 100 == 0) | (dy % 100 == 0)]
+        )
     if "c" in keys:
         wanted[(dx == 0) | (dy == 0)] = np.maximum(96, wanted[(dx == 0) | (dy == 0)])
     return wanted

@@ -65,7 +65,12 @@ class Xorg:
     def xrandr(self, *words: str) -> str:
         """What xrandr says to these words."""
         result = subprocess.run(
-            ["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            ["xrandr", *words],
+            env=self.env,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
         )
         assert result.returncode == 0, result.stderr
         if "--output" in words:
@@ -80,24 +85,53 @@ class Xorg:
         return float(match[1])
 
     @contextmanager
-    def property(self, output: str, name: str, value: str | bytes | tuple[int, ...]) -> Iterator[None]:
+    def property(
+        self, output: str, name: str, value: str | bytes | tuple[int, ...]
+    ) -> Iterator[None]:
         """An output with a property, as a driver gives it: a word (an atom), bytes, or integers
         of 32 bits.
         """
         x11, xrandr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
         pointer, number = ctypes.c_void_p, ctypes.c_ulong
         x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = pointer, [ctypes.c_char_p]
-        x11.XInternAtom.restype, x11.XInternAtom.argtypes = number, [pointer, ctypes.c_char_p, ctypes.c_int]
+        x11.XInternAtom.restype, x11.XInternAtom.argtypes = (
+            number,
+            [pointer, ctypes.c_char_p, ctypes.c_int],
+        )
         x11.XSync.argtypes, x11.XCloseDisplay.argtypes = [pointer, ctypes.c_int], [pointer]
-        xrandr.XRRConfigureOutputProperty.argtypes = [pointer, number, number, *[ctypes.c_int] * 3, pointer]
-        xrandr.XRRChangeOutputProperty.argtypes = [pointer, number, number, number, *[ctypes.c_int] * 2, pointer, ctypes.c_int]
+        xrandr.XRRConfigureOutputProperty.argtypes = [
+            pointer,
+            number,
+            number,
+            *[ctypes.c_int] * 3,
+            pointer,
+        ]
+        xrandr.XRRChangeOutputProperty.argtypes = [
+            pointer,
+            number,
+            number,
+            number,
+            *[ctypes.c_int] * 2,
+            pointer,
+            ctypes.c_int,
+        ]
         xrandr.XRRDeleteOutputProperty.argtypes = [pointer, number, number]
-        identifier = int(self.xrandr("--verbose").split(f"{output} connected")[1].split("Identifier:")[1].split()[0], 16)
+        identifier = int(
+            self.xrandr("--verbose")
+            .split(f"{output} connected")[1]
+            .split("Identifier:")[1]
+            .split()[0],
+            16,
+        )
         display = x11.XOpenDisplay(self.display.encode())
         atom = x11.XInternAtom(display, name.encode(), 0)
         match value:
             case str():
-                kind, form, items = XA_ATOM, 32, (ctypes.c_long * 1)(x11.XInternAtom(display, value.encode(), 0))
+                kind, form, items = (
+                    XA_ATOM,
+                    32,
+                    (ctypes.c_long * 1)(x11.XInternAtom(display, value.encode(), 0)),
+                )
             case bytes():
                 kind, form, items = XA_INTEGER, 8, (ctypes.c_ubyte * len(value))(*value)
             case _:
@@ -128,9 +162,21 @@ def xorg(folder: Path) -> Iterator[Xorg]:
     config, log = folder / "xorg.conf", folder / "xorg.log"
     config.write_text(SERVER_CONFIG)
     read, write = os.pipe()
-    command = ["Xorg", "-displayfd", str(write), "-config", str(config), "-logfile", str(log), "-noreset", "-novtswitch"]
+    command = [
+        "Xorg",
+        "-displayfd",
+        str(write),
+        "-config",
+        str(config),
+        "-logfile",
+        str(log),
+        "-noreset",
+        "-novtswitch",
+    ]
     with (folder / "xorg.out").open("wb") as told:
-        process = subprocess.Popen([*command, "-nolisten", "tcp"], pass_fds=(write,), stdout=told, stderr=told)
+        process = subprocess.Popen(
+            [*command, "-nolisten", "tcp"], pass_fds=(write,), stdout=told, stderr=told
+        )
     os.close(write)
     try:
         with os.fdopen(read) as number:

@@ -9,9 +9,25 @@ import pytest
 
 from hilstar.attitude.clock.sender_clock import MIN_EXCHANGES, Exchange
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.receiver import ASK_NS, FIRST_ASKS, QUICK_ASK_NS, QUIET, BackChannel, Receiver, Traffic
+from hilstar.attitude.receiver import (
+    ASK_NS,
+    FIRST_ASKS,
+    QUICK_ASK_NS,
+    QUIET,
+    BackChannel,
+    Receiver,
+    Traffic,
+)
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Status, TimeReply, TimeRequest, encode
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Event,
+    Packet,
+    Status,
+    TimeReply,
+    TimeRequest,
+    encode,
+)
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
@@ -51,7 +67,9 @@ def test_statuses_leave_at_their_rate_and_only_the_newest():
     for k in range(100):  # frames at 100 Hz
         back.post(status(k))
         back.talk(NOW_NS + k * NS_PER_S // 100, ask=True)
-    assert [packet.frame for packet in link.sent if isinstance(packet, Status)] == list(range(0, 100, 10))
+    assert [packet.frame for packet in link.sent if isinstance(packet, Status)] == list(
+        range(0, 100, 10)
+    )
 
 
 def test_a_status_that_never_left_hands_on_what_is_told_once():
@@ -108,7 +126,9 @@ def test_a_reply_completes_its_own_request_once_on_continuous_times():
 
 def test_a_request_of_the_sender_is_answered_with_its_own_time_and_the_arrival():
     link = Wire()
-    BackChannel(link, QUIET, lambda: NOW_NS).answer(request := TimeRequest(3, 4), Arrival(5, request))
+    BackChannel(link, QUIET, lambda: NOW_NS).answer(
+        request := TimeRequest(3, 4), Arrival(5, request)
+    )
     assert link.sent == [TimeReply(3, 4, 5, NOW_NS)]
 
 
@@ -125,12 +145,16 @@ class Answering(Wire):
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         self.now_ns += NS_PER_MS
         self._sequence += 1
-        sample = AttitudeSample(self.now_ns + SENDER_AHEAD_NS, np.array([1.0, 0.0, 0.0, 0.0]), None, self._sequence)
+        sample = AttitudeSample(
+            self.now_ns + SENDER_AHEAD_NS, np.array([1.0, 0.0, 0.0, 0.0]), None, self._sequence
+        )
         arrived: list[Arrival[Event]] = [Arrival(self.now_ns, sample, encode(sample))]
         for packet in self.sent:
             if isinstance(packet, TimeRequest):
                 t_ns = self.now_ns + SENDER_AHEAD_NS
-                arrived.append(Arrival(self.now_ns, TimeReply(packet.sequence, packet.t1_ns, t_ns, t_ns), b""))
+                arrived.append(
+                    Arrival(self.now_ns, TimeReply(packet.sequence, packet.t1_ns, t_ns, t_ns), b"")
+                )
                 self.answered += 1
         self.sent.clear()
         return arrived

@@ -114,11 +114,17 @@ class Run:
     """
 
     def __init__(
-        self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, unix_offset=HOST_CLOCK.unix_offset, **script
+        self,
+        make: Callable[[int], list[Arrival]],
+        traffic: Traffic | None = None,
+        unix_offset=HOST_CLOCK.unix_offset,
+        **script,
     ) -> None:
         clock = Clock()
         self.host0_ns = clock.now_ns + LEAD_NS
-        arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
+        arrivals = sorted(
+            make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns)
+        )
         self.notices = Notices()
         self.told: list[Notice] = []
         self.received_when_told = 0
@@ -128,7 +134,9 @@ class Run:
         self.shown: list[np.ndarray] = []
         self.link = Script(arrivals, clock, self._look, **script)
         kept = {"now_ns": clock, "unix_offset": unix_offset}
-        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices, **kept)
+        self.receiver = Receiver(
+            self.link, self.timeline, traffic or Traffic(), notices=self.notices, **kept
+        )
         self.receiver.learn()
         if self.link.fails:
             self._run_on_its_thread(clock)
@@ -180,7 +188,9 @@ def test_a_sender_that_hangs_is_stale_and_taken_up_again_at_once(repeat_hz, same
         repeats = []
         for k, after_ns in enumerate(hung_s):
             turned = propagate(last.q_icrs_to_cam, np.array([0, 0, 1e-3]), 0.0 if same else k)
-            sample = AttitudeSample(last.t_ns, turned, np.zeros(3), last.sequence if same else last.sequence + 1 + k)
+            sample = AttitudeSample(
+                last.t_ns, turned, np.zeros(3), last.sequence if same else last.sequence + 1 + k
+            )
             repeats.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
         if not same:
             good[400:] = Sender(first=400 + len(hung_s)).packets(t0, seconds(4, 5))
@@ -204,7 +214,9 @@ def test_a_clock_that_goes_on_from_where_it_stood_is_taken_up_and_is_no_jump():
         stopped = Sender().packets(t0, seconds(0, 3))
         last = stopped[-1].event
         stood = [Arrival(t0 + ns, last, stopped[-1].raw) for ns in seconds(3, 5)]
-        return stopped + stood + Sender(first=600, offset_ns=-2 * NS_PER_S).packets(t0, seconds(5, 7))
+        return (
+            stopped + stood + Sender(first=600, offset_ns=-2 * NS_PER_S).packets(t0, seconds(5, 7))
+        )
 
     run = Run(make)
     assert run.receiver.jumps.jumps == 0
@@ -218,7 +230,9 @@ def test_bursts_of_one_old_packet_change_nothing(old_s):
     def make(t0: int) -> list[Arrival]:
         good = Sender().packets(t0, seconds(0, 6))
         old = good[round((4.5 - old_s) * 200)]
-        return good + [Arrival(t0 + 4_502_000_000 + k * 20_000, old.event, old.raw) for k in range(50)]
+        return good + [
+            Arrival(t0 + 4_502_000_000 + k * 20_000, old.event, old.raw) for k in range(50)
+        ]
 
     run = Run(make)
     assert run.accepted == 1200
@@ -237,7 +251,8 @@ def test_of_two_senders_the_first_is_shown_and_the_other_refused(counts, first):
     """The second begins after two seconds, on the same clock, and ends after six."""
     run = Run(
         lambda t0: (
-            Sender(counts=counts).packets(t0, seconds(0, 8)) + late_sender(first, counts).packets(t0 + 2_300_000, seconds(2, 6))
+            Sender(counts=counts).packets(t0, seconds(0, 8))
+            + late_sender(first, counts).packets(t0 + 2_300_000, seconds(2, 6))
         )
     )
     assert run.events["second-sender"] == 1
@@ -254,7 +269,9 @@ def test_of_two_senders_the_first_is_shown_and_the_other_refused(counts, first):
 def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept_out(offset_s):
     def make(t0: int) -> list[Arrival]:
         other = late_sender(100_000, offset_ns=offset_s * NS_PER_S)
-        return Sender().packets(t0, seconds(0, 6, 20_000_000)) + other.packets(t0 + 2_300_000, seconds(3, 6))
+        return Sender().packets(t0, seconds(0, 6, 20_000_000)) + other.packets(
+            t0 + 2_300_000, seconds(3, 6)
+        )
 
     run = Run(make)
     assert run.events["second-sender"] == 1
@@ -265,7 +282,9 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
 
 def in_bursts(found: list[Arrival], burst: int) -> list[Arrival]:
     """The same messages, so many of them sent together when the last of them is due."""
-    last = [found[min(k // burst * burst + burst, len(found)) - 1].host_ns for k in range(len(found))]
+    last = [
+        found[min(k // burst * burst + burst, len(found)) - 1].host_ns for k in range(len(found))
+    ]
     return [replace(each, host_ns=last[k] + k % burst * 30_000) for k, each in enumerate(found)]
 
 
@@ -274,7 +293,9 @@ def beside(first: Sender, second: Sender, burst: int) -> Callable[[int], list[Ar
 
     def make(t0: int) -> list[Arrival]:
         apart_ns = burst * PERIOD_NS // 3
-        one, other = (each.packets(t0 + k * apart_ns, seconds(0, 3)) for k, each in enumerate((first, second)))
+        one, other = (
+            each.packets(t0 + k * apart_ns, seconds(0, 3)) for k, each in enumerate((first, second))
+        )
         return in_bursts(one, burst) + in_bursts(other, burst)
 
     return make
@@ -284,14 +305,19 @@ A_DAY_NS = 86_400 * NS_PER_S
 
 
 @pytest.mark.parametrize("burst", [1, 2, 3, 10])
-@pytest.mark.parametrize("offset_ns", [0, 1, 7 * NS_PER_MS, 300 * NS_PER_MS, 3 * A_DAY_NS, -NS_PER_S, -3 * A_DAY_NS])
+@pytest.mark.parametrize(
+    "offset_ns", [0, 1, 7 * NS_PER_MS, 300 * NS_PER_MS, 3 * A_DAY_NS, -NS_PER_S, -3 * A_DAY_NS]
+)
 def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, offset_ns):
     """Equal counters, two skies, clocks that are nanoseconds or days apart: the second one is
     never shown.
     """
     run = Run(beside(Sender(), Sender(LYRA, offset_ns=offset_ns), burst))
     assert run.events == {"second-sender": 1}
-    assert (run.accepted, run.counts.refused_by["source"] + run.counts.refused_by["time"]) == (600, 600)
+    assert (run.accepted, run.counts.refused_by["source"] + run.counts.refused_by["time"]) == (
+        600,
+        600,
+    )
     assert max(abs(q @ LYRA) for q in run.shown) < 0.99
     told = next(notice for notice in run.told if notice.kind == "second-sender")
     assert run.received_when_told < 2 * NS_PER_S // PERIOD_NS, told  # a second of both
@@ -302,7 +328,11 @@ def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, 
 def test_two_senders_of_one_sky_and_two_clocks_are_two(burst, offset_ns):
     run = Run(beside(Sender(), Sender(offset_ns=offset_ns), burst))
     assert run.events == {"second-sender": 1}
-    assert (run.accepted, run.counts.refused_by["source"], run.receiver.jumps.jumps) == (600, 600, 0)
+    assert (run.accepted, run.counts.refused_by["source"], run.receiver.jumps.jumps) == (
+        600,
+        600,
+        0,
+    )
 
 
 @pytest.mark.parametrize("counts", [True, False])
@@ -316,7 +346,9 @@ def test_one_sender_that_mixes_packets_and_json_is_one(burst, counts):
         for k, after_ns in enumerate(seconds(0, 4)):
             q = propagate(ORION, rate, after_ns / NS_PER_S)
             as_json = k // burst % 2
-            sample = AttitudeSample(t0 + after_ns, q, None if as_json else rate, (k if counts else 0) if as_json else k)
+            sample = AttitudeSample(
+                t0 + after_ns, q, None if as_json else rate, (k if counts else 0) if as_json else k
+            )
             found.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
         return found
 
@@ -345,7 +377,9 @@ def test_a_sender_that_restarts_takes_over(pause_s, offset_s, q):
 def test_the_first_sender_that_pauses_gives_way_and_is_the_second_when_it_resumes(offset_ns):
     def make(t0: int) -> list[Arrival]:
         first = Sender().packets(t0, seconds(0, 2)) + Sender(first=800).packets(t0, seconds(4, 6))
-        return in_bursts(first, 3) + in_bursts(Sender(LYRA, offset_ns=offset_ns).packets(t0 + 8_000_000, seconds(0, 6)), 3)
+        return in_bursts(first, 3) + in_bursts(
+            Sender(LYRA, offset_ns=offset_ns).packets(t0 + 8_000_000, seconds(0, 6)), 3
+        )
 
     run = Run(make)
     assert run.events["second-sender"] == 2
@@ -357,7 +391,10 @@ def test_the_first_sender_that_pauses_gives_way_and_is_the_second_when_it_resume
 
 def test_the_other_sender_is_taken_up_when_the_first_falls_silent():
     run = Run(
-        lambda t0: Sender().packets(t0, seconds(0, 4)) + late_sender(9).packets(t0 + 2_300_000, seconds(2, 6)),
+        lambda t0: (
+            Sender().packets(t0, seconds(0, 4))
+            + late_sender(9).packets(t0 + 2_300_000, seconds(2, 6))
+        ),
     )
     assert run.events == {"second-sender": 1, "second-sender-gone": 1}
     assert abs(run.shown[-1] @ LYRA) > 0.999
@@ -383,10 +420,15 @@ def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_si
     """1.2 s of both senders' packets are read at once, the second one's first."""
 
     def make(t0: int) -> list[Arrival]:
-        both = Sender().packets(t0, seconds(0, 8)) + late_sender(9).packets(t0 - 2_300_000, seconds(2, 8))
+        both = Sender().packets(t0, seconds(0, 8)) + late_sender(9).packets(
+            t0 - 2_300_000, seconds(2, 8)
+        )
         begin_ns, end_ns = t0 + 4_006_000_000, t0 + 5_200_000_000
         return [
-            Arrival(end_ns, arrival.event, arrival.raw) if begin_ns < arrival.host_ns < end_ns else arrival for arrival in both
+            Arrival(end_ns, arrival.event, arrival.raw)
+            if begin_ns < arrival.host_ns < end_ns
+            else arrival
+            for arrival in both
         ]
 
     run = Run(make)
@@ -395,7 +437,12 @@ def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_si
     assert run.receiver.jumps.jumps == 0
 
 
-def many(t0: int, qs: list[np.ndarray], sequences: list[int], discontinuity: Callable[[int], bool] = lambda k: False):
+def many(
+    t0: int,
+    qs: list[np.ndarray],
+    sequences: list[int],
+    discontinuity: Callable[[int], bool] = lambda k: False,
+):
     samples = [
         AttitudeSample(t0 + k * PERIOD_NS, q, np.zeros(3), sequence, discontinuity(k))
         for k, (q, sequence) in enumerate(zip(qs, sequences, strict=True))
@@ -442,7 +489,10 @@ def test_packets_out_of_order_are_one_sender_s():
         found = Sender().packets(t0, seconds(0, 5))
         for k in range(10, 990, 10):
             a, b = found[k], found[k + 1]
-            found[k], found[k + 1] = Arrival(a.host_ns, b.event, b.raw), Arrival(b.host_ns, a.event, a.raw)
+            found[k], found[k + 1] = (
+                Arrival(a.host_ns, b.event, b.raw),
+                Arrival(b.host_ns, a.event, a.raw),
+            )
         return found
 
     run = Run(make)
@@ -451,7 +501,10 @@ def test_packets_out_of_order_are_one_sender_s():
 
 
 def test_a_receiver_that_breaks_is_started_again_and_said():
-    run = Run(lambda t0: Sender().packets(t0, seconds(0, 1)), fails=[MemoryError(), OSError("no such\nsocket")])
+    run = Run(
+        lambda t0: Sender().packets(t0, seconds(0, 1)),
+        fails=[MemoryError(), OSError("no such\nsocket")],
+    )
     assert run.accepted == 200
     assert run.events == {"receiver-failed": 2}
 
@@ -468,9 +521,9 @@ def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
 @pytest.mark.parametrize("jump_s", [-3600, 0.5, 10**9])
 def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
     def make(t0: int) -> list[Arrival]:
-        return Sender().packets(t0, seconds(0, 3)) + Sender(first=600, offset_ns=round(jump_s * NS_PER_S)).packets(
-            t0, seconds(3, 6)
-        )
+        return Sender().packets(t0, seconds(0, 3)) + Sender(
+            first=600, offset_ns=round(jump_s * NS_PER_S)
+        ).packets(t0, seconds(3, 6))
 
     run = Run(make)
     told = run.receiver.clock_summary()
@@ -493,7 +546,9 @@ def test_a_shared_clock_is_taken_as_it_is():
 
 @pytest.mark.parametrize(("offset_s", "refused"), [(-50, False), (50, True), (0.3, False)])
 def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
-    run = Run(lambda t0: Sender(offset_ns=round(offset_s * NS_PER_S)).packets(t0, seconds(0, 4)), SHARED)
+    run = Run(
+        lambda t0: Sender(offset_ns=round(offset_s * NS_PER_S)).packets(t0, seconds(0, 4)), SHARED
+    )
     assert run.events == {"clock-not-shared": 1}
     assert run.counts.refused_by["time"] == (800 if refused else 0)
 
@@ -515,12 +570,23 @@ UNIX_NOW_NS = 1_795_000_000_123_456_789  # beyond what a float64 holds to 1 ns
 UNIX = Traffic(clock="unix")
 
 
-@pytest.mark.parametrize(("error_ns", "events"), [(250_000, {}), (16 * NS_PER_S, {"clock-undisciplined": 1})])
-def test_unix_time_has_the_offset_of_this_machine_s_clock_and_the_error_that_its_kernel_states(error_ns, events):
-    packets = partial(Sender(offset_ns=UNIX_NOW_NS).packets, times=seconds(0, 1), delay_ns=3_000_000)
+@pytest.mark.parametrize(
+    ("error_ns", "events"), [(250_000, {}), (16 * NS_PER_S, {"clock-undisciplined": 1})]
+)
+def test_unix_time_has_the_offset_of_this_machine_s_clock_and_the_error_that_its_kernel_states(
+    error_ns, events
+):
+    packets = partial(
+        Sender(offset_ns=UNIX_NOW_NS).packets, times=seconds(0, 1), delay_ns=3_000_000
+    )
     run = Run(packets, UNIX, unix_offset=SteppingUnixTime(error_ns))
     told = run.receiver.clock_summary()
-    assert (told.mode, told.uncertainty_ms, told.jumps, told.drift_ppm) == ("unix", error_ns / 1e6, 0, 0.0)
+    assert (told.mode, told.uncertainty_ms, told.jumps, told.drift_ppm) == (
+        "unix",
+        error_ns / 1e6,
+        0,
+        0.0,
+    )
     assert told.offset_ms == -UNIX_NOW_NS / 1e6
     assert run.receiver.latency_ms.percentile(50) == pytest.approx(3.0, rel=0.05)
     assert np.allclose(run.ages_ms, 3.0)
@@ -529,7 +595,9 @@ def test_unix_time_has_the_offset_of_this_machine_s_clock_and_the_error_that_its
 
 def test_a_step_of_unix_time_is_followed_without_a_jump():
     def make(t0: int) -> list[Arrival]:
-        stepped = Sender(first=600, offset_ns=UNIX_NOW_NS + NS_PER_S // 2).packets(t0, seconds(1, 3))
+        stepped = Sender(first=600, offset_ns=UNIX_NOW_NS + NS_PER_S // 2).packets(
+            t0, seconds(1, 3)
+        )
         return Sender(offset_ns=UNIX_NOW_NS).packets(t0, seconds(0, 1)) + stepped
 
     run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000, NS_PER_S // 2, steps_after=5))
@@ -568,7 +636,9 @@ def test_how_far_a_clock_is_ahead_is_not_what_a_late_packet_says(caplog):
     def make(t0: int) -> list[Arrival]:
         packets = Sender(offset_ns=UNIX_NOW_NS + NS_PER_S // 10).packets(t0, seconds(0, 1))
         late_ns = 60 * NS_PER_S // 1000
-        return packets[:20] + [replace(each, host_ns=each.host_ns + late_ns) for each in packets[20:]]
+        return packets[:20] + [
+            replace(each, host_ns=each.host_ns + late_ns) for each in packets[20:]
+        ]
 
     run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000))
     assert run.events == {"clock-not-shared": 1}
@@ -590,7 +660,10 @@ def test_a_clock_ahead_is_a_wrong_sky_until_it_is_right_again(ahead_s):
 def test_packets_that_are_always_late_by_a_known_clock_are_a_notice():
     late = Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=120_000_000), SHARED)
     assert late.events == {"clock-behind": 1}
-    assert Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=30_000_000), SHARED).events == {}
+    assert (
+        Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=30_000_000), SHARED).events
+        == {}
+    )
 
 
 def test_the_kernel_states_how_well_it_keeps_unix_time():

@@ -30,7 +30,9 @@ from tests.support.full_disk import files_of_at_most
 def test_an_output_that_is_an_input_by_any_name_is_refused(tmp_path, kind):
     given = tmp_path / "a.csv"
     given.write_text("x")
-    other = {"same": given, "dotted": tmp_path / "." / "sub" / ".." / "a.csv"}.get(kind, tmp_path / "b.csv")
+    other = {"same": given, "dotted": tmp_path / "." / "sub" / ".." / "a.csv"}.get(
+        kind, tmp_path / "b.csv"
+    )
     (tmp_path / "sub").mkdir()
     if kind == "hard":
         other.hardlink_to(given)
@@ -56,8 +58,15 @@ def test_what_a_bench_file_names_is_an_input_too(tmp_path):
     (tmp_path / "qe.csv").write_text("")
     (tmp_path / "m.csv").write_text("")
     (tmp_path / "m.toml").write_text('[calibration]\nresponse = "m.csv"\n')
-    (tmp_path / "b.toml").write_text('[tracker]\nquantum_efficiency = "qe.csv"\n[monitor]\ncalibration = "m.toml"\n')
-    assert {path.name for path in files_named_in(tmp_path / "b.toml")} == {"b.toml", "qe.csv", "m.toml", "m.csv"}
+    (tmp_path / "b.toml").write_text(
+        '[tracker]\nquantum_efficiency = "qe.csv"\n[monitor]\ncalibration = "m.toml"\n'
+    )
+    assert {path.name for path in files_named_in(tmp_path / "b.toml")} == {
+        "b.toml",
+        "qe.csv",
+        "m.toml",
+        "m.csv",
+    }
 
 
 def test_an_error_leaves_the_older_file_whole_and_nothing_beside(tmp_path):
@@ -102,7 +111,10 @@ def test_a_temporary_name_cannot_be_foreseen_and_no_planted_link_is_followed(tmp
 def test_what_takes_the_temporary_name_s_place_gets_nothing_written(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("theirs")
-    with pytest.raises(InputError, match="cannot be written"), whole_file(tmp_path / "a.txt") as file:
+    with (
+        pytest.raises(InputError, match="cannot be written"),
+        whole_file(tmp_path / "a.txt") as file,
+    ):
         [part] = tmp_path.glob(".a.*.part.txt")
         part.unlink()
         part.symlink_to(victim)
@@ -114,7 +126,9 @@ def test_links_in_a_circle_are_refused_and_stay(tmp_path):
     one, other = tmp_path / "one.fits", tmp_path / "other.fits"
     one.symlink_to(other)
     other.symlink_to(one)
-    with pytest.raises(InputError, match=r"one.fits: cannot be written \(Too many levels of symbolic links\)"):
+    with pytest.raises(
+        InputError, match=r"one.fits: cannot be written \(Too many levels of symbolic links\)"
+    ):
         write_whole(one, "x")
     with pytest.raises(InputError, match="Too many levels"):
         check_outputs([], [one])
@@ -194,7 +208,9 @@ def test_no_ledger_of_a_run_is_written_over_by_anything_else(tmp_path):
             NewFile(place)
 
 
-@pytest.mark.parametrize("name", ["a.fits", "a.FIT", "a.fts", "a.fits.gz", "a", "a.dat", "/dev/null", "run.3"])
+@pytest.mark.parametrize(
+    "name", ["a.fits", "a.FIT", "a.fts", "a.fits.gz", "a", "a.dat", "/dev/null", "run.3"]
+)
 def test_a_name_that_says_fits_or_nothing_is_taken(name):
     check_ending("-o", Path(name), FITS)
 
@@ -217,7 +233,10 @@ def test_a_name_that_says_another_kind_is_refused(name, endings, better):
 
 
 def test_a_file_s_name_is_no_directory_unless_one_is_there(tmp_path):
-    with pytest.raises(InputError, match=r"-o .*frames.png: several files are written, into a directory; .* such as frames"):
+    with pytest.raises(
+        InputError,
+        match=r"-o .*frames.png: several files are written, into a directory; .* such as frames",
+    ):
         check_directory("-o", tmp_path / "frames.png")
     check_directory("-o", None)
     check_directory("-o", tmp_path / "run-0.5")

@@ -18,7 +18,13 @@ from astropy.io import fits
 from PIL import Image, ImageFile
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.image_files import ImageSizeError, npy_array, opened_fits, opened_picture, unpacked
+from hilstar.basics.image_files import (
+    ImageSizeError,
+    npy_array,
+    opened_fits,
+    opened_picture,
+    unpacked,
+)
 from hilstar.instruments.calibrate.geometric.observed import read_image
 from hilstar.instruments.confront.images import read_photographs
 from hilstar.optics.glass.psf_file import read_glass
@@ -29,7 +35,13 @@ from tests.support.benches import ROOT
 SIDE_PX = 13_000  # 1.4 GB as float64
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\n(x) run\n%%EOF\n"
 READERS = [read_image, lambda path: read_photographs(path, None), read_map]
-OPENERS = {("Image", "open"), ("fits", "open"), ("fits", "getdata"), ("np", "load"), ("plt", "imread")}
+OPENERS = {
+    ("Image", "open"),
+    ("fits", "open"),
+    ("fits", "getdata"),
+    ("np", "load"),
+    ("plt", "imread"),
+}
 # Of hilstar's own files, such as the frames that `compare` takes, of tables that are read by
 # columns, and of its own process.
 OWN = {
@@ -69,7 +81,9 @@ def undecoded(monkeypatch):
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_a_picture_that_unpacks_to_gigabytes_is_refused_before_it_is_decoded(tmp_path: Path, undecoded, reader):
+def test_a_picture_that_unpacks_to_gigabytes_is_refused_before_it_is_decoded(
+    tmp_path: Path, undecoded, reader
+):
     (tmp_path / "bomb.png").write_bytes(data := png_bomb())
     assert len(data) < 200_000
     with pytest.raises(InputError, match=f"is {SIDE_PX} x {SIDE_PX} px"):
@@ -85,9 +99,13 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path: Pat
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_a_file_of_another_format_is_no_picture_whatever_its_name(tmp_path: Path, monkeypatch, reader):
+def test_a_file_of_another_format_is_no_picture_whatever_its_name(
+    tmp_path: Path, monkeypatch, reader
+):
     ghost = pytest.importorskip("PIL.EpsImagePlugin")
-    monkeypatch.setattr(ghost, "Ghostscript", lambda *arguments, **named: pytest.fail("Ghostscript was called"))
+    monkeypatch.setattr(
+        ghost, "Ghostscript", lambda *arguments, **named: pytest.fail("Ghostscript was called")
+    )
     (tmp_path / "eps.png").write_bytes(EPS)
     with pytest.raises(InputError):
         reader(tmp_path / "eps.png")
@@ -98,7 +116,10 @@ def test_fits_that_is_packed_is_bounded_by_what_it_unpacks_to(tmp_path: Path):
     fits.PrimaryHDU(np.zeros((64, 64), dtype=np.uint16)).writeto(whole)
     with opened_fits(whole.getvalue(), (64, 64)) as hdus:
         assert hdus[0].data.shape == (64, 64)
-    with pytest.raises(ImageSizeError, match="is 64 x 64 px"), opened_fits(whole.getvalue(), (64, 65)):
+    with (
+        pytest.raises(ImageSizeError, match="is 64 x 64 px"),
+        opened_fits(whole.getvalue(), (64, 65)),
+    ):
         pass
     packed = gzip.compress(whole.getvalue())
     with opened_fits(packed, (64, 64)) as hdus:
@@ -113,10 +134,15 @@ def test_fits_that_is_packed_is_bounded_by_what_it_unpacks_to(tmp_path: Path):
     assert read_image(tmp_path / "packed.fits").shape == (64, 64)
     with pytest.raises(InputError):
         read_glass(tmp_path / "packed.fits")  # a dark image is no PSF
-    with pytest.raises(ImageSizeError, match="unpack it first"), opened_fits(bz2.compress(whole.getvalue())):
+    with (
+        pytest.raises(ImageSizeError, match="unpack it first"),
+        opened_fits(bz2.compress(whole.getvalue())),
+    ):
         pass
     made = io.BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((64, 64), dtype=np.int16))]).writeto(made)
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((64, 64), dtype=np.int16))]
+    ).writeto(made)
     bomb = made.getvalue()
     for key in (b"ZNAXIS1 ", b"ZNAXIS2 "):
         at = bomb.index(key)

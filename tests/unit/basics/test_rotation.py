@@ -45,7 +45,9 @@ def test_a_direction_is_where_the_boresight_points():
     ra_deg, dec_deg = np.array([0.0, 40.0, 283.0, 10.0]), np.array([0.0, 20.0, -89.0, 90.0])
     found = direction_of(ra_deg, dec_deg)
     for ra, dec, vector in zip(ra_deg, dec_deg, found, strict=True):
-        assert np.allclose(to_matrix(from_radec_roll_deg(ra, dec, 7.0)) @ vector, [0, 0, 1], rtol=0, atol=ROUNDING)
+        assert np.allclose(
+            to_matrix(from_radec_roll_deg(ra, dec, 7.0)) @ vector, [0, 0, 1], rtol=0, atol=ROUNDING
+        )
         assert direction_of(ra, dec) == pytest.approx(vector, abs=ROUNDING)
 
 
@@ -61,7 +63,12 @@ def test_at_roll_zero_north_is_up_and_east_is_left():
 
 
 def test_radec_roll_comes_back(rng):
-    for ra, dec, roll in zip(rng.uniform(0, 360, 200), rng.uniform(-89.9, 89.9, 200), rng.uniform(0, 360, 200), strict=True):
+    for ra, dec, roll in zip(
+        rng.uniform(0, 360, 200),
+        rng.uniform(-89.9, 89.9, 200),
+        rng.uniform(0, 360, 200),
+        strict=True,
+    ):
         back = np.array(to_radec_roll_deg(from_radec_roll_deg(ra, dec, roll)))
         assert np.abs(back - [ra, dec, roll]).max() < ROUNDING_DEG / np.cos(np.radians(dec))
 
@@ -75,7 +82,13 @@ def test_right_ascension_and_roll_never_reach_360():
 
 @pytest.mark.parametrize(
     ("turn_deg", "decimals", "text"),
-    [(359.99996, 4, "0.0000"), (359.9996, 3, "0.000"), (359.9994, 3, "359.999"), (0.0, 4, "0.0000"), (84.057, 3, "84.057")],
+    [
+        (359.99996, 4, "0.0000"),
+        (359.9996, 3, "0.000"),
+        (359.9994, 3, "359.999"),
+        (0.0, 4, "0.0000"),
+        (84.057, 3, "84.057"),
+    ],
 )
 def test_no_turn_is_written_as_360(turn_deg, decimals, text):
     assert turn_text(turn_deg, decimals) == text

@@ -14,7 +14,13 @@ RELATIVE = STEP
 
 @pytest.mark.parametrize(
     "values",
-    [np.geomspace(0.01, 50, 5000), np.linspace(-3, 5, 5001), np.full(10, 16.7), np.array([0.0, 1e-9]), np.array([-2.5])],
+    [
+        np.geomspace(0.01, 50, 5000),
+        np.linspace(-3, 5, 5001),
+        np.full(10, 16.7),
+        np.array([0.0, 1e-9]),
+        np.array([-2.5]),
+    ],
     ids=["log", "both signs", "one value", "zero", "negative"],
 )
 def test_percentiles_are_those_of_the_values(values, rng):

@@ -57,7 +57,13 @@ def in_dialect(values, delimiter, header, end, decimal):
         "plain": [plain],
         "comment": ["# made by a program", f"# {plain}"],
         "units line": [named, delimiter.join(("ms", "pixel", "-"))],
-        "vizier": ["#Column t", "", named, delimiter.join(("ms", "pix", "---")), delimiter.join(("-----", "---", "----"))],
+        "vizier": [
+            "#Column t",
+            "",
+            named,
+            delimiter.join(("ms", "pix", "---")),
+            delimiter.join(("-----", "---", "----")),
+        ],
         "brackets": [delimiter.join(("t[ms]", "x(px)", "note"))],
     }
     return end.join([*heads[header], *lines[:2], "", *lines[2:], ""])
@@ -166,18 +172,29 @@ def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table):
 def test_a_document_cut_off_is_read_and_said(table, caplog):
     path = table("t_s,x_px\n1,0.25\n2,0.35\n3,0.4")
     assert len(rows(path)) == 3
-    assert f"{path}:4: the last line has no line end, and may be cut off: is the file whole?" in caplog.text
+    assert (
+        f"{path}:4: the last line has no line end, and may be cut off: is the file whole?"
+        in caplog.text
+    )
 
 
 def test_rows_that_do_not_hold_are_told_by_any_name(table):
-    for header, flags in (("valid", "10"), ("is_valid", "TF"), ("Valid", "yn"), ("lost", "01"), ("invalid", ("false", "true"))):
+    for header, flags in (
+        ("valid", "10"),
+        ("is_valid", "TF"),
+        ("Valid", "yn"),
+        ("lost", "01"),
+        ("invalid", ("false", "true")),
+    ):
         path = table(f"t_s,{header}\n1,{flags[0]}\n2,{flags[1]}\n")
         cells = [cells[1].lower() for _, cells in rows(path, ("t_s",), ("valid",))]
         assert [cell in {"1", "t", "y"} for cell in cells] == [True, False]
 
 
 def test_columns_know_their_names_and_units(table):
-    with open_table(table('ra (h),RA(ICRS),"flux [DN]",pmRA\nh,deg,DN,mas/yr\n1,2,3,4\n'), "", LIMIT) as opened:
+    with open_table(
+        table('ra (h),RA(ICRS),"flux [DN]",pmRA\nh,deg,DN,mas/yr\n1,2,3,4\n'), "", LIMIT
+    ) as opened:
         assert [(column.name, column.unit) for column in opened.columns] == [
             ("ra", "h"),
             ("RA(ICRS)", "deg"),

@@ -13,7 +13,9 @@ def test_a_condition_holds_from_when_it_began_until_it_ends():
     sky = WrongSky()
     assert not sky.any and sky.now() == []
     sky.see(RATES, "by a factor", 12 * S, since_ns=10 * S)
-    assert [(one.kind, one.text, one.since_ns) for one in sky.now()] == [(RATES, "by a factor", 10 * S)]
+    assert [(one.kind, one.text, one.since_ns) for one in sky.now()] == [
+        (RATES, "by a factor", 10 * S)
+    ]
     sky.see(ENDS[RATES], "", 15 * S)
     assert sky.now() == [] and sky.at(14 * S) == [(RATES, "by a factor")] and sky.at(15 * S) == []
     assert sky.spans_ns() == [(10 * S, 15 * S)]
@@ -27,7 +29,10 @@ def test_conditions_that_overlap_count_once_and_each_for_itself():
     sky.see(RATES, "", 30 * S)
     total = sky.total(11 * S, 32 * S)
     assert total.seconds == 21.0
-    assert [(one.kind, one.count, one.seconds) for one in total.conditions] == [(RATES, 2, 5.0), (CONVENTION, 1, 20.0)]
+    assert [(one.kind, one.count, one.seconds) for one in total.conditions] == [
+        (RATES, 2, 5.0),
+        (CONVENTION, 1, 20.0),
+    ]
 
 
 def test_other_events_and_ends_of_nothing_change_nothing():

@@ -40,19 +40,33 @@ def test_a_directory_is_looked_at_before_the_work_and_made_after_the_input_is_re
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)
     line = [part.format(bench=small_bench_file) for part in command]
     refused = run_hilstar_here(*line, "-o", tmp_path / "out" / "deep")
-    assert_refused(refused, 2, "out/deep: cannot be written (Permission denied); choose another place")
+    assert_refused(
+        refused, 2, "out/deep: cannot be written (Permission denied); choose another place"
+    )
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["budget", "noise", "benchmark", "study", "dots", "first-light"])
 def test_a_file_of_heads_in_a_bench_file_s_place_is_refused_in_words(name, tmp_path):
     line = [part.format(bench=heads_file(tmp_path, 5599)) for part in COMMANDS[name]]
-    assert_refused(run_hilstar_here(*line, "-o", tmp_path / "out"), 2, "heads.toml: ", "give one of its heads' files")
+    assert_refused(
+        run_hilstar_here(*line, "-o", tmp_path / "out"),
+        2,
+        "heads.toml: ",
+        "give one of its heads' files",
+    )
     assert not (tmp_path / "out").exists()
 
 
 def test_what_heads_have_no_use_for_is_refused_and_not_ignored(tmp_path):
     path = heads_file(tmp_path, 5599)
-    assert_refused(run_hilstar_here("verify", path, "-o", tmp_path / "out"), 2, "verify -o: is of one bench", "heads.toml")
-    assert_refused(run_hilstar_here("verify", path, "--strict"), 2, "verify --strict: is of one bench")
+    assert_refused(
+        run_hilstar_here("verify", path, "-o", tmp_path / "out"),
+        2,
+        "verify -o: is of one bench",
+        "heads.toml",
+    )
+    assert_refused(
+        run_hilstar_here("verify", path, "--strict"), 2, "verify --strict: is of one bench"
+    )
     assert not (tmp_path / "out").exists()

@@ -27,11 +27,15 @@ def bench(tmp_path, monkeypatch):
 
 
 def install(bench, *words: str):
-    return run_hilstar_here("service", "install", bench, "--name", "room7", *words, cwd=bench.parent)
+    return run_hilstar_here(
+        "service", "install", bench, "--name", "room7", *words, cwd=bench.parent
+    )
 
 
 def keys_of(text: str) -> dict[str, str]:
-    return dict(line.split("=", 1) for line in text.splitlines() if "=" in line and not line.startswith("#"))
+    return dict(
+        line.split("=", 1) for line in text.splitlines() if "=" in line and not line.startswith("#")
+    )
 
 
 def test_the_unit_serves_the_bench_and_is_watched_and_started_again(bench):
@@ -42,7 +46,13 @@ def test_the_unit_serves_the_bench_and_is_watched_and_started_again(bench):
     keys = keys_of(path.read_text())
     # As systemd reads it: $$ is $, %% is %.
     words = shlex.split(keys["ExecStart"].replace("$$", "$").replace("%%", "%"))
-    assert words[-5:] == [str(bench), "--console", "127.0.0.1:8765", "--ledger", "a b$c%d-{utc}.mcap"]
+    assert words[-5:] == [
+        str(bench),
+        "--console",
+        "127.0.0.1:8765",
+        "--ledger",
+        "a b$c%d-{utc}.mcap",
+    ]
     assert (keys["Type"], keys["Restart"], keys["WatchdogSec"]) == ("notify", "always", "3")
     assert not path.with_suffix(".env").exists()
     assert_refused(install(bench), 2, "hilstar-room7.service", "--overwrite")
@@ -80,7 +90,11 @@ def test_systemd_takes_the_unit(bench, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     path = tmp_path / "config" / "systemd" / "user" / "hilstar-room7.service"
     verified = subprocess.run(
-        [analyze, "--user", "verify", str(path)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [analyze, "--user", "verify", str(path)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert "hilstar-room7" not in verified.stderr, verified.stderr
 
@@ -105,7 +119,14 @@ def test_the_unit_takes_nothing_that_a_run_needs(bench):
     keys = keys_of(install(bench, "--print").stdout)
     # Devices (GPU, serial ports), /tmp (the X server's socket), real-time priority, OpenGL's
     # compiler, ledgers anywhere.
-    for key in ("PrivateDevices", "DevicePolicy", "PrivateTmp", "RestrictRealtime", "MemoryDenyWriteExecute", "ProtectHome"):
+    for key in (
+        "PrivateDevices",
+        "DevicePolicy",
+        "PrivateTmp",
+        "RestrictRealtime",
+        "MemoryDenyWriteExecute",
+        "ProtectHome",
+    ):
         assert key not in keys
     assert "@resources" not in keys["SystemCallFilter"]
     assert keys["NoNewPrivileges"] == "yes" and keys["CapabilityBoundingSet"] == ""
@@ -130,9 +151,16 @@ def test_what_was_installed_can_be_uninstalled(bench, name, monkeypatch):
     (bench.parent / "systemctl").write_text(f"#!/bin/sh\necho $* >> '{asked}'\n")
     (bench.parent / "systemctl").chmod(0o755)
     monkeypatch.setenv("PATH", str(bench.parent), prepend=":")
-    assert_refused(run_hilstar_here("service", "uninstall", "other"), 2, "hilstar-other.service", "there is room7")
+    assert_refused(
+        run_hilstar_here("service", "uninstall", "other"),
+        2,
+        "hilstar-other.service",
+        "there is room7",
+    )
     result = run_hilstar_here("service", "uninstall", name)
-    assert (result.returncode, result.stdout) == (0, f"{units / 'hilstar-room7.service'}\n"), result.stderr
+    assert (result.returncode, result.stdout) == (0, f"{units / 'hilstar-room7.service'}\n"), (
+        result.stderr
+    )
     assert [path.name for path in units.iterdir()] == ["mine.service"]
     assert asked.read_text() == "--user disable --now hilstar-room7.service\n--user daemon-reload\n"
     assert_refused(run_hilstar_here("service", "uninstall", name), 2, "there is none")

@@ -37,7 +37,9 @@ OTHER_OUTPUTS = (
 
 
 @pytest.mark.parametrize("words", TEXT_OUTPUTS, ids=lambda words: words[0])
-def test_a_dash_is_stdout_for_text_and_nothing_else_goes_there(words: list[str], tmp_path: Path) -> None:
+def test_a_dash_is_stdout_for_text_and_nothing_else_goes_there(
+    words: list[str], tmp_path: Path
+) -> None:
     done = run_hilstar(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     header, *rows = done.stdout.splitlines()
@@ -47,7 +49,9 @@ def test_a_dash_is_stdout_for_text_and_nothing_else_goes_there(words: list[str],
 
 
 @pytest.mark.parametrize("words", OTHER_OUTPUTS, ids=lambda words: words[0])
-def test_a_dash_is_refused_for_any_other_output(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dash_is_refused_for_any_other_output(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     done = run_hilstar_here(*words)
     assert done.returncode == 2
@@ -115,7 +119,9 @@ def test_a_wrong_name_of_a_curve_is_offered_those_of_its_kind() -> None:
         ("transmission", '"ccd47-20"', '"n-bk7-10mm", a CSV'),
     ],
 )
-def test_a_bench_file_s_curve_of_another_kind_is_refused(key: str, value: str, words: str, tmp_path: Path) -> None:
+def test_a_bench_file_s_curve_of_another_kind_is_refused(
+    key: str, value: str, words: str, tmp_path: Path
+) -> None:
     done = run_hilstar_here("budget", str(_bench(tmp_path, key, value)))
     assert done.returncode == 2
     assert words in done.stderr
@@ -131,13 +137,18 @@ def _bench(folder: Path, key: str, value: str) -> Path:
     return path
 
 
-def test_an_aperture_that_is_the_f_number_is_told_by_each_command_that_draws(tmp_path: Path) -> None:
+def test_an_aperture_that_is_the_f_number_is_told_by_each_command_that_draws(
+    tmp_path: Path,
+) -> None:
     path = _bench(tmp_path, "aperture_mm", "1.8")
     focal_length_mm = read_bench_file(path).config.tracker.focal_length_mm
     fields = fields_of_view(read_bench_file(path).config, tmp_path)
     assert fields.warning is not None
     assert f"the f-number, which is {focal_length_mm / 1.8:.6g}" in fields.warning
-    for words in (["budget", str(path)], ["simulate", str(path), "--radec", "84,-1,0", "-o", str(tmp_path / "o.fits")]):
+    for words in (
+        ["budget", str(path)],
+        ["simulate", str(path), "--radec", "84,-1,0", "-o", str(tmp_path / "o.fits")],
+    ):
         done = run_hilstar_here(*words)
         assert done.returncode == 0
         assert "the f-number" in done.stderr
@@ -145,10 +156,15 @@ def test_an_aperture_that_is_the_f_number_is_told_by_each_command_that_draws(tmp
 
 @pytest.mark.parametrize("port", ["/dev/ttyUSB99", "/dev/serial/by-id/gone"])
 def test_a_serial_port_that_is_not_there_is_the_machine_s(port: str, tmp_path: Path) -> None:
-    for table in (f'[attitude]\nsource = "serial"\nport = "{port}"\n', f'[sync]\nport = "{port}"\n'):
+    for table in (
+        f'[attitude]\nsource = "serial"\nport = "{port}"\n',
+        f'[sync]\nport = "{port}"\n',
+    ):
         path = tmp_path / "bench.toml"
         text = DEMO.read_text()
-        path.write_text(text[: text.index("[attitude]")] + table if "[attitude]" in text else text + table)
+        path.write_text(
+            text[: text.index("[attitude]")] + table if "[attitude]" in text else text + table
+        )
         done = run_hilstar_here("serve", str(path), "--headless", "--duration", "1")
         assert done.returncode == 3, done.stderr
         assert "no such device; plug it in" in done.stderr
@@ -170,9 +186,13 @@ def test_a_display_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch
         displays()
 
 
-def test_certify_finds_the_example_of_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_certify_finds_the_example_of_the_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run_hilstar_here("certify", "gone.toml", "--virtual", "truth-example.toml", "-o", "certificate")
+    done = run_hilstar_here(
+        "certify", "gone.toml", "--virtual", "truth-example.toml", "-o", "certificate"
+    )
     assert "gone.toml" in done.stderr
     from hilstar.cli.first_light import virtual_truth
 
@@ -201,6 +221,10 @@ def test_the_size_of_a_screen_is_looked_at_by_itself() -> None:
     monitor = read_bench_file(DEMO).config.monitor
     fault = size_fault(Wide(), monitor)  # type: ignore[arg-type]
     width, height = monitor.resolution_px
-    expected = "" if (width, height) == (1920, 1080) else f"1920 x 1080 px and the bench file says {width} x {height}"
+    expected = (
+        ""
+        if (width, height) == (1920, 1080)
+        else f"1920 x 1080 px and the bench file says {width} x {height}"
+    )
     assert expected in fault
     assert bool(fault) == bool(expected)

@@ -26,11 +26,23 @@ MEANT = "84.057,-1.2,0, with commas and without spaces"
         (["budget", BENCH, "--centroider", "windw"], "did you mean window?"),
         (["replay", BENCH, "log.csv", "--speed", "realtme"], "did you mean realtime?"),
         (["first-light", BENCH, "-o", "s", "--again", "verfy"], "did you mean verify?"),
-        (["frame", BENCH, "--radec", "84.057", "-1.2", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
-        (["frame", BENCH, "--radec", "84.057,", "-1.2,", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
+        (
+            ["frame", BENCH, "--radec", "84.057", "-1.2", "0", "-o", "o.fits"],
+            f"write --radec {MEANT}",
+        ),
+        (
+            ["frame", BENCH, "--radec", "84.057,", "-1.2,", "0", "-o", "o.fits"],
+            f"write --radec {MEANT}",
+        ),
         (["frame", BENCH, "--radec=84.057", "-1.2", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
-        (["frame", BENCH, "--radec", "84.057 -1.2 0", "-o", "o.fits"], "with commas and without spaces"),
-        (["simulate", BENCH, "--radec", "1,2,3", "--rate", "0", "1", "0", "-o", "o.fits"], "write --rate 0,1,0"),
+        (
+            ["frame", BENCH, "--radec", "84.057 -1.2 0", "-o", "o.fits"],
+            "with commas and without spaces",
+        ),
+        (
+            ["simulate", BENCH, "--radec", "1,2,3", "--rate", "0", "1", "0", "-o", "o.fits"],
+            "write --rate 0,1,0",
+        ),
     ],
     ids=lambda value: " ".join(value)[-40:] if isinstance(value, list) else None,
 )
@@ -39,7 +51,9 @@ def test_a_wrong_word_is_answered_with_the_right_one(words, said, tmp_path):
 
 
 def test_numbers_after_commas_are_no_reason_to_complain_of_spaces(tmp_path):
-    refused = run_hilstar_here("frame", BENCH, "--radec", "84.057,-1.2,0", "--nonsense", cwd=tmp_path)
+    refused = run_hilstar_here(
+        "frame", BENCH, "--radec", "84.057,-1.2,0", "--nonsense", cwd=tmp_path
+    )
     assert_refused(refused, 2, "No such option: --nonsense")
 
 
@@ -62,7 +76,12 @@ def test_numbers_after_commas_are_no_reason_to_complain_of_spaces(tmp_path):
 )
 def test_a_wrong_value_is_answered_with_an_example(table, line, said, tmp_path):
     tables = {
-        "tracker": ["aperture_mm = 30", "focal_length_mm = 70", "pixel_pitch_um = 13", "resolution_px = [64, 64]"],
+        "tracker": [
+            "aperture_mm = 30",
+            "focal_length_mm = 70",
+            "pixel_pitch_um = 13",
+            "resolution_px = [64, 64]",
+        ],
         "monitor": ["resolution_px = [64, 48]", "pixel_pitch_um = 57.65"],
         "collimator": ["focal_length_mm = 350"],
     }

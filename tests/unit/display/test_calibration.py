@@ -71,7 +71,11 @@ def test_light_is_above_black_and_relative_to_white(write):
     assert calibration.response.light == pytest.approx([0, 0.1, 0.4, 1])
     assert calibration.response.threshold == pytest.approx([0.05, 0.25, 0.7])
     assert calibration.response.black == pytest.approx(0.05)
-    assert (calibration.who, calibration.when, calibration.unit) == ("tester", "2026-03-01", "cd/m2")
+    assert (calibration.who, calibration.when, calibration.unit) == (
+        "tester",
+        "2026-03-01",
+        "cd/m2",
+    )
     assert calibration.weights is None
     assert calibration.uniformity_map((8, 8)) is None
 
@@ -86,8 +90,12 @@ def test_primaries_add_to_grey_by_their_white_light_or_by_given_weights(write):
 
 
 def test_codes_between_the_rows_follow_the_light_s_power(write):
-    rows = "".join(f"{code},{0.25 + 250 * (code / 255) ** 2.2!r}\n" for code in (0, 4, 16, 40, 90, 160, 255))
-    calibration = load_calibration(write(HEAD.replace("bits = 2", "bits = 8"), "code,w\n" + rows), 8)
+    rows = "".join(
+        f"{code},{0.25 + 250 * (code / 255) ** 2.2!r}\n" for code in (0, 4, 16, 40, 90, 160, 255)
+    )
+    calibration = load_calibration(
+        write(HEAD.replace("bits = 2", "bits = 8"), "code,w\n" + rows), 8
+    )
     # A power law is a straight line in log light over log code, which PCHIP keeps; so is what lies
     # below the first row.
     assert calibration.response.light == pytest.approx((np.arange(256) / 255) ** 2.2, rel=1e-9)
@@ -127,7 +135,10 @@ def refusal(path, bits=2, **more):
         (HEAD.replace("who", "whom"), "unknown key whom"),
         (HEAD.replace('who = "tester"\n', ""), "the key who is missing"),
         (HEAD.replace("photometric", "geometric"), '"photometric" is wanted'),
-        (HEAD.replace("bits = 2", "bits = 2.5"), "[calibration] bits = 2.5; a whole number is wanted"),
+        (
+            HEAD.replace("bits = 2", "bits = 2.5"),
+            "[calibration] bits = 2.5; a whole number is wanted",
+        ),
         (HEAD.replace("bits = 2", "bits = 99"), "bits = 99"),
         (HEAD.replace("bits = 2", "bits = 10"), "the monitor has 2"),
         (HEAD.replace("table.csv", "none.csv"), "no such file"),

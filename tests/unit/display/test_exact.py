@@ -54,7 +54,11 @@ def phases(count, mag, sigma=SIGMA):
 def sums(image, tile):
     """Light and first moments (x, y) of each tile, in the order of `phases`."""
     count = image.shape[0] // tile
-    tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3).reshape(count * count, tile, tile)
+    tiles = (
+        image.reshape(count, tile, count, tile)
+        .transpose(0, 2, 1, 3)
+        .reshape(count * count, tile, tile)
+    )
     at = np.arange(tile)
     return tiles.sum(axis=(1, 2)), tiles.sum(axis=1) @ at, tiles.sum(axis=2) @ at
 
@@ -73,7 +77,9 @@ def exact(sprites, panel, resolution=FIELD, sigma=SIGMA):
 
 @pytest.mark.parametrize(("bits", "aim_mag", "range_mag", "aim_px"), AIMS)
 @pytest.mark.parametrize("make", [srgb_response, gamma_response])
-def test_flux_and_moments_are_right_at_every_phase_down_to_the_aim_s_magnitude(bits, aim_mag, range_mag, aim_px, make):
+def test_flux_and_moments_are_right_at_every_phase_down_to_the_aim_s_magnitude(
+    bits, aim_mag, range_mag, aim_px, make
+):
     panel = Panel(make(bits), WHITE)
     for mag in np.linspace(0, range_mag, 9):
         sprites, tile = phases(12, mag)
@@ -119,7 +125,9 @@ def test_whatever_centroider_a_tracker_has_finds_the_star_a_third_as_far_off_as_
     )
     sky = cut(wanted, tile)
     before, after = (family_errors_px(shown, sky, SIGMA[0]) for shown in (rounded, chosen))
-    assert {name: after[name] / before[name] for name in after if after[name] > OF_ROUND * before[name]} == {}
+    assert {
+        name: after[name] / before[name] for name in after if after[name] > OF_ROUND * before[name]
+    } == {}
     flux = 2.5 * np.log10(chosen.sum((1, 2)) / sky.sum((1, 2)))
     assert np.abs(flux).max() <= FLUX_MAG
 
@@ -152,10 +160,16 @@ def test_along_a_path_the_light_is_handed_on():
     panel = Panel(response, WHITE)
     count, nodes, size = 5, 26, (200, 200)
     rng = np.random.default_rng(3)
-    angle, middle = rng.uniform(0, 2 * np.pi, count**2), np.stack(np.meshgrid(*[np.arange(count) * 40 + 20] * 2)).reshape(2, -1)
+    angle, middle = (
+        rng.uniform(0, 2 * np.pi, count**2),
+        np.stack(np.meshgrid(*[np.arange(count) * 40 + 20] * 2)).reshape(2, -1),
+    )
     middle = middle + rng.uniform(-0.5, 0.5, middle.shape)
     along = 15 * ((np.arange(nodes) + 0.5) / nodes - 0.5)
-    x, y = (m[:, None] + turn[:, None] * along for m, turn in zip(middle, (np.cos(angle), np.sin(angle)), strict=True))
+    x, y = (
+        m[:, None] + turn[:, None] * along
+        for m, turn in zip(middle, (np.cos(angle), np.sin(angle)), strict=True)
+    )
     data = sprites_at(x.ravel(), y.ravel(), np.full(x.size, flux_of(5.0) / nodes), size)
     sprites = replace(data, star=np.repeat(np.arange(count**2), nodes), per_star=nodes)
     wanted = linear_image(sprites, size, GaussianPsf(SIGMA))
@@ -171,13 +185,17 @@ def test_along_a_path_the_light_is_handed_on():
 def errors_of_tiles(levels, wanted, panel, tile):
     light, x, y = sums(wanted, tile)
     shown, shown_x, shown_y = sums(shown_light(levels, panel), tile)
-    return np.stack([2.5 * np.log10(shown / light), shown_x / shown - x / light, shown_y / shown - y / light])
+    return np.stack(
+        [2.5 * np.log10(shown / light), shown_x / shown - x / light, shown_y / shown - y / light]
+    )
 
 
 def test_every_pixel_shows_one_of_the_two_levels_about_its_light(rng):
     response = srgb_response(10)
     panel = Panel(response, WHITE)
-    sprites = sprites_at(rng.uniform(5, 150, 60), rng.uniform(5, 110, 60), flux_of(rng.uniform(0, 8, 60)))
+    sprites = sprites_at(
+        rng.uniform(5, 150, 60), rng.uniform(5, 110, 60), flux_of(rng.uniform(0, 8, 60))
+    )
     light = np.minimum(linear_image(sprites, FIELD, GaussianPsf(SIGMA)) / WHITE, 1)
     levels = exact(sprites, panel)
     lower = np.searchsorted(response.light, light * (1 + 1e-6), side="right") - 1
@@ -205,7 +223,9 @@ def test_a_star_under_half_a_step_shows_nothing_and_one_of_a_step_one_code():
     response = srgb_response(8)
     panel = Panel(response, WHITE)
     step = response.light[1] * WHITE
-    sprites = sprites_at([20.2, 60.3, 100.4], [30.1, 60.6, 80.4], np.array([0.49, 0.51, 1.4]) * step)
+    sprites = sprites_at(
+        [20.2, 60.3, 100.4], [30.1, 60.6, 80.4], np.array([0.49, 0.51, 1.4]) * step
+    )
     levels = exact(sprites, panel)
     assert levels.sum() == 2
     assert levels[61, 60] == levels[80, 100] == 1
@@ -237,14 +257,18 @@ def test_overlapping_stars_keep_the_light_of_both():
     assert abs(shown[left].sum() - wanted[left].sum()) < 3 * response.light[1] * WHITE
     assert abs(shown[right].sum() - wanted[right].sum()) < 0.6 * response.light[1] * WHITE
     at = np.arange(FIELD[0])
-    centroid = [image[left].sum(axis=0) @ at[38:64] / image[left].sum() for image in (shown, wanted)]
+    centroid = [
+        image[left].sum(axis=0) @ at[38:64] / image[left].sum() for image in (shown, wanted)
+    ]
     assert abs(centroid[0] - centroid[1]) < 1e-3
 
 
 def test_stars_cut_by_the_edge_show_their_part_of_the_light():
     response = srgb_response(10)
     panel = Panel(response, WHITE)
-    sprites = sprites_at([-0.5, 159.4, 60.2, 100.7], [50.0, 80.3, -1.0, 120.0], flux_of(np.full(4, 3.0)))
+    sprites = sprites_at(
+        [-0.5, 159.4, 60.2, 100.7], [50.0, 80.3, -1.0, 120.0], flux_of(np.full(4, 3.0))
+    )
     levels = exact(sprites, panel)
     wanted = linear_image(sprites, FIELD, GaussianPsf(SIGMA))
     shown = shown_light(levels, panel)
@@ -256,7 +280,9 @@ def test_stars_cut_by_the_edge_show_their_part_of_the_light():
 def test_nothing_remains_of_the_image_before(rng):
     panel = Panel(srgb_response(8), WHITE)
     quantiser = ExactQuantiser(panel, FIELD, GaussianPsf(SIGMA))
-    many = sprites_at(rng.uniform(-5, 165, 200), rng.uniform(-5, 125, 200), flux_of(rng.uniform(-1, 6, 200)))
+    many = sprites_at(
+        rng.uniform(-5, 165, 200), rng.uniform(-5, 125, 200), flux_of(rng.uniform(-1, 6, 200))
+    )
     few = sprites_at([30.3], [40.4], flux_of(2.0))
     alone = quantiser.levels(few).copy()
     assert quantiser.levels(many).astype(bool).sum() > 1000
@@ -266,7 +292,9 @@ def test_nothing_remains_of_the_image_before(rng):
 
 def test_stars_in_several_chunks_are_those_of_one(rng, monkeypatch):
     panel = Panel(srgb_response(8), WHITE)
-    sprites = sprites_at(rng.uniform(-5, 165, 50), rng.uniform(-5, 125, 50), flux_of(rng.uniform(-1, 6, 50)))
+    sprites = sprites_at(
+        rng.uniform(-5, 165, 50), rng.uniform(-5, 125, 50), flux_of(rng.uniform(-1, 6, 50))
+    )
     at_once = exact(sprites, panel)
     monkeypatch.setattr("hilstar.display.exact.CHUNK", 7)
     assert np.array_equal(exact(sprites, panel), at_once)
@@ -280,7 +308,9 @@ def test_a_uniformity_map_is_made_up_for(rng):
     sprites, tile = phases(10, 5.0)
     side = 10 * tile
     y, x = np.mgrid[:side, :side]
-    uniformity = 1 - 0.2 * np.hypot(x - side / 2, y - side / 2) / side + rng.normal(0, 0.05, (side, side))
+    uniformity = (
+        1 - 0.2 * np.hypot(x - side / 2, y - side / 2) / side + rng.normal(0, 0.05, (side, side))
+    )
     panel = Panel(response, WHITE, uniformity.astype(np.float32))
     flux, x_px, y_px = errors(sprites, exact(sprites, panel, (side, side)), panel, SIGMA, tile)
     assert np.abs(flux).max() < 0.002
@@ -294,7 +324,9 @@ def test_under_an_uneven_map_a_faint_star_takes_the_pixel_whose_step_is_nearest_
     panel = Panel(response, WHITE, uniformity)
     step = response.light[1] * WHITE
     # The stars' own pixels make 1.2 steps of light of a code, those beside them 0.7.
-    sprites = sprites_at([21.0, 61.0, 101.0], [30.0, 60.0, 90.0], np.array([0.25, 0.65, 1.1]) * step)
+    sprites = sprites_at(
+        [21.0, 61.0, 101.0], [30.0, 60.0, 90.0], np.array([0.25, 0.65, 1.1]) * step
+    )
     levels = exact(sprites, panel)
     assert levels[:45].max() == 0
     assert levels[45:75, 60].sum() + levels[45:75, 62].sum() == levels[45:75].sum() == 1
@@ -310,10 +342,14 @@ def test_what_cannot_be_shown_is_named_with_its_loss():
     footprints = FootprintMap(FIELD, GaussianPsf(SIGMA))
     light = linear_image(sprites, FIELD, GaussianPsf(SIGMA))[:50, :50]
     shown_mag = star_losses_mag(sprites, panel, footprints, exact(sprites, panel))
-    assert shown_mag[0] == pytest.approx(-2.5 * np.log10(np.minimum(light, WHITE).sum() / light.sum()), abs=1e-3)
+    assert shown_mag[0] == pytest.approx(
+        -2.5 * np.log10(np.minimum(light, WHITE).sum() / light.sum()), abs=1e-3
+    )
     assert np.abs(shown_mag[[1, 3]]).max() < 0.01
     assert np.isinf(shown_mag[2])
-    assert np.isinf(star_losses_mag(sprites, panel, footprints, np.zeros(FIELD[::-1], dtype=np.uint8))).all()
+    assert np.isinf(
+        star_losses_mag(sprites, panel, footprints, np.zeros(FIELD[::-1], dtype=np.uint8))
+    ).all()
 
 
 def test_a_star_within_a_brighter_one_loses_what_that_one_does():

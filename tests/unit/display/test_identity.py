@@ -36,11 +36,17 @@ class Known(NamedTuple):
 def real() -> list[Known]:
     text = Path("tests/data/edids.txt").read_text()
     found = re.findall(r"^# .+?\|(.+)\|(.+)\|(.*)\|(.*)\n([0-9a-f]+)$", text, re.MULTILINE)
-    return [Known(bytes.fromhex(block), maker, int(product), made, name) for maker, product, made, name, block in found]
+    return [
+        Known(bytes.fromhex(block), maker, int(product), made, name)
+        for maker, product, made, name, block in found
+    ]
 
 
 def read_back(identity: MonitorIdentity) -> MonitorIdentity:
-    return msgspec.convert(parse_toml(Path("a.toml"), toml_text({TABLE: identity.known()})).get(TABLE, {}), MonitorIdentity)
+    return msgspec.convert(
+        parse_toml(Path("a.toml"), toml_text({TABLE: identity.known()})).get(TABLE, {}),
+        MonitorIdentity,
+    )
 
 
 def test_30_real_edids_are_read_as_edid_decode_reads_them():
@@ -48,10 +54,16 @@ def test_30_real_edids_are_read_as_edid_decode_reads_them():
     assert len(known) == 30
     for one in known:
         found = edid_identity(one.block)
-        assert (found.maker, found.model) == (one.maker, " ".join(one.name.split()) or f"{one.product:04x}")
+        assert (found.maker, found.model) == (
+            one.maker,
+            " ".join(one.name.split()) or f"{one.product:04x}",
+        )
         made = re.fullmatch(r"(?:week (\d+) of )?(\d{4})", one.made)
         if made:
-            assert (found.week, found.year) == (None if made[1] is None else int(made[1]), int(made[2]))
+            assert (found.week, found.year) == (
+                None if made[1] is None else int(made[1]),
+                int(made[2]),
+            )
         assert bool(found.doubt) == (not found.serial)
     assert len({edid_identity(one.block).edid_sha256 for one in known}) == 30
 
@@ -87,7 +99,10 @@ def test_10_000_damaged_blocks_are_read_or_doubted_and_never_taken_for_the_whole
     [
         ({"edid_sha256": "b" * 64, "serial": "F00BAZ"}, ["another monitor"]),
         ({"edid_sha256": "", "serial": "", "maker": ""}, ["another monitor"]),
-        ({"edid_sha256": "b" * 64}, ["the same monitor with another EDID (another input, or a setting of its menu)"]),
+        (
+            {"edid_sha256": "b" * 64},
+            ["the same monitor with another EDID (another input, or a setting of its menu)"],
+        ),
         ({"connector": "DP-2"}, ["connector DP-1, now DP-2"]),
         ({"mode": "1920x1200@30.00"}, ["mode 1920x1200@59.95, now 1920x1200@30.00"]),
         ({"bits": 10}, ["bits 8, now 10"]),
@@ -113,7 +128,17 @@ PLACEHOLDERS = (
     "0000000000001", "0x00000000", "0x01010101", "16843009", "N/A", "n/a", "serial", "Serial Number", "demoset-1", "123456789",
     "1234567890", "0123456789", "987654321", "0x88888888", "2290649224", "0x20202020", "XXXXXXXX", "11111111", "none", "-",
 )  # fmt: skip
-SERIALS = ("F00BAR", "CN0ABC1234", "7", "16843010", "0x01010102", "1234567891234", "AH1234567", "NA4711X", "L3CMTF012345")
+SERIALS = (
+    "F00BAR",
+    "CN0ABC1234",
+    "7",
+    "16843010",
+    "0x01010102",
+    "1234567891234",
+    "AH1234567",
+    "NA4711X",
+    "L3CMTF012345",
+)
 
 
 def with_serial_text(text):
@@ -152,6 +177,11 @@ def test_a_number_of_one_byte_repeated_is_no_serial_number():
 def test_a_monitor_without_a_serial_number_is_doubted():
     assert not THIS.doubt and THIS.name() == "DEL U2412M, serial F00BAR, on DP-1 at 1920x1200@59.95"
     numberless = msgspec.structs.replace(THIS, serial="")
-    assert numberless.doubt == "DEL U2412M has no serial number: another one of its kind on DP-1 passes for it"
-    assert MonitorIdentity().doubt == "no EDID: the monitor is told apart by connector and mode alone"
+    assert (
+        numberless.doubt
+        == "DEL U2412M has no serial number: another one of its kind on DP-1 passes for it"
+    )
+    assert (
+        MonitorIdentity().doubt == "no EDID: the monitor is told apart by connector and mode alone"
+    )
     assert edid_identity(b"\0" * 128).doubt.startswith("EDID unreadable")

@@ -7,18 +7,28 @@ from dataclasses import replace
 
 import pytest
 
-from hilstar.display.window.output_settings import NVIDIA, OutputState, findings, property_value, size_mm_of
+from hilstar.display.window.output_settings import (
+    NVIDIA,
+    OutputState,
+    findings,
+    property_value,
+    size_mm_of,
+)
 
 PLAIN = OutputState("DP-1", (1920, 1080), preferred_px=((1920, 1080),))
 HALF = (0, 1, 0, 0, 0, 0, 0, 0, 0x80000000 - 2**32, 0, 0, 0, 0, 0, 0, 0, 0, 1)
 UNITY = (0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1)
 
 
-def edid(size_mm: tuple[int, int], size_cm: tuple[int, int] = (60, 34), wide_px: int = 1920) -> bytes:
+def edid(
+    size_mm: tuple[int, int], size_cm: tuple[int, int] = (60, 34), wide_px: int = 1920
+) -> bytes:
     """An EDID whose first detailed timing has that size."""
     (wide, high), block = size_mm, bytearray(128)
     block[21:23] = bytes(size_cm)
-    timing = struct.pack("<HBBBBBBBBBBBBBBBB", 14850, wide_px & 255, 24, wide_px >> 8 << 4, *[0] * 7, *[0] * 6)
+    timing = struct.pack(
+        "<HBBBBBBBBBBBBBBBB", 14850, wide_px & 255, 24, wide_px >> 8 << 4, *[0] * 7, *[0] * 6
+    )
     block[54:72] = timing
     block[66], block[67], block[68] = wide & 255, high & 255, wide >> 8 << 4 | high >> 8
     return bytes(block)
@@ -82,13 +92,19 @@ def test_max_bpc_is_compared_with_the_bench_s_bits():
     ("changes", "words", "refused"),
     [
         ({"mode_px": (1280, 720)}, "--mode 1920x1080", True),
-        ({"mode_px": (1280, 720), "properties": {"scaling mode": "Full aspect"}}, "(scaling mode Full aspect)", True),
+        (
+            {"mode_px": (1280, 720), "properties": {"scaling mode": "Full aspect"}},
+            "(scaling mode Full aspect)",
+            True,
+        ),
         ({"transform": (1.25, 0, 0, 0, 1.25, 0, 0, 0, 1)}, "--transform none", True),
         ({"rotated": True}, "--rotate normal", False),
         ({"providers": ("Intel", "NVIDIA-0")}, "2 GPUs (Intel, NVIDIA-0)", False),
     ],
 )
-def test_a_mode_transform_or_path_that_changes_frames_is_told_with_what_mends_it(changes, words, refused):
+def test_a_mode_transform_or_path_that_changes_frames_is_told_with_what_mends_it(
+    changes, words, refused
+):
     (finding,) = findings(replace(PLAIN, **changes), 8)
     assert words in finding.text and finding.refused == refused
 
@@ -138,7 +154,11 @@ def test_values_of_properties_are_words_integers_or_a_few_of_them():
 
 
 def test_an_output_s_line_and_fields_have_its_properties():
-    state = replace(PLAIN, properties={"max bpc": 8, "Broadcast RGB": "Full"}, edid=edid((598, 336)))
+    state = replace(
+        PLAIN, properties={"max bpc": 8, "Broadcast RGB": "Full"}, edid=edid((598, 336))
+    )
     assert state.line() == "DP-1, 1920 x 1080; Broadcast RGB Full; max bpc 8"
-    assert state.fields()["size_mm"] == (598, 336) and state.fields()["properties"] == state.properties
+    assert (
+        state.fields()["size_mm"] == (598, 336) and state.fields()["properties"] == state.properties
+    )
     assert PLAIN.line().endswith("no properties")

@@ -35,14 +35,20 @@ RGB_NM = np.arange(400.0, 721.0, 10.0)
 
 
 def written(path, spectra, nm=NM):
-    rows = "".join(f"{nm_i:g},{r:.8g},{g:.8g},{b:.8g}\n" for nm_i, r, g, b in zip(nm, *spectra, strict=True))
+    rows = "".join(
+        f"{nm_i:g},{r:.8g},{g:.8g},{b:.8g}\n" for nm_i, r, g, b in zip(nm, *spectra, strict=True)
+    )
     path.write_text(f"wavelength_nm,r,g,b\n{rows}")
     return path
 
 
 def optics_of(passbands):
     return {
-        name: Optics(30.0, Curve(RGB_NM, bump(*passband, RGB_NM)) if passband else load_curve("ccd47-20", ""), GLASS)
+        name: Optics(
+            30.0,
+            Curve(RGB_NM, bump(*passband, RGB_NM)) if passband else load_curve("ccd47-20", ""),
+            GLASS,
+        )
         for name, passband in passbands.items()
     }
 
@@ -54,7 +60,9 @@ def test_the_matrix_is_that_of_a_sum_over_a_fine_grid(tmp_path, panel, passbands
     channels = optics_of(passbands)
     found = channel_matrix(primaries, channels, WHITE_E_PER_S)
     nm = np.arange(350.0, 850.0, 0.002) + 0.001
-    photons = [np.interp(nm, NM, spectrum, left=0, right=0) * nm * GLASS(nm) for spectrum in PANELS[panel]]
+    photons = [
+        np.interp(nm, NM, spectrum, left=0, right=0) * nm * GLASS(nm) for spectrum in PANELS[panel]
+    ]
     seen = [optics.quantum_efficiency(nm) for optics in channels.values()]
     wanted = np.array([[float(p @ q) for p in photons] for q in seen])
     wanted *= WHITE_E_PER_S / wanted.sum()
@@ -66,23 +74,38 @@ def test_the_matrix_is_that_of_a_sum_over_a_fine_grid(tmp_path, panel, passbands
 
 @pytest.mark.parametrize("name", ["lcd", "crt", "oled", "laser"])
 def test_the_shipped_primaries_are_red_green_and_blue_to_a_mosaic(name):
-    found = channel_matrix(read_primaries(resource_path("configs", f"primaries-{name}.csv")), optics_of(PASSBANDS), 1.0)
+    found = channel_matrix(
+        read_primaries(resource_path("configs", f"primaries-{name}.csv")), optics_of(PASSBANDS), 1.0
+    )
     assert (found.e_per_s.argmax(axis=0) == [0, 1, 2]).all() and found.condition < 10
 
 
 def test_a_primary_beyond_a_channels_passband_gives_it_nothing(tmp_path):
-    primaries = read_primaries(written(tmp_path / "p.csv", [bump(k, 10) * (abs(NM - k) < 50) for k in (650, 550, 450)]))
+    primaries = read_primaries(
+        written(tmp_path / "p.csv", [bump(k, 10) * (abs(NM - k) < 50) for k in (650, 550, 450)])
+    )
     channels = {"r": Optics(30.0, Curve(np.array([600.0, 700.0]), np.ones(2)), constant_curve(1.0))}
     (row,) = channel_matrix(primaries, channels, 1.0).e_per_s
-    assert row[0] == pytest.approx(1, abs=1e-9) and row[2] == 0 and row[1] == pytest.approx(0, abs=1e-9)
-    infrared = {"r": Optics(30.0, Curve(np.array([900.0, 1000.0]), np.ones(2)), constant_curve(1.0))}
+    assert (
+        row[0] == pytest.approx(1, abs=1e-9)
+        and row[2] == 0
+        and row[1] == pytest.approx(0, abs=1e-9)
+    )
+    infrared = {
+        "r": Optics(30.0, Curve(np.array([900.0, 1000.0]), np.ones(2)), constant_curve(1.0))
+    }
     with pytest.raises(InputError, match="detects none of this light"):
         channel_matrix(primaries, infrared, 1.0)
 
 
 def test_channels_of_one_colour_have_no_condition_number(tmp_path):
     primaries = read_primaries(written(tmp_path / "p.csv", PANELS["lcd"]))
-    assert channel_matrix(primaries, optics_of({"r": None, "g": None, "b": PASSBANDS["b"]}), 1.0).condition is None
+    assert (
+        channel_matrix(
+            primaries, optics_of({"r": None, "g": None, "b": PASSBANDS["b"]}), 1.0
+        ).condition
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -109,24 +132,39 @@ def test_a_wrong_file_is_one_line(tmp_path, text, words):
 def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path):
     written(tmp_path / "p.csv", PANELS["oled"])
     for name, passband in PASSBANDS.items():
-        rows = "".join(f"{nm:g},{value:.8f}\n" for nm, value in zip(RGB_NM, bump(*passband, RGB_NM), strict=True))
+        rows = "".join(
+            f"{nm:g},{value:.8f}\n"
+            for nm, value in zip(RGB_NM, bump(*passband, RGB_NM), strict=True)
+        )
         (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
     bench = tmp_path / "bench.toml"
-    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in PASSBANDS}
-    tables = {"monitor.primaries": {"file": "p.csv"}, "render": {"quantisation": "round", "flux_at_white_e_per_s": 3e5}}
+    keys = {"quantum_efficiency": None} | {
+        f"quantum_efficiency_{name}": f"{name}.csv" for name in PASSBANDS
+    }
+    tables = {
+        "monitor.primaries": {"file": "p.csv"},
+        "render": {"quantisation": "round", "flux_at_white_e_per_s": 3e5},
+    }
     bench.write_text(bench_text({"tracker": keys, "sky": {"faintest_v_mag": 5.0}}, tables))
     whole = json.loads(run_hilstar_here("budget", bench, "--json").stdout)
     found, red = whole["primaries"], whole["near_infrared"]
     # 1 % of red at 711 nm
-    assert [row["from_nm"] for row in red] == [700.0] * 4 + [710.0] * 4 and red[4]["channel"] == "all"
+    assert [row["from_nm"] for row in red] == [700.0] * 4 + [710.0] * 4 and red[4][
+        "channel"
+    ] == "all"
     assert set(red[5]["by_class"]) == set("OBAFGKM")
     wanted = channel_matrix(read_primaries(tmp_path / "p.csv"), optics_of(PASSBANDS), WHITE_E_PER_S)
     digits = 1e-8 * WHITE_E_PER_S  # of the files
     np.testing.assert_allclose(found["e_per_s"], wanted.e_per_s, rtol=1e-6, atol=digits)
-    assert found["channels"] == list(keys)[1:] and found["condition"] == pytest.approx(wanted.condition, rel=1e-6)
+    assert found["channels"] == list(keys)[1:] and found["condition"] == pytest.approx(
+        wanted.condition, rel=1e-6
+    )
     printed = run_hilstar_here("budget", bench).stdout
     assert f"condition number      {wanted.condition:.2f}, electrons of each channel" in printed
-    assert f"quantum_efficiency_g  r {wanted.e_per_s[1, 0]:.4g} e-/s, g {wanted.e_per_s[1, 1]:.4g} e-/s" in printed
+    assert (
+        f"quantum_efficiency_g  r {wanted.e_per_s[1, 0]:.4g} e-/s, g {wanted.e_per_s[1, 1]:.4g} e-/s"
+        in printed
+    )
 
 
 @pytest.mark.parametrize(("first", "unit"), [(3800, "angstrom"), (0.38, "um")])

@@ -54,7 +54,9 @@ def test_the_mask_has_no_low_frequencies(rng):
     assert share(rng.permutation(blue_noise().ravel()).reshape(64, 64)) > 0.5
 
 
-@pytest.mark.parametrize("response", [srgb_response(8), srgb_response(10), gamma_response(10)], ids=["8", "10", "gamma"])
+@pytest.mark.parametrize(
+    "response", [srgb_response(8), srgb_response(10), gamma_response(10)], ids=["8", "10", "gamma"]
+)
 def test_the_mean_of_dither_over_the_mask_is_the_light_wanted(response, rng):
     panel = Panel(response, WHITE)
     for light in [*rng.uniform(0, 1, 10), *rng.uniform(0, 0.01, 10), response.light[3], 1e-4]:
@@ -69,7 +71,9 @@ def test_round_misses_the_mean_that_dither_has():
     panel = Panel(response, WHITE)
     light = 0.7 * response.light[10] + 0.3 * response.light[11]
     image = np.full((64, 64), light * WHITE, dtype=np.float32)
-    assert abs(shown_light(round_levels(image, panel), panel).mean() / WHITE - light) > 0.2 * steps_of(light, response)
+    assert abs(
+        shown_light(round_levels(image, panel), panel).mean() / WHITE - light
+    ) > 0.2 * steps_of(light, response)
 
 
 def test_dither_shows_one_of_the_two_levels_about_the_light(rng):
@@ -92,7 +96,9 @@ def test_a_level_s_own_light_is_never_dithered():
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 8, 16, 32, 64])
 @pytest.mark.parametrize("start", [0, 3])
-def test_over_aligned_turns_of_the_mask_the_error_is_under_a_step_over_their_number(frames, start, rng):
+def test_over_aligned_turns_of_the_mask_the_error_is_under_a_step_over_their_number(
+    frames, start, rng
+):
     response = srgb_response(8)
     panel = Panel(response, WHITE)
     light = rng.uniform(0, 0.9, (40, 50)) ** 2
@@ -141,12 +147,26 @@ def test_a_uniformity_that_is_not_positive_is_refused(worst):
 def test_round_without_a_map_is_the_encoder_s_oracle(rng):
     image = (WHITE * rng.uniform(0, 1.2, (50, 60))).astype(np.float32)
     response = srgb_response(10)
-    assert np.array_equal(round_levels(image, Panel(response, WHITE)), encode(image, response, WHITE))
+    assert np.array_equal(
+        round_levels(image, Panel(response, WHITE)), encode(image, response, WHITE)
+    )
 
 
-@pytest.mark.parametrize("response", [srgb_response(1), srgb_response(10), gamma_response(12)], ids=["1", "10", "gamma"])
+@pytest.mark.parametrize(
+    "response", [srgb_response(1), srgb_response(10), gamma_response(12)], ids=["1", "10", "gamma"]
+)
 def test_the_counter_counts_as_a_search_does(response, rng):
     thresholds = response.threshold.astype(np.float32)
-    edges = np.concatenate([thresholds, np.nextafter(thresholds, np.float32(0)), np.nextafter(thresholds, np.float32(2))])
-    light = np.concatenate([edges, rng.uniform(0, 1, 1000).astype(np.float32) ** 4, np.zeros(1, np.float32)])
-    assert np.array_equal(ThresholdCounter(thresholds).count(light), np.searchsorted(thresholds, light, side="right"))
+    edges = np.concatenate(
+        [
+            thresholds,
+            np.nextafter(thresholds, np.float32(0)),
+            np.nextafter(thresholds, np.float32(2)),
+        ]
+    )
+    light = np.concatenate(
+        [edges, rng.uniform(0, 1, 1000).astype(np.float32) ** 4, np.zeros(1, np.float32)]
+    )
+    assert np.array_equal(
+        ThresholdCounter(thresholds).count(light), np.searchsorted(thresholds, light, side="right")
+    )

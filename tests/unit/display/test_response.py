@@ -37,7 +37,10 @@ def test_a_code_s_own_light_is_encoded_as_that_code(bits):
 def test_the_nearest_code_is_chosen(bits, rng):
     response = srgb_response(bits)
     light = rng.uniform(0, 1, 20_000)
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055) * response.white
+    signal = (
+        np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        * response.white
+    )
     clear = np.abs(signal - np.floor(signal) - 0.5) > 1e-3  # not at a tie, which float32 may turn
     codes = encode(light.astype(np.float32), response, 1.0)
     assert np.array_equal(codes[clear], np.rint(signal)[clear])
@@ -45,7 +48,9 @@ def test_the_nearest_code_is_chosen(bits, rng):
 
 def test_what_is_over_white_is_white_and_darkness_is_black():
     response = srgb_response(8)
-    assert encode(np.array([0, 1e-9, 1, 1.0001, 1e12, np.inf], np.float32), response, 1.0).tolist() == [
+    assert encode(
+        np.array([0, 1e-9, 1, 1.0001, 1e12, np.inf], np.float32), response, 1.0
+    ).tolist() == [
         0,
         0,
         255,
@@ -61,9 +66,15 @@ def test_the_renderer_s_table_counts_thresholds(bits, white, rng):
     """What encode.frag does with the table, in NumPy, against a plain search."""
     thresholds = srgb_response(bits).thresholds_e_per_s(white)
     table = code_table(thresholds)
-    edges = np.concatenate([thresholds, np.nextafter(thresholds, 0), np.nextafter(thresholds, np.inf)])
-    light = np.concatenate([edges, np.float32(white) * rng.uniform(0, 1.1, 5000) ** 4, [0]]).astype(np.float32)
-    place = np.clip((light.view(np.int32) >> table.bin_shift) - table.first_bin, 0, len(table.first_code) - 1)
+    edges = np.concatenate(
+        [thresholds, np.nextafter(thresholds, 0), np.nextafter(thresholds, np.inf)]
+    )
+    light = np.concatenate([edges, np.float32(white) * rng.uniform(0, 1.1, 5000) ** 4, [0]]).astype(
+        np.float32
+    )
+    place = np.clip(
+        (light.view(np.int32) >> table.bin_shift) - table.first_bin, 0, len(table.first_code) - 1
+    )
     codes = table.first_code[place].astype(int)
     for _ in range(len(thresholds)):
         more = codes < len(thresholds)
@@ -83,10 +94,16 @@ def test_one_word_a_bin_says_the_level(bits, white, rng):
     thresholds = srgb_response(bits).thresholds_e_per_s(white)
     table = code_table(thresholds)
     steps = table.steps()
-    edges = np.concatenate([thresholds, np.nextafter(thresholds, 0), np.nextafter(thresholds, np.inf)])
-    light = np.concatenate([edges, np.float32(white) * rng.uniform(0, 1.1, 5000) ** 4, [0, 1e-38, 3e38]]).astype(np.float32)
+    edges = np.concatenate(
+        [thresholds, np.nextafter(thresholds, 0), np.nextafter(thresholds, np.inf)]
+    )
+    light = np.concatenate(
+        [edges, np.float32(white) * rng.uniform(0, 1.1, 5000) ** 4, [0, 1e-38, 3e38]]
+    ).astype(np.float32)
     lowest, shift = (table.first_bin - 1) << table.bin_shift, table.bin_shift
-    found = np.clip(light.view(np.int32).astype(np.int64), lowest, lowest + (len(steps) << shift) - 1)
+    found = np.clip(
+        light.view(np.int32).astype(np.int64), lowest, lowest + (len(steps) << shift) - 1
+    )
     word = steps[(found - lowest) >> shift].astype(np.int64)
     level = (word >> (shift + 1)) + ((found & ((1 << shift) - 1)) >= (word & ((2 << shift) - 1)))
     assert np.array_equal(level, np.searchsorted(thresholds, light, side="right"))
@@ -127,7 +144,9 @@ def test_bit_stealing_has_six_levels_between_greys():
     assert np.array_equal(codes, np.arange(1786))
 
 
-@pytest.mark.parametrize(("weights", "levels"), [((1, 1, 1), 255 * 3 + 1), ((1, 0, 0), 256), ((2, 2, 1), 255 * 5 + 1)])
+@pytest.mark.parametrize(
+    ("weights", "levels"), [((1, 1, 1), 255 * 3 + 1), ((1, 0, 0), 256), ((2, 2, 1), 255 * 5 + 1)]
+)
 def test_triples_of_the_same_light_are_one_level_and_greys_stay(weights, levels):
     grey = gamma_response(8)
     response = bit_stealing_response((grey, grey, grey), weights)

@@ -11,7 +11,12 @@ from hilstar.display.calibration import load_calibration
 from hilstar.display.quantise import Panel, shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import gamma_response, srgb_response, table_response
-from hilstar.display.temporal import MAX_CARRIED_STEPS, NONE_BEFORE, TemporalQuantiser, places_before
+from hilstar.display.temporal import (
+    MAX_CARRIED_STEPS,
+    NONE_BEFORE,
+    TemporalQuantiser,
+    places_before,
+)
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px, moment
@@ -50,11 +55,23 @@ def places(shift_x=0.0, shift_y=0.0):
 
 def stars(x, y, flux, numbers=None, size=SIZE):
     numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, size, GaussianPsf(SIGMA).footprint_px)
+    return pack_sprites(
+        x,
+        y,
+        np.broadcast_to(np.asarray(flux, float), x.shape),
+        numbers,
+        size,
+        GaussianPsf(SIGMA).footprint_px,
+    )
 
 
 def tiles(image):
-    return np.asarray(image.reshape(SIDE, TILE, SIDE, TILE).transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)[:, :-1, :-1], float)
+    return np.asarray(
+        image.reshape(SIDE, TILE, SIDE, TILE)
+        .transpose(0, 2, 1, 3)
+        .reshape(-1, TILE, TILE)[:, :-1, :-1],
+        float,
+    )
 
 
 def shown(panel, frames):
@@ -79,7 +96,9 @@ def worst(frames, wanted, every=1):
     the worst exposure / OF_FEW.
     """
     errors = []
-    for mean, sky in zip(exposures(frames, every=every), exposures(wanted, every=every), strict=True):
+    for mean, sky in zip(
+        exposures(frames, every=every), exposures(wanted, every=every), strict=True
+    ):
         flux = 2.5 * np.log10(mean.sum((1, 2)) / sky.sum((1, 2)))
         errors.append([np.sqrt(np.mean(flux**2)), *family_errors_px(mean, sky, SIGMA[0]).values()])
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), np.max(errors, axis=0) / OF_FEW)
@@ -109,7 +128,10 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(name
 def test_a_slow_star_is_as_right_as_a_still_one(make):
     """0.1 px a frame, each star another way."""
     way = np.arange(SIDE**2) * 2.4
-    frames = [stars(*places(0.1 * (n - 6) * np.cos(way), 0.1 * (n - 6) * np.sin(way)), flux_of(6.0)) for n in range(13)]
+    frames = [
+        stars(*places(0.1 * (n - 6) * np.cos(way), 0.1 * (n - 6) * np.sin(way)), flux_of(6.0))
+        for n in range(13)
+    ]
     flux_mag, *off_px = worst(shown(Panel(make(8), WHITE), frames), skies(frames), every=3)
     assert flux_mag < AIM_MAG
     assert max(off_px) < AIM_PX
@@ -124,26 +146,35 @@ def test_a_fast_star_has_its_light_and_its_middle():
     for n in range(9):
         at = np.repeat((n - 4) * 1.2, 2 * SIDE**2) + np.tile([-0.3, 0.3], SIDE**2)
         x, y = (
-            np.repeat(place, 2) + at * turn(np.repeat(way, 2)) for place, turn in zip(places(), (np.cos, np.sin), strict=True)
+            np.repeat(place, 2) + at * turn(np.repeat(way, 2))
+            for place, turn in zip(places(), (np.cos, np.sin), strict=True)
         )
-        frames.append(replace(stars(x, y, flux_of(6.0) / 2, np.repeat(np.arange(SIDE**2), 2)), per_star=2))
+        frames.append(
+            replace(stars(x, y, flux_of(6.0) / 2, np.repeat(np.arange(SIDE**2), 2)), per_star=2)
+        )
     lit, sky = shown(panel, frames), skies(frames)
     for mean, wanted in zip(exposures(lit), exposures(sky), strict=True):
         flux = 2.5 * np.log10(mean.sum((1, 2)) / wanted.sum((1, 2)))
         assert np.sqrt(np.mean(flux**2)) < AIM_MAG
         # Half a step of light at 3.6 px from the middle, of 6 x 66 steps: 0.0026 px rms along the
         # path beside the aim.
-        assert np.sqrt(np.mean(np.square(np.subtract(moment(mean), moment(wanted))))) < AIM_PX + 0.0026
+        assert (
+            np.sqrt(np.mean(np.square(np.subtract(moment(mean), moment(wanted))))) < AIM_PX + 0.0026
+        )
 
 
-@pytest.mark.parametrize(("bits", "steps"), [(8, 30.3), (8, 0.43), (2, 12.2), (1, 4.7), (1, 0.43), (1, 0.031)])
+@pytest.mark.parametrize(
+    ("bits", "steps"), [(8, 30.3), (8, 0.43), (2, 12.2), (1, 4.7), (1, 0.43), (1, 0.031)]
+)
 def test_on_few_equal_levels_the_light_of_any_exposure_is_within_a_step(bits, steps):
     """No panel could do better; and its place is then right with the number of frames."""
     panel = Panel(linear(bits), WHITE)
     step = panel.response.light[1] * WHITE
     sprites = stars(*places(), steps * step)
     frames = shown(panel, [sprites] * (60 if steps > 1 else 120))
-    light = np.cumsum(np.concatenate([np.zeros((1, SIDE**2)), frames.sum((2, 3)) / step - steps]), axis=0)
+    light = np.cumsum(
+        np.concatenate([np.zeros((1, SIDE**2)), frames.sum((2, 3)) / step - steps]), axis=0
+    )
     assert np.ptp(light, axis=0).max() <= ONE_STEP
     asked = steps * len(frames)
     if asked > 50:
@@ -171,8 +202,12 @@ def test_a_clipped_star_is_right_again_after_it_clips(over):
         quantiser.levels(bright)
     assert np.abs(quantiser.left.error).max() < 4 * MAX_CARRIED_STEPS * step
     quantiser.levels(fine)
-    after = np.stack([tiles(shown_light(quantiser.levels(fine), panel)) for _ in range(FRAMES)]).mean(axis=0)
-    flux = 2.5 * np.log10(after.sum((1, 2)) / tiles(linear_image(fine, SIZE, GaussianPsf(SIGMA))).sum((1, 2)))
+    after = np.stack(
+        [tiles(shown_light(quantiser.levels(fine), panel)) for _ in range(FRAMES)]
+    ).mean(axis=0)
+    flux = 2.5 * np.log10(
+        after.sum((1, 2)) / tiles(linear_image(fine, SIZE, GaussianPsf(SIGMA))).sum((1, 2))
+    )
     assert np.abs(flux).max() < AIM_MAG
 
 
@@ -180,13 +215,22 @@ def test_a_star_that_comes_back_begins_anew_and_the_others_go_on():
     panel = Panel(srgb_response(8), WHITE)
     x, y = places()
     both = stars(x[:2], y[:2], flux_of([6.0, 6.3]))
-    first = replace(both, data=both.data[:1], star=both.star[:1], x_px=both.x_px[:1], y_px=both.y_px[:1])
-    gone, stays = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)), TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
+    first = replace(
+        both, data=both.data[:1], star=both.star[:1], x_px=both.x_px[:1], y_px=both.y_px[:1]
+    )
+    gone, stays = (
+        TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)),
+        TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)),
+    )
     seen = [gone.levels(sprites).copy() for sprites in (both, both, first, both, both)]
     alone = [stays.levels(first).copy() for _ in range(5)]
     left, right = np.s_[:TILE, :TILE], np.s_[:TILE, TILE : 2 * TILE]
-    assert [np.array_equal(a[left], b[left]) for a, b in zip(seen, alone, strict=True)] == [True] * 5
-    assert np.array_equal(seen[3][right], seen[0][right]) and np.array_equal(seen[4][right], seen[1][right])
+    assert [np.array_equal(a[left], b[left]) for a, b in zip(seen, alone, strict=True)] == [
+        True
+    ] * 5
+    assert np.array_equal(seen[3][right], seen[0][right]) and np.array_equal(
+        seen[4][right], seen[1][right]
+    )
     assert not np.array_equal(seen[1][right], seen[0][right])
     assert gone.levels(None).max() == 0
     assert np.array_equal(gone.levels(both), seen[0])
@@ -196,21 +240,35 @@ def test_a_star_is_known_by_its_number_in_whatever_order_they_come(rng):
     """Also light that a fault adds, whose numbers are negative."""
     panel = Panel(srgb_response(8), WHITE)
     sprites = stars(*places(), flux_of(6.0), np.arange(SIDE**2) - 5)
-    straight, mixed = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)), TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
+    straight, mixed = (
+        TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)),
+        TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)),
+    )
     for _ in range(4):
         order = rng.permutation(len(sprites))
         other = replace(
-            sprites, data=sprites.data[order], star=sprites.star[order], x_px=sprites.x_px[order], y_px=sprites.y_px[order]
+            sprites,
+            data=sprites.data[order],
+            star=sprites.star[order],
+            x_px=sprites.x_px[order],
+            y_px=sprites.y_px[order],
         )
         assert np.array_equal(straight.levels(sprites), mixed.levels(other))
-    assert places_before(np.array([7, -2, 7]), np.array([-2, 3, 7, 900])).tolist() == [1, NONE_BEFORE, 2, NONE_BEFORE]
+    assert places_before(np.array([7, -2, 7]), np.array([-2, 3, 7, 900])).tolist() == [
+        1,
+        NONE_BEFORE,
+        2,
+        NONE_BEFORE,
+    ]
 
 
 def test_each_star_has_its_last_place_of_the_frame_before(rng):
     for count in (1, 5, 200):
         before, star = rng.integers(-20, 300, count), rng.integers(-25, 310, 150)
         places = {number: place for place, number in enumerate(before.tolist())}
-        assert places_before(before, star).tolist() == [places.get(number, NONE_BEFORE) for number in star.tolist()]
+        assert places_before(before, star).tolist() == [
+            places.get(number, NONE_BEFORE) for number in star.tolist()
+        ]
     assert places_before(before[:0], star).max() == places_before(None, star).max() == NONE_BEFORE
 
 

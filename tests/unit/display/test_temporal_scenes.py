@@ -16,4 +16,6 @@ from tests.support.exact_scenes import FRAMES, SCENES, SIDE, assert_right_over_f
 def test_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_nothing(name):
     scene = SCENES[name]()
     quantiser = TemporalQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px))
-    assert_right_over_frames([shown_light(quantiser.levels(scene.sprites), scene.panel) for _ in range(FRAMES)], scene)
+    assert_right_over_frames(
+        [shown_light(quantiser.levels(scene.sprites), scene.panel) for _ in range(FRAMES)], scene
+    )

@@ -16,7 +16,11 @@ from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIZE, FOOTPRINT = (1920, 1080), 10
-STARTS = {"equator": (84.0, -1.2, 10.0), "pole": (10.0, 90.0, 0.0), "beside the pole": (200.0, -88.5, 45.0)}
+STARTS = {
+    "equator": (84.0, -1.2, 10.0),
+    "pole": (10.0, 90.0, 0.0),
+    "beside the pole": (200.0, -88.5, 45.0),
+}
 STEPS = 12
 
 
@@ -27,7 +31,9 @@ def sky():
 
 
 def camera_of(focal_mm: float, lens: Lens | None = None):
-    return bounded(replace(monitor_camera(SIZE, 57.65, focal_mm, IDENTITY), lens=lens), FOOTPRINT / 2 + 1)
+    return bounded(
+        replace(monitor_camera(SIZE, 57.65, focal_mm, IDENTITY), lens=lens), FOOTPRINT / 2 + 1
+    )
 
 
 def assert_same(kept: Sprites, fresh: Sprites) -> None:
@@ -49,7 +55,11 @@ def test_sprites_are_those_of_a_fresh_look(sky, start, focal_mm, step_of_limit, 
 
 
 def test_a_lens_has_them_too(sky, rng):
-    camera, candidates, q = camera_of(60.0, Lens(radial=(0.05, 0.0, 0.0))), Candidates(), from_radec_roll_deg(30.0, 40.0, 50.0)
+    camera, candidates, q = (
+        camera_of(60.0, Lens(radial=(0.05, 0.0, 0.0))),
+        Candidates(),
+        from_radec_roll_deg(30.0, 40.0, 50.0),
+    )
     for _ in range(STEPS):
         q = propagate(q, rng.normal(size=3), 0.2 * KEPT_TURN_RAD)
         kept = make_sprites(sky, to_matrix(q), camera, FOOTPRINT, candidates)
@@ -60,7 +70,9 @@ def test_stars_are_looked_for_again_beyond_the_turn_alone(sky):
     camera, candidates, q = camera_of(200.0), Candidates(), from_radec_roll_deg(30.0, 40.0, 50.0)
     first = candidates.near(sky, to_matrix(q), camera, 6.0)[0]
     for rate in np.eye(3):
-        within, beyond = (to_matrix(propagate(q, rate, share * KEPT_TURN_RAD)) for share in (0.99, 1.01))
+        within, beyond = (
+            to_matrix(propagate(q, rate, share * KEPT_TURN_RAD)) for share in (0.99, 1.01)
+        )
         assert candidates.near(sky, within, camera, 6.0)[0] is first
         candidates.near(sky, beyond, camera, 6.0)
         again = candidates.near(sky, to_matrix(q), camera, 6.0)[0]
@@ -69,7 +81,11 @@ def test_stars_are_looked_for_again_beyond_the_turn_alone(sky):
 
 
 def test_other_stars_lights_observers_and_cameras_are_not_mistaken(sky, rng):
-    camera, candidates, turn = camera_of(200.0), Candidates(), to_matrix(from_radec_roll_deg(30.0, 40.0, 50.0))
+    camera, candidates, turn = (
+        camera_of(200.0),
+        Candidates(),
+        to_matrix(from_radec_roll_deg(30.0, 40.0, 50.0)),
+    )
     others = stars_at(rng.normal(size=(len(sky), 3)), np.ones(len(sky)))
     fainter = replace(sky, electrons_per_s=sky.electrons_per_s / 2)
     moving = sky.seen_at(np.array([12_000.0, -9_000.0, 4_000.0]))

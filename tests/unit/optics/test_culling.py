@@ -35,7 +35,9 @@ def sky():
 def seen_by_all(stars, icrs_to_image: np.ndarray, camera: Camera) -> np.ndarray:
     """Every star whose footprint touches the image, by projecting all of them."""
     x_px, y_px = camera.project(stars.directions(np.arange(len(stars))) @ icrs_to_image.T)
-    return pack_sprites(x_px, y_px, stars.electrons_per_s, np.arange(len(stars)), SIZE, FOOTPRINT).star
+    return pack_sprites(
+        x_px, y_px, stars.electrons_per_s, np.arange(len(stars)), SIZE, FOOTPRINT
+    ).star
 
 
 def in_cells_of(stars, cell_deg: float):
@@ -81,11 +83,16 @@ def test_a_crowd_clips_where_the_light_of_all_is_over_white(count, rng):
     light = rng.uniform(0.3, 1.2, count) / GaussianPsf(SIGMA).peak_share
     sprites = pack_sprites(x, y, light, np.arange(count), size, FOOTPRINT)
     column, row = np.rint(sprites.x_px), np.rint(sprites.y_px)
-    shares = [pixel_shares(place - own[:, None], SIGMA[0]) for place, own in ((column, sprites.x_px), (row, sprites.y_px))]
+    shares = [
+        pixel_shares(place - own[:, None], SIGMA[0])
+        for place, own in ((column, sprites.x_px), (row, sprites.y_px))
+    ]
     total = sprites.data["electrons_per_s"] @ (shares[0] * shares[1])
     on_image = (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
     bright = sprites.data["electrons_per_s"] > 0.5 / GaussianPsf(SIGMA).peak_share
     over = total > 1 + CLIP_TOLERANCE
     sure = np.abs(total - 1) > 1e-5  # of white: footprints cut 1e-6 of a star
-    clipped = np.isin(np.arange(len(sprites)), clipped_sprites(sprites, GaussianPsf(SIGMA), 1.0, size))
+    clipped = np.isin(
+        np.arange(len(sprites)), clipped_sprites(sprites, GaussianPsf(SIGMA), 1.0, size)
+    )
     assert np.array_equal(clipped[sure], (over & on_image & bright)[sure])

@@ -24,13 +24,21 @@ SIGMA = (0.85, 0.6)
 
 
 def motion(rate_deg_s, exposure_s=1.0, radec=(84.0, -1.0, 20.0)) -> Motion:
-    return Motion(from_radec_roll_deg(*radec), np.radians(np.array(rate_deg_s, dtype=float)), exposure_s)
+    return Motion(
+        from_radec_roll_deg(*radec), np.radians(np.array(rate_deg_s, dtype=float)), exposure_s
+    )
 
 
 def star_on(pixel, at: Motion, flux=1.0):
     """One star that is at `pixel` in the middle of the exposure."""
     image = np.array(
-        [[pixel[0] - CAMERA.principal_point_px[0], pixel[1] - CAMERA.principal_point_px[1], CAMERA.focal_length_px]]
+        [
+            [
+                pixel[0] - CAMERA.principal_point_px[0],
+                pixel[1] - CAMERA.principal_point_px[1],
+                CAMERA.focal_length_px,
+            ]
+        ]
     )
     return stars_at(image @ at.icrs_to_image(MIDDLE_S, CAMERA)[0], np.array([flux]))
 
@@ -42,17 +50,32 @@ def brute_force(stars, at: Motion, steps: int) -> np.ndarray:
         seconds = ((k + 0.5) / steps - 0.5) * at.exposure_s
         q = propagate(at.q_icrs_to_cam, at.rate_cam_rad_s, seconds)
         instants.append(make_sprites(stars, to_matrix(q), CAMERA, GaussianPsf(SIGMA).footprint_px))
-    return linear_image(join_sprites(instants, GaussianPsf(SIGMA).footprint_px), SIZE, GaussianPsf(SIGMA)) / steps
+    return (
+        linear_image(
+            join_sprites(instants, GaussianPsf(SIGMA).footprint_px), SIZE, GaussianPsf(SIGMA)
+        )
+        / steps
+    )
 
 
 @pytest.mark.parametrize(
     "rate",
-    [(0.0005, 0, 0), (0.003, 0.002, 0), (0.05, 0, 0), (0, 0.1, 0.3), (0.1, -0.2, 3.0), (0, 0, 40.0), (1.0, 0.5, 0)],
+    [
+        (0.0005, 0, 0),
+        (0.003, 0.002, 0),
+        (0.05, 0, 0),
+        (0, 0.1, 0.3),
+        (0.1, -0.2, 3.0),
+        (0, 0, 40.0),
+        (1.0, 0.5, 0),
+    ],
 )
 def test_a_path_is_the_mean_of_its_instants(rate):
     at = motion(rate)
     stars = star_on((200.3, 90.6), at)
-    drawn = linear_image(smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA)), SIZE, GaussianPsf(SIGMA))
+    drawn = linear_image(
+        smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA)), SIZE, GaussianPsf(SIGMA)
+    )
     path_px = np.radians(np.hypot(*rate[:2]) * CAMERA.focal_length_px + abs(rate[2]) * SIZE[0] / 4)
     exact = brute_force(stars, at, max(400, round(38 * path_px)))
     # The mean of midpoints is itself off by (path / steps)^2 / 24 times the PSF's curvature: 1e-7
@@ -67,7 +90,9 @@ def test_flux_is_conserved_along_every_path():
         sprites = smeared_sprites(star_on((160.2, 120.7), at, 1e6), at, CAMERA, GaussianPsf(SIGMA))
         # Gauss-Legendre weights and float32 fluxes: a few 1e-8.
         assert sprites.data["electrons_per_s"].sum(dtype=np.float64) == pytest.approx(1e6, rel=3e-7)
-        assert linear_image(sprites, SIZE, GaussianPsf(SIGMA)).sum() == pytest.approx(1e6, rel=3e-7 + MAX_CUT)
+        assert linear_image(sprites, SIZE, GaussianPsf(SIGMA)).sum() == pytest.approx(
+            1e6, rel=3e-7 + MAX_CUT
+        )
 
 
 def test_a_camera_at_rest_has_one_sprite_a_star():
@@ -122,7 +147,9 @@ def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
 @pytest.mark.parametrize("rate", [(1e9, 0, 0), (0, 0, 1e12), (3e5, 1e5, 0)])
 def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
     at = motion(rate)
-    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"):
+    with pytest.raises(
+        InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"
+    ):
         smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, GaussianPsf(SIGMA))
 
 
@@ -134,6 +161,8 @@ def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkey
     coarse = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA))
     assert len(coarse) <= len(whole) // 2
     assert (whole.capped, coarse.capped) == (0, len(np.unique(whole.star)))
-    light = [float(sprites.data["electrons_per_s"].sum(dtype=np.float64)) for sprites in (whole, coarse)]
+    light = [
+        float(sprites.data["electrons_per_s"].sum(dtype=np.float64)) for sprites in (whole, coarse)
+    ]
     # paths end at the image's edge, a node more or less
     assert light[1] == pytest.approx(light[0], rel=0.02)

@@ -54,7 +54,8 @@ PIXELS = [(30.0, 12.0), (160.0, 120.0), (290.3, 229.5)]
 
 
 @pytest.mark.parametrize(
-    ("down", "axis", "sign", "rows"), [((0, 1), 1, 1, 240), ((0, -1), 1, -1, 240), ((1, 0), 0, 1, 320), ((-1, 0), 0, -1, 320)]
+    ("down", "axis", "sign", "rows"),
+    [((0, 1), 1, 1, 240), ((0, -1), 1, -1, 240), ((1, 0), 0, 1, 320), ((-1, 0), 0, -1, 320)],
 )
 def test_each_star_is_where_it_is_when_its_own_row_lights(down, axis, sign, rows):
     stars, at = stars_on(PIXELS), turn((1.0, -1.0, 3.0))
@@ -77,7 +78,12 @@ def test_a_path_is_the_mean_of_its_instants_and_keeps_its_flux(rate):
     exact = np.zeros_like(drawn)
     for k in range(steps):
         q = propagate(Q, at.rate_cam_rad_s, (k + 0.5) / steps * FRAME_S)
-        exact += linear_image(make_sprites(stars, to_matrix(q), CAMERA, FOOTPRINT), SIZE, GaussianPsf(SIGMA)) / steps
+        exact += (
+            linear_image(
+                make_sprites(stars, to_matrix(q), CAMERA, FOOTPRINT), SIZE, GaussianPsf(SIGMA)
+            )
+            / steps
+        )
     assert np.abs(drawn - exact).max() < PIXEL_LIMIT
     assert drawn.sum() == pytest.approx(exact.sum(), rel=1e-5)
     assert sprites.star_count == 1
@@ -110,7 +116,9 @@ def test_a_camera_at_rest_draws_the_same_points_as_ever():
 def test_stars_that_come_in_during_the_frame_are_drawn():
     """One that is 30 px outside at the first row's light and inside when the last row lights."""
     at = turn((30.0, 0, 0))
-    inside_later = np.diff([place_px(stars_on([(160.0, 120.0)]), at, s)[0, 1] for s in (0.0, FRAME_S)])[0]
+    inside_later = np.diff(
+        [place_px(stars_on([(160.0, 120.0)]), at, s)[0, 1] for s in (0.0, FRAME_S)]
+    )[0]
     outside = -30.0 if inside_later > 0 else SIZE[1] + 30.0
     stars = stars_on([(160.0, outside)])
     assert len(make_sprites(stars, CAMERA.cam_to_image @ to_matrix(Q), CAMERA, FOOTPRINT)) == 0
@@ -128,12 +136,16 @@ def test_a_bright_path_is_called_clipped_by_its_light_together():
 
 def crowd(count: int, rng: np.random.Generator):
     """Stars all over the image and as far around it again."""
-    return stars_on(rng.uniform((-SIZE[0], -SIZE[1]), (2 * SIZE[0], 2 * SIZE[1]), size=(9 * count, 2)))
+    return stars_on(
+        rng.uniform((-SIZE[0], -SIZE[1]), (2 * SIZE[0], 2 * SIZE[1]), size=(9 * count, 2))
+    )
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, 57.0, 900.0, 1e6, 1e9])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, 1), (0.6, -0.7, 0.2)])
-@pytest.mark.parametrize("scan", [Scan((0, 1), FRAME_S, FRAME_S), Scan((1, 0), 100.0, 1e9), Scan(hold_s=FRAME_S)])
+@pytest.mark.parametrize(
+    "scan", [Scan((0, 1), FRAME_S, FRAME_S), Scan((1, 0), 100.0, 1e9), Scan(hold_s=FRAME_S)]
+)
 def test_no_turn_makes_more_than_its_budget_of_sprites(speed, axis, scan, rng):
     stars = crowd(1000, rng)
     still = len(make_sprites(stars, CAMERA.cam_to_image @ to_matrix(Q), CAMERA, FOOTPRINT))
@@ -176,7 +188,10 @@ def test_a_path_that_is_too_coarse_still_has_all_its_light_in_its_middle(rng):
     assert sprites.capped == 1000
     light = np.bincount(sprites.star, sprites.data["electrons_per_s"])
     assert light == pytest.approx(1.0, rel=1e-6)
-    x_px, y_px = (np.bincount(sprites.star, sprites.data["electrons_per_s"] * part) for part in (sprites.x_px, sprites.y_px))
+    x_px, y_px = (
+        np.bincount(sprites.star, sprites.data["electrons_per_s"] * part)
+        for part in (sprites.x_px, sprites.y_px)
+    )
     middle = place_px(stars, at, FRAME_S / 2)
     # The mean of a path lies off its middle by its bend: (path / focal length)^2 / 24 of the
     # distance from the axis.
@@ -188,7 +203,9 @@ def test_nodes_belong_to_what_of_a_path_lies_on_the_image():
     sprites.
     """
     at, scan = turn((0, 120.0, 0)), Scan(hold_s=FRAME_S)  # 188 px in a frame
-    crossing, cutting, outside = (stars_on([place]) for place in ((200.0, 120.0), (-20.0, 5.0), (160.0, -40.0)))
+    crossing, cutting, outside = (
+        stars_on([place]) for place in ((200.0, 120.0), (-20.0, 5.0), (160.0, -40.0))
+    )
     towards = np.sign(place_px(crossing, at, FRAME_S)[0, 0] - 200.0)
     cutting = stars_on([(-180.0 if towards > 0 else 10.0, 5.0)])
     whole, part = swept(crossing, at, scan), swept(cutting, at, scan)

@@ -80,7 +80,9 @@ def test_the_fields_terms_are_its_values(rng):
     ones = ResidualField.of_terms(np.ones(terms.shape[1]), np.zeros(terms.shape[1]), 5, SIZE)
     np.testing.assert_allclose(ones.at(x, y)[0], terms.sum(axis=1), atol=1e-12)
     t_x, t_y = (2 * x - SIZE[0] + 1) / SIZE[0], (2 * y - SIZE[1] + 1) / SIZE[1]
-    np.testing.assert_allclose(shift.at(x, y)[0], np.polynomial.chebyshev.chebval2d(t_x, t_y, shift.x), atol=1e-12)
+    np.testing.assert_allclose(
+        shift.at(x, y)[0], np.polynomial.chebyshev.chebval2d(t_x, t_y, shift.x), atol=1e-12
+    )
 
 
 def test_a_lens_that_folds_on_the_screen_is_refused():

@@ -37,10 +37,15 @@ def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
     pixel = np.arange(psf.footprint_px) - psf.footprint_px // 2
     found = []
     for x, y in product(PHASES, PHASES):
-        share, true = psf.shares(pixel - x, (pixel - y)[:, None]), in_pixels(profile, pixel - x, pixel - y, nodes)
+        share, true = (
+            psf.shares(pixel - x, (pixel - y)[:, None]),
+            in_pixels(profile, pixel - x, pixel - y, nodes),
+        )
         true /= true.sum()  # as the cut light is shared out
         places = [centroid_px(part, pixel) for part in (share, true)]
-        found.append((abs(share.sum() - 1), np.hypot(*(places[0] - places[1])), np.abs(share - true).max()))
+        found.append(
+            (abs(share.sum() - 1), np.hypot(*(places[0] - places[1])), np.abs(share - true).max())
+        )
     return tuple(np.max(found, axis=0).tolist())
 
 
@@ -62,7 +67,9 @@ def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
     ],
     ids=["0.4", "0.55", "0.55 x 1.1", "0.85", "3.0", "coma", "fine coma", "airy", "wide airy"],
 )
-def test_a_sampled_psf_has_its_light_in_the_right_pixels_at_every_phase(profile, per_px, half_px, limit):
+def test_a_sampled_psf_has_its_light_in_the_right_pixels_at_every_phase(
+    profile, per_px, half_px, limit
+):
     flux, centroid, pixel = errors(SampledPsf(sampled(profile, per_px, half_px), per_px), profile)
     assert flux < FLUX_LIMIT
     assert centroid < CENTROID_LIMIT_PX
@@ -108,10 +115,14 @@ def test_a_sampled_gaussian_is_the_gaussian():
     assert psf.outside_share(5) == pytest.approx(exact.outside_share(5), rel=2e-3)
     assert psf.cut_share(99) == 0
     wider, exactly = psf.blurred(0.3), exact.blurred(0.3)
-    assert np.abs(wider.stamps(fraction, light, 11) - exactly.stamps(fraction, light, 11)).max() < 2e-4
+    assert (
+        np.abs(wider.stamps(fraction, light, 11) - exactly.stamps(fraction, light, 11)).max() < 2e-4
+    )
 
 
-@pytest.mark.parametrize(("profile", "half_px"), [(coma(), 7), (airy(1.5), 15), (gaussian(0.3, 1.5), 9)])
+@pytest.mark.parametrize(
+    ("profile", "half_px"), [(coma(), 7), (airy(1.5), 15), (gaussian(0.3, 1.5), 9)]
+)
 def test_footprint_and_reach_hold_what_they_say(profile, half_px):
     psf = SampledPsf(sampled(profile, 4, half_px), 4)
     assert psf.footprint_px % 2 == 1
@@ -119,7 +130,10 @@ def test_footprint_and_reach_hold_what_they_say(profile, half_px):
     (x2, y2), factor = psf.reach
     pixel = np.arange(psf.footprint_px) - psf.footprint_px // 2
     for x, y in product(PHASES[::3], PHASES[::3]):
-        share, away = psf.shares(pixel - x, (pixel - y)[:, None]), (pixel - x) ** 2 / x2 + (pixel - y)[:, None] ** 2 / y2
+        share, away = (
+            psf.shares(pixel - x, (pixel - y)[:, None]),
+            (pixel - x) ** 2 / x2 + (pixel - y)[:, None] ** 2 / y2,
+        )
         assert (share <= factor * np.exp(-away)).all()
         assert share.max() <= psf.peak_share
     # A star that lights its first pixel at 1 % of its light is drawn in an ellipse, not in a whole
@@ -133,7 +147,9 @@ def test_the_chief_ray_stays_in_the_middle():
     pixel = np.arange(-8.0, 9.0)
     share = psf.shares(pixel, pixel[:, None])
     truly = 0.45 * (0.28 * np.array([1.2, 0.5]) + 0.12 * np.array([3.0, 1.3]))
-    assert [float((share.sum(axis=axis) * pixel).sum()) for axis in (0, 1)] == pytest.approx(truly, abs=1e-3)
+    assert [float((share.sum(axis=axis) * pixel).sum()) for axis in (0, 1)] == pytest.approx(
+        truly, abs=1e-3
+    )
     assert share[9, 9] > 2 * share[7, 7]  # right and down, not left and up
 
 

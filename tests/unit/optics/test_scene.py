@@ -10,7 +10,14 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.geometry import monitor_camera
-from hilstar.optics.psf import MAX_CUT, MAX_SHARE_ERROR, GaussianPsf, pixel_share, pixel_shares, share_polynomial
+from hilstar.optics.psf import (
+    MAX_CUT,
+    MAX_SHARE_ERROR,
+    GaussianPsf,
+    pixel_share,
+    pixel_shares,
+    share_polynomial,
+)
 from hilstar.optics.sprites import clipped_sprites, make_sprites
 from hilstar.sky.stars import Stars
 from tests.support.stars import stars_at
@@ -29,14 +36,22 @@ def stars_on_pixels(camera, pixels: np.ndarray, electrons_per_s: np.ndarray | No
 @pytest.mark.parametrize("sigma", [0.2, 0.4, 0.55, 0.85, 1.0, 3.0, 20.0])
 def test_a_footprint_is_the_smallest_that_cuts_too_little_to_matter(sigma):
     size = GaussianPsf((sigma, sigma)).footprint_px
-    assert GaussianPsf((sigma, sigma)).cut_share(size) <= MAX_CUT < GaussianPsf((sigma, sigma)).cut_share(size - 1)
+    assert (
+        GaussianPsf((sigma, sigma)).cut_share(size)
+        <= MAX_CUT
+        < GaussianPsf((sigma, sigma)).cut_share(size - 1)
+    )
 
 
 def test_cut_share_is_the_light_outside_the_worst_footprint():
     for size in (3, 4, 9, 10):
-        inside = [sum(pixel_share(k + 0.5 - size / 2 - 0.5, s) for k in range(size)) for s in (0.9, 1.4)]
+        inside = [
+            sum(pixel_share(k + 0.5 - size / 2 - 0.5, s) for k in range(size)) for s in (0.9, 1.4)
+        ]
         # A sum of a few pixel shares: float64 rounding.
-        assert GaussianPsf((0.9, 1.4)).cut_share(size) == pytest.approx(1 - inside[0] * inside[1], abs=1e-14)
+        assert GaussianPsf((0.9, 1.4)).cut_share(size) == pytest.approx(
+            1 - inside[0] * inside[1], abs=1e-14
+        )
 
 
 def test_the_peak_is_that_of_a_centred_star():

@@ -14,7 +14,16 @@ from hilstar.display.geometry import monitor_camera
 from hilstar.optics import frame_motion
 from hilstar.optics.camera import Lens, ResidualField, bounded
 from hilstar.optics.frame_motion import CameraTurn, Scan, swept_sprites
-from hilstar.optics.paths import LIMIT_PX, LIMIT_SHARE, TABLE_PX, Paths, ShortPaths, _lens_table, _mapping, points_within
+from hilstar.optics.paths import (
+    LIMIT_PX,
+    LIMIT_SHARE,
+    TABLE_PX,
+    Paths,
+    ShortPaths,
+    _lens_table,
+    _mapping,
+    points_within,
+)
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import stars_at
 
@@ -57,7 +66,9 @@ def off_px(camera, axis, half_turn_rad, points):
     short = ShortPaths(exact, np.full(len(seen), half_s), half_s, points)
     moments = np.linspace(0.0, 2 * half_s, 15)
     places = np.stack(exact.all_places_px(moments[:, None]))
-    found = np.stack([short.places_px(slice(None), np.full(len(seen), moment)) for moment in moments], axis=1)
+    found = np.stack(
+        [short.places_px(slice(None), np.full(len(seen), moment)) for moment in moments], axis=1
+    )
     return np.hypot(*(found - places)), places, np.hypot(*(places[:, -1] - places[:, 0]))
 
 
@@ -78,11 +89,16 @@ def test_a_place_is_off_by_no_more_than_the_limit_over_the_whole_screen(camera, 
     off, places, length = off_px(camera, axis, half_turn_rad, points)
     seen = on_screen(places)
     assert seen.any(axis=0).mean() > 0.95
-    assert (off[seen] <= BETWEEN_THE_TRIED * np.maximum(LIMIT_PX, LIMIT_SHARE * length[np.nonzero(seen)[1]])).all()
+    assert (
+        off[seen]
+        <= BETWEEN_THE_TRIED * np.maximum(LIMIT_PX, LIMIT_SHARE * length[np.nonzero(seen)[1]])
+    ).all()
 
 
 @pytest.mark.parametrize(
-    "camera", [CAMERAS["wide"], CAMERAS["narrow"], lens_camera(200.0, degree=10)], ids=["wide", "narrow", "wild"]
+    "camera",
+    [CAMERAS["wide"], CAMERAS["narrow"], lens_camera(200.0, degree=10)],
+    ids=["wide", "narrow", "wild"],
 )
 def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
     """At 40 000 places, a half of them within 8 px of the image's border, where the field is
@@ -90,7 +106,9 @@ def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
     """
     size = np.array(SIZE)[:, None]
     px = rng.uniform(-0.5, size - 0.5, (2, 40_000))
-    px[:, ::4] = np.where(px[:, ::4] < size / 2, rng.uniform(-0.5, 7.5), size - 0.5 - rng.uniform(0, 8))
+    px[:, ::4] = np.where(
+        px[:, ::4] < size / 2, rng.uniform(-0.5, 7.5), size - 0.5 - rng.uniform(0, 8)
+    )
     px[0, 1::4] = rng.choice([-0.5, SIZE[0] - 0.5], 10_000)
     table = _lens_table(*_mapping(camera))
     found = table.along(np.stack(camera.tangents(*px)), *np.zeros((2, 2, 1)))[0]
@@ -99,7 +117,9 @@ def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
     assert (off_px < TABLE_PX) == (points_within(camera, 1e-6) == 1)
 
 
-@pytest.mark.parametrize(("points", "camera"), [(1, CAMERAS["narrow"]), (2, CAMERAS["pinhole"]), (3, CAMERAS["narrow"])])
+@pytest.mark.parametrize(
+    ("points", "camera"), [(1, CAMERAS["narrow"]), (2, CAMERAS["pinhole"]), (3, CAMERAS["narrow"])]
+)
 def test_the_limit_is_where_it_fails(points, camera):
     """A turn that is twice the longest for its points is off by more than it may be: the limit
     is no mere caution.
@@ -144,7 +164,9 @@ def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng
     scan = Scan((0, 1), FRAME_S, FRAME_S)
     short = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
     monkeypatch.setattr(frame_motion, "points_within", lambda camera, half_turn_rad: None)
-    monkeypatch.setattr(type(camera), "in_view", lambda self, seen, margin_px, reach_rad: np.arange(len(seen)))
+    monkeypatch.setattr(
+        type(camera), "in_view", lambda self, seen, margin_px, reach_rad: np.arange(len(seen))
+    )
     exact = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
     places = [_means(sprites) for sprites in (short, exact)]
     (light, *of_short), (true, *of_exact) = places
@@ -155,13 +177,19 @@ def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng
     path_px = np.radians(rate_deg_s) * FRAME_S * camera.scales_px_rad()[1]
     # The row's moment is found from short places too: twice their error.
     limit_px = 2 * max(LIMIT_PX, 2 * LIMIT_SHARE * path_px)
-    assert np.hypot(*(a[whole] - b[whole] for a, b in zip(of_short, of_exact, strict=True))).max() < limit_px
+    assert (
+        np.hypot(*(a[whole] - b[whole] for a, b in zip(of_short, of_exact, strict=True))).max()
+        < limit_px
+    )
 
 
 def _means(sprites):
     """The light of each of 3000 stars, and its mean x and y."""
     light = np.bincount(sprites.star, sprites.data["electrons_per_s"], 3000)
-    sums = (np.bincount(sprites.star, sprites.data["electrons_per_s"] * at, 3000) for at in (sprites.x_px, sprites.y_px))
+    sums = (
+        np.bincount(sprites.star, sprites.data["electrons_per_s"] * at, 3000)
+        for at in (sprites.x_px, sprites.y_px)
+    )
     return light, *(total / np.maximum(light, 1e-9) for total in sums)
 
 

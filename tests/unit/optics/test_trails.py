@@ -66,14 +66,18 @@ def gaussians(x_px: np.ndarray, y_px: np.ndarray, light: np.ndarray) -> np.ndarr
     return (down * light[:, None]).T @ across
 
 
-def moment_by_moment(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float) -> np.ndarray:
+def moment_by_moment(
+    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float
+) -> np.ndarray:
     """The mean image, each moment from a pass of its own and an attitude of its own."""
     places, light = [], []
     for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * exposure_s:
         seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + round(seconds * 1e9))
         if seen is None:
             continue
-        direction = seen.directions(slice(None), np.zeros(1)) @ to_matrix(propagate(q, rate, seconds)).T
+        direction = (
+            seen.directions(slice(None), np.zeros(1)) @ to_matrix(propagate(q, rate, seconds)).T
+        )
         places.append([float(place[0]) for place in CAMERA.project(direction)])
         half = np.array([exposure_s / MOMENTS / 2])
         light.append(float(seen.rates_e_per_s(np.array([0]), -half, half)[0]) / MOMENTS)
@@ -90,7 +94,9 @@ def streak(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float) -
 @pytest.mark.parametrize("exposure_s", [0.02, 0.4, 2.0])
 def test_a_streak_is_the_light_of_all_its_moments(rate_deg_s, exposure_s):
     sky, t_ns = lit_moment(LIST)
-    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    q = looking_at(
+        sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0]
+    )
     found = streak(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
     wanted = moment_by_moment(sky, t_ns, q, np.radians(rate_deg_s), exposure_s)
     total = wanted.sum()
@@ -107,7 +113,10 @@ def test_its_length_is_its_own_rate_against_the_camera_s():
     seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns)
     q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
     at_rest = Cone(NORTH, np.pi, 0.0)
-    ends = [sky.passing(at_rest, t_ns + k).directions(slice(None), np.zeros(1))[0] for k in (-500_000_000, 500_000_000)]
+    ends = [
+        sky.passing(at_rest, t_ns + k).directions(slice(None), np.zeros(1))[0]
+        for k in (-500_000_000, 500_000_000)
+    ]
     length_px = 3000 * np.linalg.norm(ends[1] - ends[0])
     found = streak(sky, t_ns, q, np.zeros(3), 1.0).sprites
     wide_px = np.hypot(np.ptp(found.x_px), np.ptp(found.y_px))
@@ -121,17 +130,23 @@ def test_a_flash_shines_where_the_satellite_is_at_its_time():
     at_s = t_ns / 1e9 + 0.3
     table = f"norad,period_s,amplitude_mag,flash_s,flash_at_s\n7,10,5,0.01,{at_s}\n"
     flashing, _ = lit_moment(LIST, table)
-    q = looking_at(flashing.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    q = looking_at(
+        flashing.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0]
+    )
     rate = np.radians([0.0, 1.0, 0.0])
     found, plain = (streak(one, t_ns, q, rate, 1.0) for one in (flashing, sky))
     bright = found.sprites.data["electrons_per_s"] / plain.sprites.data["electrons_per_s"]
     # 99 times the steady light for 0.01 s at half height
     extra = 99 * 0.01 * np.sqrt(np.pi / (4 * np.log(2)))
     assert found.electrons_per_s[0] / plain.electrons_per_s[0] == pytest.approx(1 + extra, rel=0.01)
-    there = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + 300_000_000).directions(slice(None), np.zeros(1))
+    there = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + 300_000_000).directions(
+        slice(None), np.zeros(1)
+    )
     x_px, y_px = CAMERA.project(there @ to_matrix(propagate(q, rate, 0.3)).T)
     k = int(np.argmax(bright))
-    assert np.hypot(found.sprites.x_px[k] - x_px[0], found.sprites.y_px[k] - y_px[0]) < 0.3 * max(SIGMA_PX)
+    assert np.hypot(found.sprites.x_px[k] - x_px[0], found.sprites.y_px[k] - y_px[0]) < 0.3 * max(
+        SIGMA_PX
+    )
 
 
 def test_a_path_into_the_shadow_ends_there():
@@ -155,9 +170,13 @@ def test_a_path_into_the_shadow_ends_there():
 
 def test_streaks_follow_the_stars_of_an_image():
     sky, t_ns = lit_moment(LIST)
-    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    q = looking_at(
+        sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0]
+    )
     found = streak(sky, t_ns, q, np.zeros(3), 0.5)
-    stars = sprites_at(np.array([[5.0, 6.0], [7.0, 8.0]]), np.array([1.0, 2.0]), BRUSH.psf.footprint_px)
+    stars = sprites_at(
+        np.array([[5.0, 6.0], [7.0, 8.0]]), np.array([1.0, 2.0]), BRUSH.psf.footprint_px
+    )
     both = with_trails(stars, found, 100)
     assert both.star.tolist() == [0, 1] + [100] * len(found.sprites)
     assert both.per_star == len(found.sprites) > 1
@@ -166,7 +185,9 @@ def test_streaks_follow_the_stars_of_an_image():
 
 def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     sky, t_ns = lit_moment(LIST)
-    q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
+    q = looking_at(
+        sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0]
+    )
     seen = sky.passing(Cone(to_matrix(q)[2], 0.5, 1.0), t_ns)
     lit, view = Lit(np.array([-1.0]), 2.0), TrailView(CAMERA, to_matrix(q), np.zeros(3))
     fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))

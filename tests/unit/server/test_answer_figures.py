@@ -28,9 +28,16 @@ def records_of_a_run(seconds: float = 60.0) -> list[AnswerRecord | FaultRecord]:
     found: list[AnswerRecord | FaultRecord] = []
     for t_s in np.arange(0.3, seconds - 0.5, CYCLE_S).tolist():
         middle_ns = START_NS + round(t_s * NS_PER_S)
-        record = AnswerRecord(host_ns=middle_ns + round(LATE_S * NS_PER_S), raw="01", middle_ns=middle_ns, verdict="right")
+        record = AnswerRecord(
+            host_ns=middle_ns + round(LATE_S * NS_PER_S),
+            raw="01",
+            middle_ns=middle_ns,
+            verdict="right",
+        )
         faulty = FAULT_S[0] <= t_s < FAULT_S[1]
-        record.residual_arcsec = tuple((SIGMA_ARCSEC * rng.standard_normal(3) * (IN_FAULT if faulty else 1)).tolist())
+        record.residual_arcsec = tuple(
+            (SIGMA_ARCSEC * rng.standard_normal(3) * (IN_FAULT if faulty else 1)).tolist()
+        )
         if WRONG_S[0] <= t_s < WRONG_S[1]:
             record.verdict, record.residual_arcsec = "wrong", (7200.0, 0.0, 0.0)
         if LOST_S[0] <= t_s < LOST_S[1]:
@@ -39,7 +46,16 @@ def records_of_a_run(seconds: float = 60.0) -> list[AnswerRecord | FaultRecord]:
     for event, t_s in zip(("start", "end"), FAULT_S, strict=True):
         at_ns = START_NS + round(t_s * NS_PER_S)
         found.append(
-            FaultRecord(host_ns=at_ns, event=event, number=3, name="sunlit", kind="stray", who="file", t_ns=0, table="")
+            FaultRecord(
+                host_ns=at_ns,
+                event=event,
+                number=3,
+                name="sunlit",
+                kind="stray",
+                who="file",
+                t_ns=0,
+                table="",
+            )
         )
     return found
 
@@ -48,7 +64,9 @@ def records_of_a_run(seconds: float = 60.0) -> list[AnswerRecord | FaultRecord]:
 def ledger(tmp_path_factory) -> Path:
     times_s = np.arange(0.0, 60.0, 0.1)
     q = np.tile([1.0, 0.0, 0.0, 0.0], (len(times_s), 1))
-    return write_ledger(tmp_path_factory.mktemp("run") / "run.mcap", times_s, q, START_NS, records_of_a_run())
+    return write_ledger(
+        tmp_path_factory.mktemp("run") / "run.mcap", times_s, q, START_NS, records_of_a_run()
+    )
 
 
 def test_a_run_without_answers_says_nothing_of_them(tmp_path):
@@ -68,11 +86,15 @@ def test_a_fault_is_reported_with_the_answers_before_during_and_after_it(ledger)
     assert (fault.before.availability, fault.before.wrong) == (1.0, 0)
     # Right for two seconds and one more of ten, then lost; after its end lost for two seconds of
     # ten.
-    assert (fault.during.availability, fault.during.wrong, fault.during.invalid) == pytest.approx((0.3, 10, 60), abs=0.011)
+    assert (fault.during.availability, fault.during.wrong, fault.during.invalid) == pytest.approx(
+        (0.3, 10, 60), abs=0.011
+    )
     assert (fault.after.availability, fault.after.invalid) == pytest.approx((0.8, 20), abs=0.011)
     # 100 and 30 answers: the rms of each axis within four of its own sigmas, rms / sqrt(2 n).
     assert fault.before.rms_arcsec == pytest.approx(SIGMA_ARCSEC.tolist(), rel=4 / np.sqrt(200))
-    assert fault.during.rms_arcsec == pytest.approx((IN_FAULT * SIGMA_ARCSEC).tolist(), rel=4 / np.sqrt(60))
+    assert fault.during.rms_arcsec == pytest.approx(
+        (IN_FAULT * SIGMA_ARCSEC).tolist(), rel=4 / np.sqrt(60)
+    )
     assert fault.during.largest_arcsec == 7200.0
     assert fault.first_wrong_s == pytest.approx(WRONG_S[0] - FAULT_S[0], abs=CYCLE_S)
     assert fault.recovered_s == pytest.approx(BACK_S - FAULT_S[1], abs=CYCLE_S)
@@ -85,4 +107,8 @@ def test_the_reports_page_and_text_have_the_answers(ledger, tmp_path):
     assert told["faults"][0]["recovered_s"] == pytest.approx(2.0, abs=CYCLE_S)
     assert told == json.loads((tmp_path / "report.json").read_text())["answers"]
     text = run_hilstar_here("report", ledger, "-o", tmp_path).stdout
-    assert "fault sunlit" in text and "first wrong after 2.0" in text and "tracker's availability" in text
+    assert (
+        "fault sunlit" in text
+        and "first wrong after 2.0" in text
+        and "tracker's availability" in text
+    )

@@ -69,7 +69,9 @@ def test_of_rows_that_stay_lit_the_largest_error_is_a_closed_form(refreshes):
     """f (1 - f) / 2 of a refresh's path over n + f; and no light is lost."""
     part = refreshes % 1
     found = beat(Exposures(60.0, refreshes / 60))
-    assert found.worst_arcsec_per_deg_s == pytest.approx(part * (1 - part) / 2 / refreshes * 60.0, rel=1e-6)
+    assert found.worst_arcsec_per_deg_s == pytest.approx(
+        part * (1 - part) / 2 / refreshes * 60.0, rel=1e-6
+    )
     assert found.worst_mag < 1e-9
 
 
@@ -78,7 +80,9 @@ def test_whole_refreshes_cure_the_light_of_a_panel_that_flashes_and_not_its_plac
     for whole in (1, 6, 100):
         found = beat(Exposures(60.0, whole / 60, lit_s=1 / 240))
         assert found.worst_mag < 1e-6
-        assert found.worst_arcsec_per_deg_s == pytest.approx(0.75 / 2 / 60 * ARCSEC_PER_DEG, rel=1e-3)
+        assert found.worst_arcsec_per_deg_s == pytest.approx(
+            0.75 / 2 / 60 * ARCSEC_PER_DEG, rel=1e-3
+        )
     one_or_two = beat(Exposures(60.0, 1.5 / 60, lit_s=0.0))
     assert one_or_two.worst_mag == pytest.approx(2.5 * math.log10(1.5), rel=1e-3)
     assert beat(Exposures(60.0, 0.5 / 60, lit_s=0.0)).worst_mag == math.inf
@@ -113,7 +117,9 @@ TIGHT = {"tolerance_px": 0.02, "tolerance_mag": 0.02}
 def bench(tmp_path, tracker, **tables):
     return parse_config(
         tmp_path / "bench.toml",
-        bench_text({"collimator": {"focal_length_mm": 350}, "tracker": tracker, "render": TIGHT}, tables),
+        bench_text(
+            {"collimator": {"focal_length_mm": 350}, "tracker": tracker, "render": TIGHT}, tables
+        ),
     )
 
 
@@ -124,7 +130,10 @@ WITHOUT = {
     "by the tracker's frames": ({"exposure_s": 0.045, "frame_hz": 20}, {}),
     "as many as its frames have room for": ({"exposure_s": 0.0455, "frame_hz": 21.9}, {}),
     "60 for 59.94": ({"exposure_s": 0.04}, {"monitor": {"refresh_hz": 59.94}}),
-    "light of flashes": ({"exposure_s": 0.04}, {"monitor": {"hold_ms": 15}, "sync": {"turn_deg_s": 0.1}}),
+    "light of flashes": (
+        {"exposure_s": 0.04},
+        {"monitor": {"hold_ms": 15}, "sync": {"turn_deg_s": 0.1}},
+    ),
 }
 
 
@@ -139,16 +148,25 @@ def test_each_proposal_alone_is_without_a_beat_and_the_nearest(tmp_path, tracker
         if value is None:
             continue
         assert f"[{table}] {key} = {value:.6g}" in line
-        changed = {"monitor": dict(monitor), **{name: keys for name, keys in tables.items() if name != "monitor"}}
+        changed = {
+            "monitor": dict(monitor),
+            **{name: keys for name, keys in tables.items() if name != "monitor"},
+        }
         if table == "monitor":
-            cured = bench(tmp_path, tracker, **{**changed, "monitor": {**monitor, key: float(f"{value:.6g}")}})
+            cured = bench(
+                tmp_path, tracker, **{**changed, "monitor": {**monitor, key: float(f"{value:.6g}")}}
+            )
         else:
             cured = bench(tmp_path, {**tracker, key: float(f"{value:.6g}")}, **changed)
         again = beat_of(cured)
         assert not again.matters and beat_line(again) is None
-        assert again.refreshes_per_exposure == pytest.approx(round(again.refreshes_per_exposure), abs=1e-4)
+        assert again.refreshes_per_exposure == pytest.approx(
+            round(again.refreshes_per_exposure), abs=1e-4
+        )
         room = 60 / tracker.get("frame_hz", 60.0) if key == "exposure_s" else math.inf
-        assert abs(again.refreshes_per_exposure - found.refreshes_per_exposure) <= 0.5 or room < math.ceil(room)
+        assert abs(
+            again.refreshes_per_exposure - found.refreshes_per_exposure
+        ) <= 0.5 or room < math.ceil(room)
 
 
 def test_the_line_has_the_amount_and_the_proposal(tmp_path):
@@ -160,7 +178,11 @@ def test_the_line_has_the_amount_and_the_proposal(tmp_path):
 
 
 def test_what_does_not_matter_is_not_said(tmp_path):
-    for tracker in ({"exposure_s": 0.1}, {"exposure_s": 0.0}, {"exposure_s": 0.105, "trigger": "external"}):
+    for tracker in (
+        {"exposure_s": 0.1},
+        {"exposure_s": 0.0},
+        {"exposure_s": 0.105, "trigger": "external"},
+    ):
         found = beat_of(bench(tmp_path, tracker))
         assert not found.matters and found.proposal is None and beat_line(found) is None
     measured = beat_of(bench(tmp_path, {"exposure_s": 0.1}), refresh_hz=59.94)
@@ -193,15 +215,27 @@ def test_an_amount_of_hundreds_is_written_without_an_exponent(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        ({"tracker": {"frame_hz": 20}}, r"\[tracker\] frame_hz = 20: exposures of 0.1 s overlap; write 10 or less"),
-        ({"sync": {"port": "/dev/ttyUSB0", "pulse_ms": 20}}, r"\[sync\] pulse_ms = 20: the next pulse is due after 16.67 ms"),
+        (
+            {"tracker": {"frame_hz": 20}},
+            r"\[tracker\] frame_hz = 20: exposures of 0.1 s overlap; write 10 or less",
+        ),
+        (
+            {"sync": {"port": "/dev/ttyUSB0", "pulse_ms": 20}},
+            r"\[sync\] pulse_ms = 20: the next pulse is due after 16.67 ms",
+        ),
         (
             {"sync": {"port": "/dev/x"}, "attitude": {"source": "serial", "port": "/dev/x"}},
             r"\[sync\] port = /dev/x: the attitude comes over it",
         ),
-        ({"sync": {"port": "socket://bench:1"}}, r"\[sync\] port = 'socket://bench:1': write .* \"rfc2217://HOST:PORT\""),
+        (
+            {"sync": {"port": "socket://bench:1"}},
+            r"\[sync\] port = 'socket://bench:1': write .* \"rfc2217://HOST:PORT\"",
+        ),
         ({"sync": {"port": ""}}, r"\[sync\] port = '': write .*; leave it out for no pulse"),
-        ({"sync": {"port": "rfc2217://bench"}}, r"'rfc2217://bench': write .* \"rfc2217://HOST:PORT\""),
+        (
+            {"sync": {"port": "rfc2217://bench"}},
+            r"'rfc2217://bench': write .* \"rfc2217://HOST:PORT\"",
+        ),
         ({"sync": {"port": "/dev/tty\x07"}}, r"\[sync\] port = '/dev/tty\\x07': write"),
         ({"tracker": {"trigger": "yes"}}, "trigger"),
         ({"sync": {"every_frames": 0}}, "every_frames"),

@@ -25,7 +25,9 @@ FIRST_SWAP_NS = 1_000_000_000
 TO_LIGHT_NS = 9_000_000
 DRAW_NS = 4_000_000
 GUARD_NS = DrawBudget.GUARD_NS
-TURNING = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 0, False, rate_cam_rad_s=np.array([0.0, 0.1, 0.0]))
+TURNING = Attitude(
+    np.array([1.0, 0.0, 0.0, 0.0]), 0, False, rate_cam_rad_s=np.array([0.0, 0.1, 0.0])
+)
 SETTLED = DrawBudget.FRAMES // 4  # frames after which the budget follows what frames cost
 
 
@@ -34,7 +36,9 @@ class FakeScreen:
     last frame.
     """
 
-    def __init__(self, clock: FakeClock, by_screen: bool = True, closes_at: int | None = None) -> None:
+    def __init__(
+        self, clock: FakeClock, by_screen: bool = True, closes_at: int | None = None
+    ) -> None:
         self.clock = SwapClock(FIRST_SWAP_NS, PERIOD_NS, by_screen)
         self.budget = DrawBudget(PERIOD_NS)
         self.queued = 0
@@ -76,7 +80,9 @@ class Run:
         self.rates: list[object] = []
         self._cost = cost
         config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
-        bench = SimpleNamespace(config=config, renderer=WellGpu(), view=View, light=self._light, draw_sprites=self._draw)
+        bench = SimpleNamespace(
+            config=config, renderer=WellGpu(), view=View, light=self._light, draw_sprites=self._draw
+        )
         self.loop = FrameLoop(bench, self.shown.append, self.pacer, notices=self.notices)
         self.loop.paced(limit, self._draw_slot)
 
@@ -117,8 +123,12 @@ def test_a_frame_is_begun_as_late_as_the_last_ones_allow(tmp_path):
 
 
 def test_a_slow_frame_is_swapped_late_and_what_it_missed_is_counted(tmp_path):
-    run = Run(tmp_path, Limit(slots=100), lambda number: 1.5 * PERIOD_NS if number == 60 else DRAW_NS)
-    (late,) = [frame for frame in run.shown if abs(frame.swap_ns - frame.predicted_swap_ns) > PERIOD_NS / 2]
+    run = Run(
+        tmp_path, Limit(slots=100), lambda number: 1.5 * PERIOD_NS if number == 60 else DRAW_NS
+    )
+    (late,) = [
+        frame for frame in run.shown if abs(frame.swap_ns - frame.predicted_swap_ns) > PERIOD_NS / 2
+    ]
     assert late.number == 60
     missed = [frame.missed_before for frame in run.shown if frame.missed_before]
     assert sum(missed) == run.loop.tally.missed_frames >= 1

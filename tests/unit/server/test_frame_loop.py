@@ -45,13 +45,17 @@ class SlowBench:
 
     def draw_sprites(self, sprites, number):
         self._clock.work(1e6)
-        return SimpleNamespace(levels=None, star_count=0 if sprites is None else 7, clipped_hip=(), capped=0)
+        return SimpleNamespace(
+            levels=None, star_count=0 if sprites is None else 7, clipped_hip=(), capped=0
+        )
 
 
 class Run:
     """A paced run of `limit` on a fake clock."""
 
-    def __init__(self, tmp_path, limit: Limit, cost=lambda number: 0, more: str = "", attitude=STILL) -> None:
+    def __init__(
+        self, tmp_path, limit: Limit, cost=lambda number: 0, more: str = "", attitude=STILL
+    ) -> None:
         self.clock = FakeClock()
         bench = SlowBench(tmp_path, self.clock, cost, more)
         self.shown: list[Shown] = []
@@ -92,10 +96,14 @@ def test_a_wait_that_wakes_late_shifts_no_later_frame(tmp_path):
 @pytest.mark.parametrize(("cost_periods", "missed"), [(0.5, 0), (1.5, 1), (1.96, 2)])
 def test_a_slow_frame_misses_the_slots_that_pass_meanwhile(tmp_path, cost_periods, missed):
     """With the millisecond of drawing, 1.96 periods are more than two."""
-    run = Run(tmp_path, Limit(slots=20), lambda number: cost_periods * PERIOD_NS if number == 5 else 0)
+    run = Run(
+        tmp_path, Limit(slots=20), lambda number: cost_periods * PERIOD_NS if number == 5 else 0
+    )
     assert run.numbers == [*range(6), *range(6 + missed, 20)]
     assert run.loop.tally.missed_frames == missed
-    assert [frame.missed_before for frame in run.shown if frame.missed_before] == ([missed] if missed else [])
+    assert [frame.missed_before for frame in run.shown if frame.missed_before] == (
+        [missed] if missed else []
+    )
 
 
 def test_a_frame_whose_sprites_took_too_long_is_given_up_and_the_next_is_shown(tmp_path):
@@ -144,7 +152,9 @@ def test_a_stopped_run_draws_no_other_frame(tmp_path):
 def test_frames_of_a_lead_in_are_not_counted(tmp_path):
     clock = FakeClock()
     shown = []
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), shown.append, Pacer(PERIOD_NS, clock))
+    loop = FrameLoop(
+        SlowBench(tmp_path, clock, lambda number: 0), shown.append, Pacer(PERIOD_NS, clock)
+    )
     loop.lead_in(lambda moment: loop.draw(moment.slot, 0, None, moment), lambda: len(shown) == 5)
     assert [frame.missing for frame in shown] == [True] * 5
     loop.paced(Limit(slots=7), lambda moment: loop.draw(moment.slot, 0, STILL, moment))
@@ -169,23 +179,32 @@ def test_a_stale_attitude_is_held_or_blank_as_the_bench_file_says(tmp_path, on_s
 
 def test_without_an_attitude_a_frame_is_blank_and_says_so(tmp_path):
     run = Run(tmp_path, Limit(slots=2), attitude=None)
-    assert all(frame.missing and frame.attitude is None and frame.drawn.star_count == 0 for frame in run.shown)
+    assert all(
+        frame.missing and frame.attitude is None and frame.drawn.star_count == 0
+        for frame in run.shown
+    )
 
 
 def test_a_frame_that_has_no_moment_is_never_late(tmp_path):
     clock = FakeClock()
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 100 * PERIOD_NS), pacer=Pacer(PERIOD_NS, clock))
+    loop = FrameLoop(
+        SlowBench(tmp_path, clock, lambda number: 100 * PERIOD_NS), pacer=Pacer(PERIOD_NS, clock)
+    )
     assert loop.draw(0, 0, STILL) is not None
     assert loop.tally.given_up_frames == 0
     assert loop.notices.counts() == {"first-attitude": 1}
 
 
 @pytest.mark.parametrize(("motion", "paths"), [("auto", False), ("on", True), ("off", False)])
-def test_stars_move_within_a_frame_on_a_screen_only_unless_the_bench_file_says_otherwise(tmp_path, motion, paths):
+def test_stars_move_within_a_frame_on_a_screen_only_unless_the_bench_file_says_otherwise(
+    tmp_path, motion, paths
+):
     clock = FakeClock()
     bench = SlowBench(tmp_path, clock, lambda number: 0, f'[render]\nmotion = "{motion}"\n')
     rate = np.array([0.0, 0.1, 0.0])
-    FrameLoop(bench, pacer=Pacer(PERIOD_NS, clock)).draw(0, 0, Attitude(STILL.q_icrs_to_cam, 0, False, rate_cam_rad_s=rate))
+    FrameLoop(bench, pacer=Pacer(PERIOD_NS, clock)).draw(
+        0, 0, Attitude(STILL.q_icrs_to_cam, 0, False, rate_cam_rad_s=rate)
+    )
     assert (bench.asked[0] is rate) == paths
 
 
@@ -200,13 +219,18 @@ def test_a_frame_starts_when_it_is_due_or_on_a_screen_when_that_has_swapped_it(t
     due_ns = clock.now_ns() + PERIOD_NS
     swapped = loop.draw(1, 0, STILL, Moment(1, clock.now_ns(), due_ns, swap_ns=due_ns))
     at_once = loop.draw(2, 0, STILL)
-    assert started[1:] == [(frame.number, frame.swap_ns, frame.swap_ns) for frame in (swapped, at_once)]
+    assert started[1:] == [
+        (frame.number, frame.swap_ns, frame.swap_ns) for frame in (swapped, at_once)
+    ]
     assert swapped.swap_ns > swapped.draw_ns
 
 
 def test_a_frame_that_is_given_up_has_no_start_on_a_screen(tmp_path):
     clock = FakeClock()
-    loop, started = FrameLoop(SlowBench(tmp_path, clock, lambda number: 1e8), pacer=Pacer(PERIOD_NS, clock)), []
+    loop, started = (
+        FrameLoop(SlowBench(tmp_path, clock, lambda number: 1e8), pacer=Pacer(PERIOD_NS, clock)),
+        [],
+    )
     loop.on_frame = lambda number, frame_ns: started.append(number)
     due_ns = clock.now_ns()
     assert loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns, swap_ns=due_ns)) is None

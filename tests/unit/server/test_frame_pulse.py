@@ -68,12 +68,18 @@ def frames(pulse, count, first=0):
 
 
 @pytest.mark.parametrize("active", ["high", "low"])
-def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_ends_at_rest(kept, active):
+def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_ends_at_rest(
+    kept, active
+):
     high = active == "high"
     with FramePulse(Line(high), settings(active=active, pulse_ms=3.0), Notices()) as pulse:
         for number in range(12):
             frames(pulse, 1, number)
-            wait_for(lambda number=number: pulse.summary().pulses == number + 1, "its pulse has ended", poll_s=0.0)
+            wait_for(
+                lambda number=number: pulse.summary().pulses == number + 1,
+                "its pulse has ended",
+                poll_s=0.0,
+            )
     summary = pulse.summary()
     line = kept[-1]
     levels = [level for _, level in line.edges]
@@ -84,7 +90,11 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
     widths_ms = sorted((down - up) / 1e6 for up, down in zip(raised, fallen, strict=True))
     assert 3.0 <= widths_ms[0] < 3.0 + FRAME_S * 500  # a busy machine makes some of them wider
     assert not line.is_open
-    assert 0 <= summary.delay_ms <= summary.max_delay_ms and summary.jitter_ms >= 0 and summary.lost == 0
+    assert (
+        0 <= summary.delay_ms <= summary.max_delay_ms
+        and summary.jitter_ms >= 0
+        and summary.lost == 0
+    )
 
 
 def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
@@ -159,7 +169,10 @@ def test_a_port_without_modem_lines_is_refused_in_a_line():
     """
     ours, theirs = os.openpty()
     try:
-        with pytest.raises(InputError, match=r"\[sync\] port = /dev/pts/\d+: has no line RTS .*write a serial port with modem"):
+        with pytest.raises(
+            InputError,
+            match=r"\[sync\] port = /dev/pts/\d+: has no line RTS .*write a serial port with modem",
+        ):
             RtsLine(os.ttyname(theirs), True)
     finally:
         os.close(ours)

@@ -50,7 +50,9 @@ def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
     timing = timing_of(periods_ms, monitor, 60.0)
     assert timing.dropped == 3
     assert timing.period_ms == pytest.approx(PERIOD_MS)
-    assert [fault for fault in faults(plain_window(), monitor, timing) if "dropped 3 of 120" in fault]
+    assert [
+        fault for fault in faults(plain_window(), monitor, timing) if "dropped 3 of 120" in fault
+    ]
 
 
 def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
@@ -68,7 +70,11 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
         ({"ramp_refused": True}, GOOD, "gamma ramp that is not straight"),
         ({"back_buffer": BackBuffer(6, 0)}, GOOD, "6 bits per colour and the bench file says 8"),
         ({"back_buffer": BackBuffer(10, 0)}, GOOD, "10 bits per colour and the bench file says 8"),
-        ({"screen_bits": 10}, GOOD, "the X screen has 10 bits per colour and the window 8, so that X converts codes"),
+        (
+            {"screen_bits": 10},
+            GOOD,
+            "the X screen has 10 bits per colour and the window 8, so that X converts codes",
+        ),
         ({"back_buffer": BackBuffer(8, 4)}, GOOD, "4 samples a pixel"),
         ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
         ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
@@ -82,7 +88,9 @@ def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timin
 @pytest.mark.parametrize("buffers", [2, 3])
 @pytest.mark.parametrize("hz", [60, 120])
 def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, buffers, hz):
-    screen, display = model_screen(tmp_path, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000)
+    screen, display = model_screen(
+        tmp_path, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000
+    )
     assert not pass_gate(screen, force=False, clock=display.clock).variable
 
 
@@ -95,9 +103,13 @@ def test_a_variable_refresh_is_recognised_and_refused(tmp_path, stamp_ns):
 
 
 def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, caplog):
-    output = OutputState("DP-1", (320, 240), properties={"Broadcast RGB": "Limited 16:235", "TearFree": "on"})
+    output = OutputState(
+        "DP-1", (320, 240), properties={"Broadcast RGB": "Limited 16:235", "TearFree": "on"}
+    )
     screen, display = model_screen(tmp_path, output=output)
-    with pytest.raises(MachineError, match=r"Broadcast RGB of DP-1.*xrandr --output DP-1 --set.*or add --force"):
+    with pytest.raises(
+        MachineError, match=r"Broadcast RGB of DP-1.*xrandr --output DP-1 --set.*or add --force"
+    ):
         pass_gate(screen, force=False, clock=display.clock)
     assert "TearFree of DP-1 is on" in caplog.text
     pass_gate(screen, force=True, clock=display.clock)

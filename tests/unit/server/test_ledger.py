@@ -33,7 +33,12 @@ from hilstar.server.record.ledger import (
     QueueEntry,
     SplitLimits,
 )
-from hilstar.server.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord, drawable_frames
+from hilstar.server.record.ledger_records import (
+    FAULT_TOPIC,
+    FaultRecord,
+    FrameRecord,
+    drawable_frames,
+)
 from hilstar.server.record.report import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
@@ -45,11 +50,19 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 @pytest.fixture
 def bench(small_bench_file):
     return SimpleNamespace(
-        file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64, config=UNCERTIFIED),
+        file=SimpleNamespace(
+            path=small_bench_file,
+            text=small_bench_file.read_text(),
+            sha256="0" * 64,
+            config=UNCERTIFIED,
+        ),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
         renderer=SimpleNamespace(
-            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+            gl_renderer="none",
+            gl_version="none",
+            path="NumPy",
+            target=SimpleNamespace(quantisation="exact"),
         ),
         config=SimpleNamespace(
             render=SimpleNamespace(codes_ms=None),
@@ -63,11 +76,17 @@ def keep(ledger: Ledger, first: int, last: int) -> None:
     for k in range(first, last):
         sample = AttitudeSample(k, UPRIGHT, None, k)
         ledger.packet(1000 + k, encode(sample), sample, None)
-        ledger.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k + 1, q=(1, 0, 0, 0)))
+        ledger.frame(
+            FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k + 1, q=(1, 0, 0, 0))
+        )
 
 
 def read_topics(path):
-    return [(topics[channel], data) for topics, messages in read_chunks(path) for channel, data in messages]
+    return [
+        (topics[channel], data)
+        for topics, messages in read_chunks(path)
+        for channel, data in messages
+    ]
 
 
 def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
@@ -79,11 +98,17 @@ def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
     assert len(parts_of(path)) >= 2
     assert [sample.sequence for sample in read_log(path)] == list(range(100))
     assert [frame.frame for frame in drawable_frames(path)] == list(range(100))
-    assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(parts_of(path)) > 2
+    assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(
+        parts_of(path)
+    ) > 2
 
 
 def test_a_split_is_a_size_or_a_time():
-    assert (parse_split("1GB").bytes, parse_split("30min").seconds, parse_split("1.5h").seconds) == (1e9, 1800, 5400)
+    assert (
+        parse_split("1GB").bytes,
+        parse_split("30min").seconds,
+        parse_split("1.5h").seconds,
+    ) == (1e9, 1800, 5400)
     for wrong in ("1", "GB", "1kB", "5s", "-1h", "1e3GB", "1 fortnight"):
         with pytest.raises(InputError, match="--ledger-split"):
             parse_split(wrong)
@@ -93,7 +118,9 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(t
     notices = Notices()
     with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
         keep(ledger, 0, 10)
-        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        wait_for(
+            lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
+        )
         with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
             keep(ledger, 10, 20)
             wait_for(lambda: "ledger-failed" in notices.active)
@@ -155,7 +182,9 @@ def harm_until_said(path, harm, notices):
 
 
 @pytest.mark.parametrize("split", [SplitLimits(), SplitLimits(bytes=1)])
-@pytest.mark.parametrize("harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over])
+@pytest.mark.parametrize(
+    "harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over]
+)
 def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
     notices, path = Notices(), tmp_path / "run.mcap"
     with Ledger(path, bench, notices, split=split) as ledger:
@@ -177,7 +206,9 @@ def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, b
 def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, bench):
     with Ledger(tmp_path / "run.mcap", bench) as ledger:
         keep(ledger, 0, 10)
-        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        wait_for(
+            lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
+        )
         (tmp_path / "run.mcap").unlink()
     assert ledger.failure.endswith("run.mcap was deleted while it was written")
     assert ledger.summary()["unrecorded"] >= 20
@@ -188,7 +219,9 @@ def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, ben
     folder.mkdir()
     with Ledger(folder / "run.mcap", bench, notices) as ledger:
         keep(ledger, 0, 10)
-        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        wait_for(
+            lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
+        )
         shutil.rmtree(folder)
         wait_for(lambda: "ledger-lost" in notices.active)
         folder.mkdir()
@@ -215,12 +248,23 @@ def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp
     notices, path = Notices(), tmp_path / "run.mcap"
     with LedgerSwitch(Ledger(path, bench, notices)) as switch:
         for number, event in ((9, "scenario"), (0, "start"), (1, "start"), (0, "end")):
-            record = {"name": f"f{number}", "kind": "blank", "who": "file", "t_ns": 0, "table": "{}"}
+            record = {
+                "name": f"f{number}",
+                "kind": "blank",
+                "who": "file",
+                "t_ns": 0,
+                "table": "{}",
+            }
             switch.fault(FaultRecord(host_ns=1, event=event, number=number, **record))
-        wait_for(lambda: sum(topic == FAULT_TOPIC for topic, _ in read_topics(path)) == 4, "the faults on the disk")
+        wait_for(
+            lambda: sum(topic == FAULT_TOPIC for topic, _ in read_topics(path)) == 4,
+            "the faults on the disk",
+        )
         path.unlink()
         wait_for(lambda: "ledger-lost" in notices.active)
-    found = [json.loads(data) for topic, data in read_topics(switch.last.path) if topic == FAULT_TOPIC]
+    found = [
+        json.loads(data) for topic, data in read_topics(switch.last.path) if topic == FAULT_TOPIC
+    ]
     assert [(each["event"], each["number"]) for each in found] == [("scenario", 9), ("start", 1)]
 
 
@@ -243,7 +287,9 @@ def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert ledger.failure is None
-    assert len([topic for topic, _ in read_topics(tmp_path / "run.mcap") if topic == "/process"]) >= 2
+    assert (
+        len([topic for topic, _ in read_topics(tmp_path / "run.mcap") if topic == "/process"]) >= 2
+    )
 
 
 def bomb(claimed: int, size: int) -> bytes:
@@ -255,7 +301,12 @@ def bomb(claimed: int, size: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("claimed", "word"), [(100_000_000, "at most 64 MB are unpacked"), (1000, "more than the 1000"), (50_000_000, "times")]
+    ("claimed", "word"),
+    [
+        (100_000_000, "at most 64 MB are unpacked"),
+        (1000, "more than the 1000"),
+        (50_000_000, "times"),
+    ],
 )
 def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, claimed, word):
     path = tmp_path / "bomb.mcap"
@@ -309,7 +360,11 @@ def test_a_report_of_absurd_times_is_a_report(tmp_path):
     form = {"light_ns": 1, "draw_ns": 1, "q": [1, 0, 0, 0]}
     times = (0, 10**18, 5, 2**62, 7)
     path = frames_file(
-        tmp_path, [form | {"frame": k, "t_ns": -(2**63) if k % 2 else t, "swap_ns": t} for k, t in enumerate(times)]
+        tmp_path,
+        [
+            form | {"frame": k, "t_ns": -(2**63) if k % 2 else t, "swap_ns": t}
+            for k, t in enumerate(times)
+        ],
     )
     assert summarise(figures_of(path)).frames == 5
 
@@ -319,7 +374,9 @@ def test_a_report_s_memory_does_not_grow_with_the_run():
     for begin in range(0, 140_000, 7000):
         figures.add(
             *(
-                FrameRecord(frame=k, t_ns=k, swap_ns=16_666_667 * k, missed_before=int(k == 70_000), **known)
+                FrameRecord(
+                    frame=k, t_ns=k, swap_ns=16_666_667 * k, missed_before=int(k == 70_000), **known
+                )
                 for k in range(begin, begin + 7000)
             )
         )
@@ -333,10 +390,16 @@ def test_a_report_s_memory_does_not_grow_with_the_run():
 def test_refused_packets_are_counted_by_reason(tmp_path, bench):
     with Ledger(tmp_path / "run.mcap", bench) as ledger:
         for k in range(500):
-            ledger.packet(1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000))
-    figures_messages = [(topic, json.loads(data)) for topic, data in read_topics(tmp_path / "run.mcap")]
+            ledger.packet(
+                1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000)
+            )
+    figures_messages = [
+        (topic, json.loads(data)) for topic, data in read_topics(tmp_path / "run.mcap")
+    ]
     whole = [each for topic, each in figures_messages if topic == "/attitude"]
-    counted = {each["reason"]: each["count"] for topic, each in figures_messages if topic == "/not_kept"}
+    counted = {
+        each["reason"]: each["count"] for topic, each in figures_messages if topic == "/not_kept"
+    }
     assert len(whole) == 40
     assert counted == {"crc": 380, "norm": 80}
     assert max(len(each["raw"]) for each in whole) == 2048

@@ -34,7 +34,18 @@ class Kept:
 
 
 def fault(event: str, name: str, number: int) -> FaultRecord:
-    return FaultRecord(host_ns=1, event=event, number=number, name=name, kind="", who="", t_ns=0, table="", seed=0, folder="")
+    return FaultRecord(
+        host_ns=1,
+        event=event,
+        number=number,
+        name=name,
+        kind="",
+        who="",
+        t_ns=0,
+        table="",
+        seed=0,
+        folder="",
+    )
 
 
 def begun(switch: LedgerSwitch) -> Kept:

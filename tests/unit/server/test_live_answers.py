@@ -22,7 +22,10 @@ from tests.support.waiting import wait_for
 
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 AWAY = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])  # 11 degrees
-BENCH = SimpleNamespace(config=SimpleNamespace(monitor=SimpleNamespace(refresh_hz=60.0)), scan=SimpleNamespace(hold_s=0.0))
+BENCH = SimpleNamespace(
+    config=SimpleNamespace(monitor=SimpleNamespace(refresh_hz=60.0)),
+    scan=SimpleNamespace(hold_s=0.0),
+)
 RULES = AnswerRules(0.1, clock="host")
 DRAWN = SimpleNamespace(rate_cam_rad_s=None)
 
@@ -76,26 +79,48 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
         assert answers.figures.answers == 0 and answers.figures.silent == ""
         second_of_frames(answers)
         star = ReportedStar(1.5, 2.0, 300.0, 26311)
-        source.waiting.append(Answer(at_ns + 9, b"\x01\xff", at_ns, Q, np.zeros(3), True, "track", 7, 1.2, (star,)))
+        source.waiting.append(
+            Answer(at_ns + 9, b"\x01\xff", at_ns, Q, np.zeros(3), True, "track", 7, 1.2, (star,))
+        )
         source.waiting.append(Answer(at_ns + 9, b"\x02", at_ns, AWAY, mode="x" * 99))
         source.waiting.append(Answer(at_ns + 9, b"\x03", at_ns, None, valid=False))
         source.refused = {"checksum": 2}
         wait_for(lambda: heard)
         clock.work(4 * NS_PER_S)
         wait_for(lambda: answers.figures.silent)
-    assert (heard[0].right, heard[0].wrong, heard[0].invalid, heard[0].refused) == (1, 1, 1, {"checksum": 2})
+    assert (heard[0].right, heard[0].wrong, heard[0].invalid, heard[0].refused) == (
+        1,
+        1,
+        1,
+        {"checksum": 2},
+    )
     assert notices.counts() == {"wrong-answer": 1, "tracker-silent": 1}
     right, wrong, invalid = kept.records
-    assert (right.raw, right.verdict, right.stars, right.centroids) == ("01ff", "right", 7, ((1.5, 2.0, 300.0, 26311),))
-    assert (right.middle_ns, right.light_ns, right.q_lit, right.residual_arcsec) == (at_ns, at_ns + 5, tuple(Q), (0, 0, 0))
+    assert (right.raw, right.verdict, right.stars, right.centroids) == (
+        "01ff",
+        "right",
+        7,
+        ((1.5, 2.0, 300.0, 26311),),
+    )
+    assert (right.middle_ns, right.light_ns, right.q_lit, right.residual_arcsec) == (
+        at_ns,
+        at_ns + 5,
+        tuple(Q),
+        (0, 0, 0),
+    )
     assert (right.first_frame, right.last_frame) == (27, 33)
-    assert wrong.verdict == "wrong" and abs(wrong.residual_arcsec[1] - np.degrees(0.2) * 3600) < 1e-3
+    assert (
+        wrong.verdict == "wrong" and abs(wrong.residual_arcsec[1] - np.degrees(0.2) * 3600) < 1e-3
+    )
     assert len(wrong.mode) == 40
     assert (invalid.verdict, invalid.q, invalid.q_lit) == ("invalid", None, None)
     # as the ledger writes and reads it, with a schema that readers of MCAP know
     for record in kept.records:
         assert msgspec.json.decode(msgspec.json.encode(record), type=AnswerRecord) == record
-    types = {field["type"] for field in msgspec.json.decode(schema_of(AnswerRecord, "x"))["properties"].values()}
+    types = {
+        field["type"]
+        for field in msgspec.json.decode(schema_of(AnswerRecord, "x"))["properties"].values()
+    }
     assert types == {"integer", "string", "array", "boolean", "number"}
 
 
@@ -133,7 +158,10 @@ def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
     assert notices.counts() == {"answers-failed": 1}
     # The one that could not be judged is counted and recorded all the same.
     assert (answers.figures.answers, answers.figures.unjudged) == (2, 1)
-    assert [(record.raw, record.verdict) for record in kept.records] == [("07", "unjudged"), ("", "right")]
+    assert [(record.raw, record.verdict) for record in kept.records] == [
+        ("07", "unjudged"),
+        ("", "right"),
+    ]
 
 
 def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():

@@ -36,7 +36,10 @@ def test_a_monitor_is_named_without_its_serial_number(monkeypatch, tmp_path):
         (folder / "edid").write_bytes(block)
     monkeypatch.setattr("hilstar.server.doctor.SYS", tmp_path)
     cells = row()
-    assert cells["monitors"].count("EDID") == 1 and "EDID DEL DELL U2412M (2012, 52 x 32 cm)" in cells["monitors"]
+    assert (
+        cells["monitors"].count("EDID") == 1
+        and "EDID DEL DELL U2412M (2012, 52 x 32 cm)" in cells["monitors"]
+    )
     assert SERIAL_TEXT not in str(cells) and str(SERIAL) not in str(cells)
 
 
@@ -45,16 +48,30 @@ def test_the_row_names_parts_and_versions_and_nothing_private(monkeypatch):
     monkeypatch.setattr("platform.release", lambda: "6.1.0-18-labs-bench-ada")
     cells = row()
     assert tuple(cells) == COLUMNS and all(cells.values())
-    assert "Python 3." in cells["hilstar"] and "6.1.0" in cells["machine"] and "OpenGL" in cells["OpenGL"]
+    assert (
+        "Python 3." in cells["hilstar"]
+        and "6.1.0" in cells["machine"]
+        and "OpenGL" in cells["OpenGL"]
+    )
     text = table(cells)
     head, rule, line = text.splitlines()
     assert head.count("|") == rule.count("|") == line.count("|") == len(COLUMNS) + 1
-    private = {socket.gethostname(), str(Path.home()), str(Path.cwd()), "labs-bench-ada", "/dev/"} - {"localhost", "/", ""}
+    private = {
+        socket.gethostname(),
+        str(Path.home()),
+        str(Path.cwd()),
+        "labs-bench-ada",
+        "/dev/",
+    } - {"localhost", "/", ""}
     private |= {getpass.getuser()} - {"root"}
     assert not [words for words in private if re.search(rf"(?<!\w){re.escape(words)}(?!\w)", text)]
 
 
 def test_the_command_prints_it_to_be_pasted_or_read_by_a_program():
     printed = run_hilstar_here("doctor", "--report")
-    assert printed.returncode == 0 and printed.stdout.startswith("| hilstar | machine |") and printed.stdout.count("\n") == 3
+    assert (
+        printed.returncode == 0
+        and printed.stdout.startswith("| hilstar | machine |")
+        and printed.stdout.count("\n") == 3
+    )
     assert tuple(json.loads(run_hilstar_here("doctor", "--report", "--json").stdout)) == COLUMNS

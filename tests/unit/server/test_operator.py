@@ -16,7 +16,9 @@ RATE = np.array([0.0, 0.1, 0.0])
 
 
 def attitude(angle: float, age_ns: int = 5 * MS) -> Attitude:
-    return Attitude(np.array([np.cos(angle), 0.0, 0.0, np.sin(angle)]), age_ns, False, rate_cam_rad_s=RATE)
+    return Attitude(
+        np.array([np.cos(angle), 0.0, 0.0, np.sin(angle)]), age_ns, False, rate_cam_rad_s=RATE
+    )
 
 
 @pytest.fixture
@@ -63,7 +65,15 @@ def test_each_change_of_keys_and_window_is_told_once(aids):
     notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
     window = SimpleNamespace(hidden="")
     operator = Operator(aids, notices, lambda: window.hidden)
-    for keys, hidden in (("", ""), ("grid", ""), ("grid", ""), ("", ""), ("", "minimised"), ("", "minimised"), ("", "")):
+    for keys, hidden in (
+        ("", ""),
+        ("grid", ""),
+        ("grid", ""),
+        ("", ""),
+        ("", "minimised"),
+        ("", "minimised"),
+        ("", ""),
+    ):
         aids.set("grid", keys == "grid")
         window.hidden = hidden
         assert operator.look() == OnScreen(keys, hidden, True)
@@ -73,7 +83,9 @@ def test_each_change_of_keys_and_window_is_told_once(aids):
 
 def test_changed_and_hidden_frames_are_counted_with_their_time(aids):
     operator = Operator(aids, Notices())
-    for k, on_screen in enumerate([OnScreen(), OnScreen("grid"), OnScreen("grid", "covered"), OnScreen()]):
+    for k, on_screen in enumerate(
+        [OnScreen(), OnScreen("grid"), OnScreen("grid", "covered"), OnScreen()]
+    ):
         operator.count(on_screen, 20 * MS * k)
     assert operator.summary() == {
         "operator": {"frames": 2, "s": pytest.approx(0.04)},

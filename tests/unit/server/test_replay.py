@@ -58,7 +58,10 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
         renderer=SimpleNamespace(
-            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+            gl_renderer="none",
+            gl_version="none",
+            path="NumPy",
+            target=SimpleNamespace(quantisation="exact"),
         ),
         config=SimpleNamespace(
             render=SimpleNamespace(codes_ms=None),
@@ -72,7 +75,9 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
             kept.packet(1000 + k, encode(sample), sample, None)
             q, rate = None if k == 3 else (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0) if k >= 8 else None
             at_ns = 20_000_000 * k
-            frame = FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate)
+            frame = FrameRecord(
+                frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate
+            )
             frame.velocity_km_s = (0.0, 7.5, speed_km_s) if k >= 6 else None
             frame.place_km = (7000.0 + away_km, 0.0, 1.0) if k >= 6 else None
             kept.frame(frame)
@@ -96,7 +101,13 @@ def test_the_speed_stretches_the_log_and_max_draws_it_all_unpaced(log, config, s
 
 def test_a_span_and_a_step_choose_the_frames(log, config):
     play = plan_play(log, Wanted(MAX, start_s=0.5, stop_s=1.5, step_s=0.25), config)
-    assert [play.frame(k)[1] / 1e9 for k in range(play.frame_count)] == [100.5, 100.75, 101.0, 101.25, 101.5]
+    assert [play.frame(k)[1] / 1e9 for k in range(play.frame_count)] == [
+        100.5,
+        100.75,
+        101.0,
+        101.25,
+        101.5,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -115,14 +126,18 @@ def test_a_replay_of_no_or_too_many_frames_is_refused(log, config, wanted, word)
         plan_play(log, wanted, config)
 
 
-def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(tmp_path, config):
+def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(
+    tmp_path, config
+):
     path = tmp_path / "fast.csv"
     path.write_text("t_s,qw,qx,qy,qz,rx,ry,rz\n0,1,0,0,0,0,0,0\n1,1,0,0,0,0,0,57.3\n")
     with pytest.raises(InputError, match=r"attitude 2.*max_rate_deg_s"):
         plan_play(path, Wanted(), config)
 
 
-def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_attitudes(ledger, config):
+def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_attitudes(
+    ledger, config
+):
     play = plan_play(ledger, Wanted(MAX), config)
     assert (play.frame_count, play.packet_count, play.paced, play.moving) == (10, 10, False, True)
     frames = [play.frame(k) for k in range(10)]
@@ -141,8 +156,13 @@ def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledg
         plan_play(ledger, Wanted(2.0), config)
 
 
-def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(ledger, config, tmp_path, small_bench_file):
-    places = [frame[2].place_km for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(
+    ledger, config, tmp_path, small_bench_file
+):
+    places = [
+        frame[2].place_km
+        for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))
+    ]
     assert places[0] is None
     assert places[1].tolist() == [7000.0, 0.0, 1.0]
     far = earlier_run(tmp_path / "far.mcap", small_bench_file, away_km=1e8)
@@ -150,8 +170,13 @@ def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(ledger, co
         plan_play(far, Wanted(speed=MAX), config)
 
 
-def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(ledger, config, tmp_path, small_bench_file):
-    velocities = [frame[2].velocity_km_s for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(
+    ledger, config, tmp_path, small_bench_file
+):
+    velocities = [
+        frame[2].velocity_km_s
+        for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))
+    ]
     assert velocities[0] is None
     assert velocities[1].tolist() == [0.0, 7.5, 0.0]
     too_fast = earlier_run(tmp_path / "fast.mcap", small_bench_file, speed_km_s=3e5)
@@ -167,7 +192,11 @@ def test_a_ledger_says_who_drew_it_and_a_log_does_not(ledger, log, config):
 def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
     here = DrawnBy("llvmpipe", "4.5", "compute shaders")
     assert here.other_codes(DrawnBy("llvmpipe", "4.5", "compute shaders"), "exact") == 0
-    for other in (replace(here, gl_renderer="zink"), replace(here, gl_version="4.6"), replace(here, path="points")):
+    for other in (
+        replace(here, gl_renderer="zink"),
+        replace(here, gl_version="4.6"),
+        replace(here, path="points"),
+    ):
         assert here.other_codes(other, "round") == QUANTISERS["round"].other_codes
         assert here.other_codes(other, "exact") == QUANTISERS["exact"].other_codes
     assert here.other_codes(replace(here, path="NumPy"), "exact") == OTHER_CODES_BY_NUMPY

@@ -34,14 +34,19 @@ class Keys:
 @pytest.fixture
 def loop():
     return SimpleNamespace(
-        tally=RunTally(), gate=StaleGate(250 * MS), notices=Notices(), pacer=SimpleNamespace(operator=Keys())
+        tally=RunTally(),
+        gate=StaleGate(250 * MS),
+        notices=Notices(),
+        pacer=SimpleNamespace(operator=Keys()),
     )
 
 
 RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
 
 
-def shown(attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more) -> Shown:
+def shown(
+    attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more
+) -> Shown:
     return Shown(number, 0, attitude, SimpleNamespace(clipped_hip=clipped), **more)
 
 
@@ -49,7 +54,12 @@ def test_a_status_names_the_frame_its_light_and_the_attitude_behind_it(loop):
     counts = PacketCounts(received=10)
     counts.refused_by["crc"] = 3
     status = StatusMaker().status(shown(), 123, loop, counts, True)
-    assert (status.frame, status.light_t_ns, status.attitude_sequence, status.attitude_age_ns) == (9, 123, 42, 5 * MS)
+    assert (status.frame, status.light_t_ns, status.attitude_sequence, status.attitude_age_ns) == (
+        9,
+        123,
+        42,
+        5 * MS,
+    )
     assert (status.accepted, status.refused) == (7, 3)
     assert status.health == protocol.HEALTH_CLOCK_SYNCHRONISED | protocol.HEALTH_REFUSED
 
@@ -71,12 +81,18 @@ def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):
 
 @pytest.mark.parametrize(
     ("on_screen", "bit"),
-    [(OnScreen(operator="grid"), protocol.HEALTH_OPERATOR_OVERRIDE), (OnScreen(hidden="minimised"), protocol.HEALTH_HIDDEN)],
+    [
+        (OnScreen(operator="grid"), protocol.HEALTH_OPERATOR_OVERRIDE),
+        (OnScreen(hidden="minimised"), protocol.HEALTH_HIDDEN),
+    ],
 )
 def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop, on_screen, bit):
     maker = StatusMaker()
     loop.pacer.operator.now = on_screen
-    assert [maker.status(shown(), 0, loop, PacketCounts(), False).health for _ in range(2)] == [bit, bit]
+    assert [maker.status(shown(), 0, loop, PacketCounts(), False).health for _ in range(2)] == [
+        bit,
+        bit,
+    ]
 
 
 def test_a_failed_ledger_a_clipped_star_and_a_stale_attitude_are_told_while_they_last(loop):

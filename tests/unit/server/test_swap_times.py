@@ -24,7 +24,9 @@ MS = 1e6
 ON_TIME_NS = 20_000
 # while a queue fills, swaps return between refreshes and pull the clock a little
 QUEUED_NS = 250_000
-TURNING = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 0, False, rate_cam_rad_s=np.array([0.0, 0.03, 0.0]))
+TURNING = Attitude(
+    np.array([1.0, 0.0, 0.0, 0.0]), 0, False, rate_cam_rad_s=np.array([0.0, 0.03, 0.0])
+)
 
 
 class Run:
@@ -39,7 +41,9 @@ class Run:
         self.pacer = DisplayPacer(self.screen, self.notices, clock)
         self.moments: list[Moment] = []
         self.shown: list[Shown] = []
-        self.loop = FrameLoop(self.screen.bench, self.shown.append, self.pacer, notices=self.notices)
+        self.loop = FrameLoop(
+            self.screen.bench, self.shown.append, self.pacer, notices=self.notices
+        )
 
     def frames(self, slots: int) -> np.ndarray:
         """Show so many refresh periods; how much later than predicted the light of each frame
@@ -82,16 +86,23 @@ def test_stamps_of_another_clock_are_given_up(tmp_path, caplog, wrong_ms):
 def test_single_gaps_between_stamps_cost_nothing(tmp_path, caplog):
     run = Run(tmp_path, stamp_ns=0, stampless=lambda number: number % 10 == 3)
     assert np.abs(run.frames(200)).max() < ON_TIME_NS
-    assert {frame.timestamp_source for frame in run.shown} == {"GLX_OML_sync_control", "after-swap clock"}
+    assert {frame.timestamp_source for frame in run.shown} == {
+        "GLX_OML_sync_control",
+        "after-swap clock",
+    }
     assert "gives no time" not in caplog.text
 
 
 @pytest.mark.parametrize("hz", HZ)
 @pytest.mark.parametrize("buffers", [2, 3, 4])
-def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(tmp_path, hz, buffers):
+def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(
+    tmp_path, hz, buffers
+):
     held = buffers - 2
     if held:
-        with pytest.raises(MachineError, match=f"holds {held} finished frame.* back.*after the swap.*--force"):
+        with pytest.raises(
+            MachineError, match=f"holds {held} finished frame.* back.*after the swap.*--force"
+        ):
             Run(tmp_path, hz, buffers=buffers)
     run = Run(tmp_path, hz, force=True, buffers=buffers)
     assert run.timing.queued == held
@@ -99,7 +110,9 @@ def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(
     assert run.loop.screen_summary()["queued_frames"] == held
 
 
-@pytest.mark.parametrize(("deadline_ms", "hz"), [(0.2, 60), (0.9, 60), (1.3, 60), (1.3, 240), (3.1, 60), (3.1, 144)])
+@pytest.mark.parametrize(
+    ("deadline_ms", "hz"), [(0.2, 60), (0.9, 60), (1.3, 60), (1.3, 240), (3.1, 60), (3.1, 144)]
+)
 def test_a_driver_that_needs_longer_is_found_by_the_gate(tmp_path, deadline_ms, hz):
     """With a guard of 1 ms and a driver that needs 1.3, every frame was a refresh late, at half
     the rate, for good.

@@ -32,7 +32,11 @@ def test_a_run_on_time_is_right(summary):
         ({"frames": 13, "missed_frames": 167}, False, "167 of 180 frames missed"),
         ({"stale_frames": 6}, True, "6 of 600 frames with a stale attitude"),
         ({"stale_frames": 7}, False, "7 of 600 frames with a stale attitude"),
-        ({"stale_frames": 90, "blank_frames": 90}, True, "90 of 600 frames before the first attitude"),
+        (
+            {"stale_frames": 90, "blank_frames": 90},
+            True,
+            "90 of 600 frames before the first attitude",
+        ),
         ({"stale_frames": 600, "blank_frames": 600}, False, "no frame had an attitude"),
     ],
 )

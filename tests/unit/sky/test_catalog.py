@@ -38,13 +38,24 @@ def test_every_usable_row_is_there():
     assert catalog.rows_read == 118_218
     assert len(catalog) == 116_812
     assert len(np.unique(catalog.hip)) == 116_812
-    for name in ("ra_deg", "dec_deg", "v_mag", "bv_mag", "vi_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"):
+    for name in (
+        "ra_deg",
+        "dec_deg",
+        "v_mag",
+        "bv_mag",
+        "vi_mag",
+        "pm_ra_cosdec_mas_yr",
+        "pm_dec_mas_yr",
+    ):
         assert np.isfinite(getattr(catalog, name)).all(), name
 
 
 def test_the_packaged_file_names_its_source():
     with np.load(PACKAGED_CATALOG) as packed:
-        assert str(packed["source_sha256"]) == "58ceabb104d647160d9437ce6e513a02a036bb4ad9f8879a5a22fd52943616e0"
+        assert (
+            str(packed["source_sha256"])
+            == "58ceabb104d647160d9437ce6e513a02a036bb4ad9f8879a5a22fd52943616e0"
+        )
     assert len(hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest()) == 64
     assert PACKAGED_CATALOG.stat().st_size < 6_000_000
 
@@ -63,7 +74,15 @@ def test_a_user_s_own_hip_main_gives_the_packaged_figures(tmp_path):
     assert own.rows_read == 2
     for k in range(2):
         place = np.flatnonzero(packaged.hip == own.hip[k])[0]
-        for name in ("ra_deg", "dec_deg", "v_mag", "bv_mag", "vi_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"):
+        for name in (
+            "ra_deg",
+            "dec_deg",
+            "v_mag",
+            "bv_mag",
+            "vi_mag",
+            "pm_ra_cosdec_mas_yr",
+            "pm_dec_mas_yr",
+        ):
             assert getattr(own, name)[k] == getattr(packaged, name)[place]
 
 
@@ -92,7 +111,10 @@ def test_a_missing_v_minus_i_is_nan(tmp_path):
         ("\N{SNOWMAN}", "hip_main.dat:1: not a row"),
         (with_field(ROWS[0], 8, " nan ") + "\n", "hip_main.dat:1: field 8 (ra_deg)"),
         (with_field(ROWS[0], 8, "400") + "\n", "write a number from 0 to 360"),
-        (with_field(ROWS[0], 9, "-90.01") + "\n", "field 9 (dec_deg) is '-90.01'; write a number from -90 to 90"),
+        (
+            with_field(ROWS[0], 9, "-90.01") + "\n",
+            "field 9 (dec_deg) is '-90.01'; write a number from -90 to 90",
+        ),
         (with_field(ROWS[0], 5, "-1000000") + "\n", "write a number from -30 to 40"),
         (with_field(ROWS[0], 1, "9" * 11) + "\n", "field 1 (hip)"),
         (with_field(ROWS[0], 1, "1" * 100_000) + "\n", "field 1 (hip) is '1111"),
@@ -129,17 +151,32 @@ def test_a_star_is_called_by_its_catalogue():
     zero = np.zeros(2)
     columns = {"v_mag": zero, "ra_deg": zero, "dec_deg": zero}
     tycho = plain_catalog("TYC", 2, columns | {"identifier": np.array([9_537_003_861, 1_000_133])})
-    gaia = plain_catalog("Gaia DR3", 2, columns | {"identifier": np.array([4_295_806_720, 2**62]), "hip": np.array([0, 7])})
+    gaia = plain_catalog(
+        "Gaia DR3",
+        2,
+        columns | {"identifier": np.array([4_295_806_720, 2**62]), "hip": np.array([0, 7])},
+    )
     assert [tycho.name(row) for row in range(2)] == ["TYC 9537-386-1", "TYC 1-13-3"]
     assert [gaia.name(row) for row in range(2)] == ["Gaia DR3 4295806720", "HIP 7"]
 
 
 @pytest.mark.parametrize(
     ("designation", "name", "identifier"),
-    [("Gaia DR3", "Gaia DR3 4295806720", 4_295_806_720), ("TYC", "TYC 8-3041-2", 8_030_412), ("mine", "mine 12", 12)],
+    [
+        ("Gaia DR3", "Gaia DR3 4295806720", 4_295_806_720),
+        ("TYC", "TYC 8-3041-2", 8_030_412),
+        ("mine", "mine 12", 12),
+    ],
 )
 def test_a_name_of_a_catalogue_s_own_leads_back_to_its_star(designation, name, identifier):
-    columns = {"v_mag": np.zeros(1), "ra_deg": np.zeros(1), "dec_deg": np.zeros(1), "identifier": np.array([identifier])}
+    columns = {
+        "v_mag": np.zeros(1),
+        "ra_deg": np.zeros(1),
+        "dec_deg": np.zeros(1),
+        "identifier": np.array([identifier]),
+    }
     catalog = plain_catalog(designation, 1, columns)
     assert catalog.name(0) == name and catalog.identifier_of(name) == identifier
-    assert [catalog.identifier_of(other) for other in ("HIP 3", f"{designation} x", designation, "")] == [None] * 4
+    assert [
+        catalog.identifier_of(other) for other in ("HIP 3", f"{designation} x", designation, "")
+    ] == [None] * 4

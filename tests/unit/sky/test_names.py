@@ -29,7 +29,9 @@ def test_names_belong_to_the_stars_that_skyfield_gives_them():
     ours = {name: hip for hip, (_, name) in star_names().items() if name}
     shared = ours.keys() & named_star_dict.keys()
     assert len(shared) >= MIN_SHARED
-    assert {name: ours[name] for name in shared} == {name: named_star_dict[name] for name in shared} | GIVEN_ANEW
+    assert {name: ours[name] for name in shared} == {
+        name: named_star_dict[name] for name in shared
+    } | GIVEN_ANEW
 
 
 def test_labels_are_designations_where_there_are_any():

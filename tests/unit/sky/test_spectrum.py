@@ -87,7 +87,9 @@ def test_a_curve_that_is_neither_name_nor_file_is_refused(tmp_path):
 def test_a_tracker_that_sees_nothing_is_refused():
     with pytest.raises(InputError, match="zero everywhere"):
         tabulate("dgs", Optics(30, constant_curve(0.0), constant_curve(1.0)), Photometry())
-    apart = Optics(30, Curve(np.array([300.0, 400]), np.ones(2)), Curve(np.array([500.0, 600]), np.ones(2)))
+    apart = Optics(
+        30, Curve(np.array([300.0, 400]), np.ones(2)), Curve(np.array([500.0, 600]), np.ones(2))
+    )
     with pytest.raises(InputError, match="share no wavelength"):
         tabulate("dgs", apart, Photometry())
 

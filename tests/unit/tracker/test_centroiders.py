@@ -13,7 +13,15 @@ from hilstar.tracker.centroiders import Centroider, brightest, star_places
 SIGMA = (1.05, 0.95)
 # Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
 # 3 most of them.
-BIAS_PX = {"moment": 1e-6, "window": 2e-3, "wide": 2e-3, "fit": 1e-6, "psf": 1e-6, "box3": 0.3, "box5": 0.1}
+BIAS_PX = {
+    "moment": 1e-6,
+    "window": 2e-3,
+    "wide": 2e-3,
+    "fit": 1e-6,
+    "psf": 1e-6,
+    "box3": 0.3,
+    "box5": 0.1,
+}
 
 
 def stars(places, side=21):
@@ -44,7 +52,11 @@ def test_each_follows_a_small_shift_and_finds_nothing_in_the_dark(kind):
 
 
 def test_noise_alone_and_clipped_stars_keep_every_place_finite(rng):
-    for images in (rng.normal(0, 1, (40, 15, 15)) + 0.1, np.ones((3, 15, 15)), np.minimum(stars(np.zeros((2, 3))), 0.01)):
+    for images in (
+        rng.normal(0, 1, (40, 15, 15)) + 0.1,
+        np.ones((3, 15, 15)),
+        np.minimum(stars(np.zeros((2, 3))), 0.01),
+    ):
         for kind in get_args(Centroider):
             assert np.isfinite(star_places(np.maximum(images, 0), kind, SIGMA)).all()
 

@@ -28,7 +28,10 @@ def test_a_centre_that_leaves_the_image_is_measured_alike_at_all_four_edges(wind
     image[0, 19:22] = 30.0, 100.0, 50.0
     image[1, 20] = -120.0
     turned = [
-        find_stars(np.rot90(image, k), CentroidSettings(window=window, window_sigma_px=1.3), BACKGROUND) for k in range(4)
+        find_stars(
+            np.rot90(image, k), CentroidSettings(window=window, window_sigma_px=1.3), BACKGROUND
+        )
+        for k in range(4)
     ]
     assert turned[0].y_px[0] < -0.5
     for k, star in enumerate(turned):
@@ -60,6 +63,9 @@ def test_the_background_of_whole_numbers_is_that_of_their_pixels(shape):
     """
     image = np.random.default_rng(5).poisson(20.0, shape).astype(np.uint16)
     image[3:6, 3:6] = 4000
-    counted, by_pixel = estimate_background(image), estimate_background(image.astype(np.float64), step=1.0)
+    counted, by_pixel = (
+        estimate_background(image),
+        estimate_background(image.astype(np.float64), step=1.0),
+    )
     assert counted.level == pytest.approx(by_pixel.level, rel=1e-12)
     assert counted.noise == pytest.approx(by_pixel.noise, rel=1e-12)

@@ -12,7 +12,14 @@ from msgspec.structs import replace
 from scipy import ndimage, stats
 
 from hilstar.basics.errors import InputError
-from hilstar.tracker.detector import RAY_DEPTH_UM, RAY_E_PER_UM, Detector, bloom, cosmic_rays_e, false_stars_e
+from hilstar.tracker.detector import (
+    RAY_DEPTH_UM,
+    RAY_E_PER_UM,
+    Detector,
+    bloom,
+    cosmic_rays_e,
+    false_stars_e,
+)
 from hilstar.tracker.settings import MAX_E, DetectorSettings, e2v_dark, silicon_gap_ev
 
 SIZE_PX = (160, 128)
@@ -53,22 +60,30 @@ def flat(level_e: float) -> np.ndarray:
 
 
 def test_same_seeds_give_the_same_image_bit_for_bit():
-    first, second = (Detector(EVERYTHING, SIZE_PX).expose(flat(900.0), 1.0, generator()) for _ in range(2))
+    first, second = (
+        Detector(EVERYTHING, SIZE_PX).expose(flat(900.0), 1.0, generator()) for _ in range(2)
+    )
     assert first.dtype == np.uint16
     assert first.shape == SHAPE
     np.testing.assert_array_equal(first, second)
 
 
 def test_another_frame_seed_changes_only_the_frames_noise():
-    settings = DetectorSettings(gain_e_per_dn=1.0, prnu=0.05, dsnu_e_per_s=200.0, dark_e_per_s=1000.0, bits=16)
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0, prnu=0.05, dsnu_e_per_s=200.0, dark_e_per_s=1000.0, bits=16
+    )
     detector = Detector(settings, SIZE_PX)
-    first, second = (detector.expose(flat(10_000.0), 1.0, generator(seed)).astype(float) for seed in (1, 2))
+    first, second = (
+        detector.expose(flat(10_000.0), 1.0, generator(seed)).astype(float) for seed in (1, 2)
+    )
     assert (first != second).mean() > 0.9
     # Shot noise of 11 000 e- is 105 e-, the fixed pattern 540 e-: the difference holds the first
     # and not the second.
     shot_e = math.sqrt(11_000.0)
     rounding = 1 / 12
-    assert (first - second).std() == pytest.approx(math.sqrt(2 * (shot_e**2 + rounding)), rel=SIGMA_ERROR)
+    assert (first - second).std() == pytest.approx(
+        math.sqrt(2 * (shot_e**2 + rounding)), rel=SIGMA_ERROR
+    )
     assert first.std() > 4 * shot_e
 
 
@@ -82,7 +97,10 @@ def test_another_device_seed_changes_every_map():
 
 def test_switching_one_defect_on_leaves_the_other_maps_as_they_were():
     plain = Detector(DetectorSettings(prnu=0.03, dark_e_per_s=203.0, dsnu_e_per_s=60.0), SIZE_PX)
-    hot = Detector(DetectorSettings(prnu=0.03, dark_e_per_s=203.0, dsnu_e_per_s=60.0, hot_pixel_fraction=0.01), SIZE_PX)
+    hot = Detector(
+        DetectorSettings(prnu=0.03, dark_e_per_s=203.0, dsnu_e_per_s=60.0, hot_pixel_fraction=0.01),
+        SIZE_PX,
+    )
     np.testing.assert_array_equal(plain.gain_map, hot.gain_map)
     changed = plain.dark_map_e_per_s != hot.dark_map_e_per_s
     assert changed.sum() == pytest.approx(0.01 * PIXELS, abs=SIGMAS * math.sqrt(0.01 * PIXELS))
@@ -91,7 +109,9 @@ def test_switching_one_defect_on_leaves_the_other_maps_as_they_were():
 
 def test_the_gain_map_acts_on_light_before_its_shot_noise():
     detector = Detector(DetectorSettings(gain_e_per_dn=1.0, bits=16, prnu=0.3), SIZE_PX)
-    first, second = (detector.expose(flat(5000.0), 0.0, generator(seed)).astype(float) for seed in (1, 2))
+    first, second = (
+        detector.expose(flat(5000.0), 0.0, generator(seed)).astype(float) for seed in (1, 2)
+    )
     # Before: a variance of 5000 <g>. After: 5000 <g^2>, 9 % more. The variance of 20 480
     # differences is good to 1 %.
     variance_e2 = (first - second).var() / 2 - 1 / 12
@@ -99,7 +119,9 @@ def test_the_gain_map_acts_on_light_before_its_shot_noise():
 
 
 def test_the_full_well_clips_before_read_noise_and_adc():
-    settings = DetectorSettings(gain_e_per_dn=1.0, full_well_e=3000.0, bits=16, offset_dn=100.0, read_noise_e=20.0)
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0, full_well_e=3000.0, bits=16, offset_dn=100.0, read_noise_e=20.0
+    )
     image = Detector(settings, SIZE_PX).expose(flat(1e6), 1.0, generator()).astype(float)
     # Read noise after the clip is whole; before it, the image would be a constant 3100. No shot
     # noise survives the clip.
@@ -116,7 +138,15 @@ def test_noise_by_source_is_what_frames_of_that_source_alone_scatter_by():
         "dark_e2": ({"dark_e_per_s": 300.0, "temperature_k": 298.0}, 0.0),
         "read_e2": ({"read_noise_e": 12.0}, 0.0),
         "prnu_e2": ({"prnu": 0.2}, 5000.0),
-        "dsnu_e2": ({"dark_e_per_s": 900.0, "dsnu_e_per_s": 90.0, "fixed_pattern": "cmos", "column_noise_e": 80.0}, 0.0),
+        "dsnu_e2": (
+            {
+                "dark_e_per_s": 900.0,
+                "dsnu_e_per_s": 90.0,
+                "fixed_pattern": "cmos",
+                "column_noise_e": 80.0,
+            },
+            0.0,
+        ),
         "dsnu_e2 of offsets": ({"dsnu_e": 30.0}, 0.0),
         "reset_e2": ({"sense_capacitance_ff": 2.0, "temperature_k": 250.0}, 0.0),
         "quantisation_e2": ({"quantisation_noise": True}, 0.0),
@@ -125,7 +155,12 @@ def test_noise_by_source_is_what_frames_of_that_source_alone_scatter_by():
         settings = replace(bench, **keys)
         noise = settings.noise(light_e, 2.0)
         assert getattr(noise, name.split()[0]) > 0.7 * noise.total_e2, name
-        variance_e2 = Detector(settings, (1280, 128)).expose(np.full((128, 1280), light_e), 2.0, generator()).var() * 0.25
+        variance_e2 = (
+            Detector(settings, (1280, 128))
+            .expose(np.full((128, 1280), light_e), 2.0, generator())
+            .var()
+            * 0.25
+        )
         # 1280 columns give the variance of a column to 4 %; it is at most half of one of these.
         assert variance_e2 == pytest.approx(noise.total_e2, rel=SIGMAS * 0.02), name
     assert bench.noise(0.0, 0.0).total_e2 == pytest.approx(rounding_e2)
@@ -168,7 +203,9 @@ def test_no_exposure_and_no_light_give_the_offset_and_nothing_else():
 
 
 def test_an_empty_field_in_a_noiseless_sensor_is_the_offset():
-    image = Detector(DetectorSettings(offset_dn=7.0), SIZE_PX).expose(np.zeros(SHAPE, dtype=np.float32), 10.0, generator())
+    image = Detector(DetectorSettings(offset_dn=7.0), SIZE_PX).expose(
+        np.zeros(SHAPE, dtype=np.float32), 10.0, generator()
+    )
     assert (image == 7).all()
 
 
@@ -177,7 +214,9 @@ def test_electrons_of_every_number_type_give_the_same_image_and_stay_as_they_wer
     image_e = flat(300.0).astype(kind)
     image = Detector(EVERYTHING, SIZE_PX).expose(image_e, 0.1, generator())
     Detector(EVERYTHING, SIZE_PX).expose_noiseless(image_e, 0.1)
-    np.testing.assert_array_equal(image, Detector(EVERYTHING, SIZE_PX).expose(flat(300.0), 0.1, generator()))
+    np.testing.assert_array_equal(
+        image, Detector(EVERYTHING, SIZE_PX).expose(flat(300.0), 0.1, generator())
+    )
     assert (image_e == 300).all()
 
 
@@ -189,7 +228,9 @@ def test_noiseless_is_the_rounded_mean_without_fixed_pattern():
 
 
 def test_noisy_frames_scatter_around_the_noiseless_one():
-    settings = DetectorSettings(gain_e_per_dn=2.0, offset_dn=50.0, read_noise_e=6.0, dark_e_per_s=100.0)
+    settings = DetectorSettings(
+        gain_e_per_dn=2.0, offset_dn=50.0, read_noise_e=6.0, dark_e_per_s=100.0
+    )
     detector = Detector(settings, SIZE_PX)
     rng, frames = generator(), 16
     mean = np.mean([detector.expose(flat(1000.0), 1.0, rng) for _ in range(frames)])
@@ -215,7 +256,10 @@ def test_quantisation_noise_is_roundings_unless_the_thesis_gaussian_is_asked_for
 def test_dark_is_the_datasheets_at_the_reference_and_falls_with_the_cold():
     for law in ("arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"):
         assert DetectorSettings(dark_law=law).dark_factor == 1.0
-        factors = [DetectorSettings(dark_law=law, temperature_k=t).dark_factor for t in (240.0, 260.0, 280.0, 300.0)]
+        factors = [
+            DetectorSettings(dark_law=law, temperature_k=t).dark_factor
+            for t in (240.0, 260.0, 280.0, 300.0)
+        ]
         assert factors == sorted(factors)
     # The datasheet's own figure at 293 K must be the 1 that it is relative to; its coefficients
     # have 3 digits.
@@ -227,13 +271,18 @@ def test_arrhenius_doubles_over_the_textbook_interval():
     # d ln D / dT = E / (k T^2): 0.56 eV at 293 K gives ln 2 in 9.2 K (taken at the middle of the
     # interval).
     interval_k = math.log(2) * 8.617333e-5 * 293.0**2 / 0.56
-    colder, warmer = (DetectorSettings(temperature_k=293.0 + side * interval_k / 2).dark_factor for side in (-1, 1))
+    colder, warmer = (
+        DetectorSettings(temperature_k=293.0 + side * interval_k / 2).dark_factor
+        for side in (-1, 1)
+    )
     second_order = (interval_k / 293.0) ** 2
     assert warmer / colder == pytest.approx(2.0, rel=second_order)
 
 
 def test_temperature_acts_on_dark_frames():
-    settings = DetectorSettings(gain_e_per_dn=1.0, bits=16, dark_e_per_s=203.0, dark_law="ccd47-20", temperature_k=273.0)
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0, bits=16, dark_e_per_s=203.0, dark_law="ccd47-20", temperature_k=273.0
+    )
     image = Detector(settings, SIZE_PX).expose(flat(0.0), 10.0, generator())
     expected_e = 2030.0 * e2v_dark("ccd47-20", 273.0) / e2v_dark("ccd47-20", 293.0)
     assert expected_e < 0.2 * 2030.0
@@ -249,7 +298,9 @@ def test_diffusion_and_depletion_follow_the_thesis_equation(share):
 
     for kelvin in (230.0, 263.0, 293.0, 313.0):
         wanted = float(np.array([1 - share, share]) @ (terms(kelvin) / terms(293.0)))
-        settings = DetectorSettings(dark_law="diffusion-depletion", dark_depletion_share=share, temperature_k=kelvin)
+        settings = DetectorSettings(
+            dark_law="diffusion-depletion", dark_depletion_share=share, temperature_k=kelvin
+        )
         assert settings.dark_factor == pytest.approx(wanted, rel=1e-12)
 
 
@@ -267,7 +318,9 @@ def test_the_gap_is_silicons_or_the_one_that_is_written():
         ("gamma", lambda share: stats.gamma.ppf(share, (200 / 60) ** 2, scale=60.0**2 / 200)),
         (
             "log-normal",
-            lambda share: stats.lognorm.ppf(share, (s := math.sqrt(math.log1p(0.09))), scale=200 * math.exp(-s * s / 2)),
+            lambda share: stats.lognorm.ppf(
+                share, (s := math.sqrt(math.log1p(0.09))), scale=200 * math.exp(-s * s / 2)
+            ),
         ),
     ],
 )
@@ -287,17 +340,25 @@ QUANTILE_SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 @pytest.mark.parametrize(
     ("law", "of"),
-    [("normal", stats.norm(200, 40)), ("gamma", stats.gamma(4, scale=30)), ("log-normal", stats.lognorm(0.6, scale=100))],
+    [
+        ("normal", stats.norm(200, 40)),
+        ("gamma", stats.gamma(4, scale=30)),
+        ("log-normal", stats.lognorm(0.6, scale=100)),
+    ],
 )
 def test_a_law_is_fitted_to_measured_quantiles(law, of):
     points = tuple(zip(QUANTILE_SHARES, of.ppf(QUANTILE_SHARES).tolist(), strict=True))
     settings = DetectorSettings(dark_distribution=law, dark_quantiles=points)
-    assert (settings.dark_e_per_s, settings.dsnu_e_per_s) == pytest.approx((of.mean(), of.std()), rel=1e-5)
+    assert (settings.dark_e_per_s, settings.dsnu_e_per_s) == pytest.approx(
+        (of.mean(), of.std()), rel=1e-5
+    )
     assert replace(settings, prnu=0.01).dark_e_per_s == settings.dark_e_per_s
     rates = Detector(settings, (600, 600)).dark_map_e_per_s
     # A quantile of 360 000 pixels: 1 % of the sigma at 99 %, which is its largest error by five of
     # its own sigmas.
-    assert np.quantile(rates, QUANTILE_SHARES) == pytest.approx(of.ppf(QUANTILE_SHARES), abs=0.05 * of.std())
+    assert np.quantile(rates, QUANTILE_SHARES) == pytest.approx(
+        of.ppf(QUANTILE_SHARES), abs=0.05 * of.std()
+    )
 
 
 @pytest.mark.parametrize(
@@ -317,27 +378,42 @@ def test_quantiles_that_no_law_has_are_refused(law, points, words):
 
 def test_offsets_of_pixels_stay_whatever_the_exposure_and_the_rows():
     settings = DetectorSettings(gain_e_per_dn=0.1, offset_dn=2000.0, bits=16, dsnu_e=20.0)
-    image = Detector(settings, (256, 1024)).expose(np.zeros((1024, 256)), 0.0, generator()) * 0.1 - 200.0
+    image = (
+        Detector(settings, (256, 1024)).expose(np.zeros((1024, 256)), 0.0, generator()) * 0.1
+        - 200.0
+    )
     np.testing.assert_allclose(image, Detector(settings, (256, 1024)).offset_map_e, atol=0.051)
     assert image.std() == pytest.approx(20.0, rel=0.02)
 
 
 def test_hot_pixels_have_a_temperature_law_of_their_own():
     cold, warm = (
-        DetectorSettings(hot_pixel_fraction=1.0, hot_pixel_activation_ev=0.3, dark_e_per_s=100.0, temperature_k=kelvin)
+        DetectorSettings(
+            hot_pixel_fraction=1.0,
+            hot_pixel_activation_ev=0.3,
+            dark_e_per_s=100.0,
+            temperature_k=kelvin,
+        )
         for kelvin in (263.0, 293.0)
     )
-    extra = [Detector(one, SIZE_PX).dark_map_e_per_s.astype(float) - 100.0 * one.dark_factor for one in (cold, warm)]
+    extra = [
+        Detector(one, SIZE_PX).dark_map_e_per_s.astype(float) - 100.0 * one.dark_factor
+        for one in (cold, warm)
+    ]
     factor = math.exp(0.3 / 8.617333262e-5 * (1 / 293 - 1 / 263))
     assert extra[0].mean() / extra[1].mean() == pytest.approx(factor, rel=1e-4)  # maps are float32
     assert cold.dark_factor < 0.5 * factor
 
 
 def test_a_columns_dark_current_is_its_own_and_grows_with_the_exposure():
-    settings = DetectorSettings(dark_e_per_s=500.0, fixed_pattern="cmos", column_dark_e_per_s=50.0, temperature_k=300.0)
+    settings = DetectorSettings(
+        dark_e_per_s=500.0, fixed_pattern="cmos", column_dark_e_per_s=50.0, temperature_k=300.0
+    )
     dark = Detector(settings, (2000, 8)).dark_map_e_per_s
     assert (dark == dark[0]).all()
-    assert dark[0].std() == pytest.approx(50.0 * settings.dark_factor, rel=SIGMAS / math.sqrt(2 * 2000))
+    assert dark[0].std() == pytest.approx(
+        50.0 * settings.dark_factor, rel=SIGMAS / math.sqrt(2 * 2000)
+    )
 
 
 def test_read_noise_follows_the_readout_frequency():
@@ -346,16 +422,22 @@ def test_read_noise_follows_the_readout_frequency():
     assert replace(white, readout_hz=1e6).read_noise_now_e == pytest.approx(8.0)
     corner = replace(white, read_noise_corner_hz=1e6)
     # 1/f alone
-    assert replace(corner, readout_hz=1.0).read_noise_now_e == pytest.approx(8.0 / math.sqrt(2), rel=1e-5)
+    assert replace(corner, readout_hz=1.0).read_noise_now_e == pytest.approx(
+        8.0 / math.sqrt(2), rel=1e-5
+    )
     table = DetectorSettings(read_noise_table=((1e4, 2.0), (1e6, 8.0)), readout_hz=1e5)
     assert table.read_noise_now_e == pytest.approx(4.0)
-    image = Detector(replace(table, gain_e_per_dn=0.1, offset_dn=500.0, bits=16), SIZE_PX).expose(flat(0.0), 0.0, generator())
+    image = Detector(replace(table, gain_e_per_dn=0.1, offset_dn=500.0, bits=16), SIZE_PX).expose(
+        flat(0.0), 0.0, generator()
+    )
     assert image.std() * 0.1 == pytest.approx(4.0, rel=SIGMA_ERROR)
 
 
 def test_reset_noise_is_k_t_c():
     # 10 fF at 293 K: sqrt(1.380649e-23 * 293 * 1e-14) C = 6.36e-18 C = 39.7 e-.
-    settings = DetectorSettings(sense_capacitance_ff=10.0, gain_e_per_dn=1.0, offset_dn=500.0, read_noise_e=30.0)
+    settings = DetectorSettings(
+        sense_capacitance_ff=10.0, gain_e_per_dn=1.0, offset_dn=500.0, read_noise_e=30.0
+    )
     assert settings.reset_noise_e == pytest.approx(39.70, abs=0.005)
     image = Detector(settings, SIZE_PX).expose(flat(0.0), 0.0, generator())
     assert image.std() == pytest.approx(math.hypot(39.7, 30.0), rel=SIGMA_ERROR)
@@ -364,7 +446,11 @@ def test_reset_noise_is_k_t_c():
 
 def test_dead_pixels_give_the_offset_and_hot_ones_their_share():
     settings = DetectorSettings(
-        gain_e_per_dn=1.0, bits=16, dead_pixel_fraction=0.02, hot_pixel_fraction=0.05, hot_pixel_e_per_s=5000.0
+        gain_e_per_dn=1.0,
+        bits=16,
+        dead_pixel_fraction=0.02,
+        hot_pixel_fraction=0.05,
+        hot_pixel_e_per_s=5000.0,
     )
     detector = Detector(settings, SIZE_PX)
     image = detector.expose(flat(2000.0), 1.0, generator())
@@ -378,7 +464,12 @@ def test_dead_pixels_give_the_offset_and_hot_ones_their_share():
 
 def test_a_cmos_column_pattern_is_the_same_down_each_column():
     settings = DetectorSettings(
-        gain_e_per_dn=0.1, full_well_e=5000.0, bits=16, offset_dn=2000.0, fixed_pattern="cmos", column_noise_e=20.0
+        gain_e_per_dn=0.1,
+        full_well_e=5000.0,
+        bits=16,
+        offset_dn=2000.0,
+        fixed_pattern="cmos",
+        column_noise_e=20.0,
     )
     image = Detector(settings, (2000, 8)).expose(np.zeros((8, 2000)), 0.0, generator())
     assert (image == image[0]).all()
@@ -397,7 +488,9 @@ def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
     # cos^2 even from 0 to 1: half of the paths are longer than sqrt 2 of the depth. The median's
     # error is
     # 1 / (2 f sqrt n) = 3 %, f = 0.7 the density there.
-    assert np.median(charge_e) == pytest.approx(math.sqrt(2) * RAY_DEPTH_UM * RAY_E_PER_UM, rel=SIGMAS * 0.03)
+    assert np.median(charge_e) == pytest.approx(
+        math.sqrt(2) * RAY_DEPTH_UM * RAY_E_PER_UM, rel=SIGMAS * 0.03
+    )
 
 
 def test_cosmic_rays_reach_the_frame_and_are_off_by_default():
@@ -415,7 +508,9 @@ def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
     # edge.
     inside = false_stars_e(settings, (2000, 2000), 0.5, generator())
     assert inside.sum() == pytest.approx(10 * 2500.0, rel=2 * 6e-7)
-    frame = Detector(replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(flat(0.0), 0.5, generator())
+    frame = Detector(replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(
+        flat(0.0), 0.5, generator()
+    )
     # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-,
     # with 23 e- of noise.
     assert frame.max() > 540 - SIGMAS * 23
@@ -442,7 +537,9 @@ def test_wells_do_not_bloom_by_default():
     image_e = flat(0.0)
     image_e[64, 80] = 1e6
     for blooming in (False, True):
-        image = Detector(DetectorSettings(blooming=blooming), SIZE_PX).expose(image_e, 0.1, generator())
+        image = Detector(DetectorSettings(blooming=blooming), SIZE_PX).expose(
+            image_e, 0.1, generator()
+        )
         assert (image[63, 80] > 0) == blooming
 
 
@@ -460,7 +557,10 @@ def test_wells_do_not_bloom_by_default():
 )
 def test_wrong_electrons_are_refused_in_one_line(image_e, words):
     detector = Detector(DetectorSettings(dead_pixel_fraction=1.0), SIZE_PX)
-    for expose in (lambda: detector.expose(image_e, 0.1, generator()), lambda: detector.expose_noiseless(image_e, 0.1)):
+    for expose in (
+        lambda: detector.expose(image_e, 0.1, generator()),
+        lambda: detector.expose_noiseless(image_e, 0.1),
+    ):
         with pytest.raises(InputError, match=words) as refusal:
             expose()
         assert "\n" not in str(refusal.value)
@@ -474,14 +574,19 @@ def test_wrong_exposures_are_refused(exposure_s):
 
 def test_dark_beyond_what_can_be_drawn_is_refused():
     detector = Detector(DetectorSettings(dark_e_per_s=1e6), SIZE_PX)
-    for expose in (lambda: detector.expose(flat(0.0), 1e7, generator()), lambda: detector.expose_noiseless(flat(0.0), 1e7)):
+    for expose in (
+        lambda: detector.expose(flat(0.0), 1e7, generator()),
+        lambda: detector.expose_noiseless(flat(0.0), 1e7),
+    ):
         with pytest.raises(InputError, match=r"1e\+13 electrons"):
             expose()
 
 
 def test_more_rays_than_a_frame_can_hold_are_refused():
     with pytest.raises(InputError, match="cosmic"):
-        Detector(DetectorSettings(cosmic_rays_per_cm2_s=1e9), SIZE_PX).expose(flat(0.0), 10.0, generator())
+        Detector(DetectorSettings(cosmic_rays_per_cm2_s=1e9), SIZE_PX).expose(
+            flat(0.0), 10.0, generator()
+        )
 
 
 @pytest.mark.parametrize(
@@ -503,8 +608,14 @@ def test_more_rays_than_a_frame_can_hold_are_refused():
         ({"column_dark_e_per_s": 5.0}, 'fixed_pattern = "cmos"'),
         ({"dark_distribution": "gamma", "dsnu_e_per_s": 5.0}, "write dark_e_per_s above 0"),
         ({"fill_factor": 0.0}, "fill_factor"),
-        ({"readout_hz": 1e3, "read_noise_table": ((1e4, 3.0), (1e6, 9.0))}, "within read_noise_table.*10000 to 1e\\+06"),
-        ({"readout_hz": 2e5, "read_noise_table": ((1e6, 3.0), (1e4, 9.0))}, "whose frequencies rise"),
+        (
+            {"readout_hz": 1e3, "read_noise_table": ((1e4, 3.0), (1e6, 9.0))},
+            "within read_noise_table.*10000 to 1e\\+06",
+        ),
+        (
+            {"readout_hz": 2e5, "read_noise_table": ((1e6, 3.0), (1e4, 9.0))},
+            "whose frequencies rise",
+        ),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(wrong, words):

@@ -49,7 +49,10 @@ def poisson_errors(mean_e: float) -> PoissonErrors:
     mean_e = float(np.float32(mean_e))
     reach = 7 * math.sqrt(mean_e) + 12
     count = np.arange(max(0, math.floor(mean_e - reach)), math.ceil(mean_e + reach))
-    low, high = np.full(len(count), -NUMBERS_END, dtype=np.float32), np.full(len(count), NUMBERS_END, dtype=np.float32)
+    low, high = (
+        np.full(len(count), -NUMBERS_END, dtype=np.float32),
+        np.full(len(count), NUMBERS_END, dtype=np.float32),
+    )
     means = np.full(len(count), mean_e, dtype=np.float32)
     for _ in range(40):
         middle = (low + high) / 2
@@ -126,7 +129,9 @@ def test_words_make_two_independent_normal_numbers():
     for number in pair:
         grid = np.linspace(-3, 3, 61)
         # A midpoint rule of 512 radii and 512 angles.
-        assert np.abs(np.searchsorted(np.sort(number), grid) / number.size - ndtr(grid)).max() < 1e-3
+        assert (
+            np.abs(np.searchsorted(np.sort(number), grid) / number.size - ndtr(grid)).max() < 1e-3
+        )
         assert number.mean() == pytest.approx(0.0, abs=1e-6)
         assert number.std() == pytest.approx(1.0, abs=5e-4)
     assert np.mean(pair[0] * pair[1]) == pytest.approx(0.0, abs=1e-6)
@@ -151,7 +156,14 @@ def test_every_word_has_a_number():
 
 
 def test_one_seed_gives_one_frame_on_any_number_of_threads(monkeypatch):
-    settings = DetectorSettings(gain_e_per_dn=1.0, bits=16, offset_dn=100.0, read_noise_e=5.0, dark_e_per_s=30.0, blooming=True)
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0,
+        bits=16,
+        offset_dn=100.0,
+        read_noise_e=5.0,
+        dark_e_per_s=30.0,
+        blooming=True,
+    )
     detector = Detector(settings, (700, 401))
     mean_e = np.random.default_rng(1).uniform(0, 200, (401, 700))
     frames = []
@@ -166,8 +178,14 @@ def test_one_seed_gives_one_frame_on_any_number_of_threads(monkeypatch):
 
 def test_words_repeat_nowhere_in_a_frame():
     seen = []
-    draw_blocks((500, 300), np.random.default_rng(1), lambda part, words: seen.append((part.start, words.copy())))
-    words = np.concatenate([words.reshape(-1, 300) for _, words in sorted(seen, key=lambda item: item[0])])
+    draw_blocks(
+        (500, 300),
+        np.random.default_rng(1),
+        lambda part, words: seen.append((part.start, words.copy())),
+    )
+    words = np.concatenate(
+        [words.reshape(-1, 300) for _, words in sorted(seen, key=lambda item: item[0])]
+    )
     assert words.shape == (500, 300)
     assert len(np.unique(words)) == words.size
 
@@ -182,11 +200,19 @@ def test_a_wrong_pixel_is_refused_from_every_thread(monkeypatch):
 
 def test_noise_version_1_draws_as_numpy_does():
     settings = DetectorSettings(
-        noise_version=1, gain_e_per_dn=2.0, bits=16, offset_dn=100.0, read_noise_e=5.0, dark_e_per_s=30.0, prnu=0.02
+        noise_version=1,
+        gain_e_per_dn=2.0,
+        bits=16,
+        offset_dn=100.0,
+        read_noise_e=5.0,
+        dark_e_per_s=30.0,
+        prnu=0.02,
     )
     detector = Detector(settings, (60, 40))
     rng = np.random.default_rng(2)
-    charge_e = rng.poisson(300.0 * detector.gain_map + detector.dark_map_e_per_s * 2.0).astype(float)
+    charge_e = rng.poisson(300.0 * detector.gain_map + detector.dark_map_e_per_s * 2.0).astype(
+        float
+    )
     charge_e += 5.0 * rng.standard_normal((40, 60), dtype=np.float32)
     frame = detector.expose(np.full((40, 60), 300.0), 2.0, np.random.default_rng(2))
     np.testing.assert_array_equal(frame, np.rint(charge_e / 2.0 + 100.0))

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad, from_rotation_vector, multiply, normalise, to_matrix
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_matrix,
+)
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.tracker.identify import FoundStars, LostInSpace, identify, wahba
@@ -61,7 +67,9 @@ class Sky:
         return near, self.vectors[near]
 
 
-def test_lost_in_space_and_then_by_all_stars_is_the_true_attitude_wherever_the_camera_looks(sky, lost_in_space, rng):
+def test_lost_in_space_and_then_by_all_stars_is_the_true_attitude_wherever_the_camera_looks(
+    sky, lost_in_space, rng
+):
     for q in normalise(rng.normal(size=(25, 4))):
         seen = Sky(sky, q, rng)
         rays = seen.found.rays
@@ -77,7 +85,15 @@ def test_noise_alone_is_no_attitude(sky, lost_in_space, rng):
     rays = normalise(np.stack([x - 511.5, y - 511.5, np.full(30, FOCAL_PX)], axis=1))
     assert lost_in_space.solve(rays[:, :2] / rays[:, 2:], np.ones(30)) is None
     seen = Sky(sky, normalise(rng.normal(size=4)), rng)
-    assert identify(FoundStars(x, y, np.ones(30), rays), normalise(rng.normal(size=4)), seen.near, seen.place) is None
+    assert (
+        identify(
+            FoundStars(x, y, np.ones(30), rays),
+            normalise(rng.normal(size=4)),
+            seen.near,
+            seen.place,
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize("off_px", [0.5, 9.0])
@@ -109,5 +125,7 @@ def test_without_the_extra_it_says_how_to_get_it(sky, monkeypatch):
         return real(name, *arguments)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r"pip install \"hilstar\[solve\]\", or write --solver truth"):
+    with pytest.raises(
+        InputError, match=r"pip install \"hilstar\[solve\]\", or write --solver truth"
+    ):
         LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))

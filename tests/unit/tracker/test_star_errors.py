@@ -9,7 +9,15 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from hilstar.display.balance import Balance, Seen
-from hilstar.display.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.display.phases import (
+    MARGIN_PX,
+    WHITE,
+    fainter,
+    line_places,
+    phase_grid,
+    phase_image,
+    shown_by,
+)
 from hilstar.display.quantise import Panel
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
@@ -35,7 +43,14 @@ def codes(method, mag, seen, sigma_px=SIGMA):
     panel = Panel(srgb_response(8), WHITE)
     return (
         wanted,
-        shown_by(method, 1, panel, wanted.astype(np.float32), fainter(sprites, mag), Balance(GaussianPsf(sigma_px), seen)),
+        shown_by(
+            method,
+            1,
+            panel,
+            wanted.astype(np.float32),
+            fainter(sprites, mag),
+            Balance(GaussianPsf(sigma_px), seen),
+        ),
         tile,
     )
 
@@ -48,8 +63,17 @@ def tiles_of(image, tile):
 
 def along(stars, axis, star_px, seen):
     """What the tracker's pixels about each star collect along an axis of fine samples, (n, ...)."""
-    fine = np.repeat(np.pad(stars, [(0, 0)] + [(FAR_PX, FAR_PX) if k == axis else (0, 0) for k in (1, 2)]), FINE, axis) / FINE
-    fine = np.moveaxis(gaussian_filter1d(fine, seen.blur_px * FINE, axis=axis, truncate=6), axis, -1)
+    fine = (
+        np.repeat(
+            np.pad(stars, [(0, 0)] + [(FAR_PX, FAR_PX) if k == axis else (0, 0) for k in (1, 2)]),
+            FINE,
+            axis,
+        )
+        / FINE
+    )
+    fine = np.moveaxis(
+        gaussian_filter1d(fine, seen.blur_px * FINE, axis=axis, truncate=6), axis, -1
+    )
     sums = np.concatenate([np.zeros((*fine.shape[:-1], 1)), np.cumsum(fine, axis=-1)], axis=-1)
     half = int(np.ceil(6.5 / seen.pixel_px))
     found = []
@@ -57,7 +81,9 @@ def along(stars, axis, star_px, seen):
         phase = (k % COUNT if axis == 2 else k // COUNT) * GOLDEN % 1 - 0.5
         edges = star_px[k] + seen.pixel_px * (np.arange(-half, half + 2) - 0.5 + phase)
         at = (edges + 0.5 + FAR_PX) * FINE
-        found.append(np.diff([np.interp(at, np.arange(sums.shape[-1]), line) for line in sums[k]], axis=-1))
+        found.append(
+            np.diff([np.interp(at, np.arange(sums.shape[-1]), line) for line in sums[k]], axis=-1)
+        )
     return np.moveaxis(np.array(found), -1, axis)
 
 
@@ -85,7 +111,9 @@ def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
     for kind, way in ways.items():
         off_px = seen.pixel_px * np.subtract(way(lit), way(sky))
         assert np.abs(found.off_px[kind] - off_px).max() < SAMPLED_PX, kind
-    plain = np.subtract(outside.moment(tiles_of(shown, tile)), outside.moment(tiles_of(wanted, tile)))
+    plain = np.subtract(
+        outside.moment(tiles_of(shown, tile)), outside.moment(tiles_of(wanted, tile))
+    )
     assert found.off_px["moment"] == pytest.approx(plain, abs=1e-12)
     flux = -2.5 * np.log10(tiles_of(shown, tile).sum((1, 2)) / tiles_of(wanted, tile).sum((1, 2)))
     assert found.flux_mag == pytest.approx(flux, abs=1e-12)

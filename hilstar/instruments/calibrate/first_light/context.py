@@ -20,13 +20,24 @@ from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import make_directory, write_whole
 from hilstar.basics.reading import NOT_JSON, exists, read_bytes
 from hilstar.basics.rotation import to_matrix
-from hilstar.instruments.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
+from hilstar.instruments.calibrate.first_light.image_sources import (
+    ByHand,
+    ImageSource,
+    Pattern,
+    VirtualBench,
+    black,
+)
 from hilstar.instruments.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file, with_key
-from hilstar.server.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
+from hilstar.server.bench.cameras import (
+    before_detector,
+    bench_camera,
+    ideal_monitor,
+    tracker_camera,
+)
 from hilstar.server.bench.config import parse_config
 from hilstar.server.sync import BeatSummary
 from hilstar.tracker.mosaic import software_image
@@ -112,7 +123,8 @@ class StepOutcome:
         if self.verdict != "done" or not at_end:
             return self
         ends = ", ".join(
-            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to {each.high:g})" for each in at_end
+            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to {each.high:g})"
+            for each in at_end
         )
         line = f"{self.line}; but {ends}, so it was not measured and nothing was changed"
         return dataclasses.replace(self, verdict="failed", line=line, changes=(), number=None)
@@ -169,7 +181,9 @@ def read_session(folder: Path) -> SessionFile | None:
     except NOT_JSON as error:
         raise InputError(f"{path}: is no session ({shortened(error)}); {ADVICE}") from error
     if found.kind != KIND:
-        raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
+        raise InputError(
+            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+        )
     return found
 
 
@@ -192,12 +206,16 @@ def with_changes(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
     """
     text = file.text
     for change in changes:
-        text = with_key(text, change.table, change.key, change.after, INSTEAD_OF.get(change.key, ()))
+        text = with_key(
+            text, change.table, change.key, change.after, INSTEAD_OF.get(change.key, ())
+        )
     config = parse_config(file.path, text)
     for change in changes:
         now = getattr(getattr(config, change.table), change.key)
         if (list(now) if isinstance(now, tuple) else now) != change.after:
-            raise InputError(f"{file.path}: {change.key} could not be set; write it under [{change.table}] yourself")
+            raise InputError(
+                f"{file.path}: {change.key} could not be set; write it under [{change.table}] yourself"
+            )
     return BenchFile(file.path, text, config, file.sha256)
 
 
@@ -279,11 +297,16 @@ class StepContext:
 
     def geometry(self) -> BenchGeometry:
         """Monitor and tracker as the bench file has them, with an ideal collimator."""
-        return BenchGeometry(ideal_monitor(self.file.config), tracker_camera(self.file.config.tracker, self.file.folder))
+        return BenchGeometry(
+            ideal_monitor(self.file.config),
+            tracker_camera(self.file.config.tracker, self.file.folder),
+        )
 
     def real_geometry(self) -> BenchGeometry:
         """Monitor and tracker with the measured lens."""
-        return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
+        return BenchGeometry(
+            bench_camera(self.file.config, self.file.folder), self.geometry().tracker
+        )
 
     @property
     def seen_screen(self) -> SeenScreen:
@@ -293,9 +316,13 @@ class StepContext:
         geometry, psf_px = self.geometry(), psf_sigma_of(self.file)
         focal_px = self.known.get(f"orientation.{SEEN_FOCAL}")
         if focal_px is None:
-            return SeenScreen(geometry.monitor, geometry.tracker, is_sure=False, psf_sigma_px=psf_px)
+            return SeenScreen(
+                geometry.monitor, geometry.tracker, is_sure=False, psf_sigma_px=psf_px
+            )
         turn = np.array([float(self.known[f"orientation.{name}"]) for name in SEEN_Q])
-        monitor = dataclasses.replace(geometry.monitor, focal_length_px=float(focal_px), cam_to_image=to_matrix(turn))
+        monitor = dataclasses.replace(
+            geometry.monitor, focal_length_px=float(focal_px), cam_to_image=to_matrix(turn)
+        )
         return SeenScreen(monitor, geometry.tracker, is_sure=True, psf_sigma_px=psf_px)
 
     @property
@@ -314,7 +341,11 @@ class StepContext:
     def change(self, table: str, key: str, after: TomlValue) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file; none where it is so already."""
         before = getattr(getattr(self.file.config, table), key)
-        return () if before == after else (KeyChange(table=table, key=key, before=before, after=after),)
+        return (
+            ()
+            if before == after
+            else (KeyChange(table=table, key=key, before=before, after=after),)
+        )
 
     @property
     def exposure_s(self) -> float:
@@ -328,7 +359,9 @@ class StepContext:
         make_directory(self.folder)
         stem = self.folder / pattern.name
         self.watch(pattern)
-        return self.source.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
+        return self.source.look(
+            self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s
+        )
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
         """Take the tracker's image of a pattern, or by hand the key that says how it looks;
@@ -343,7 +376,11 @@ class StepContext:
     def unlit(self) -> Path | None:
         """The tracker's image with the monitor switched off, None where there is none."""
         name = "unlit_000"
-        return self.kept[name] if name in self.kept else self.source.unlit(make_directory(self.folder) / name)
+        return (
+            self.kept[name]
+            if name in self.kept
+            else self.source.unlit(make_directory(self.folder) / name)
+        )
 
     def dark(self, number: int = 0) -> Path:
         """Take the tracker's image of a black screen, the first or a further one."""
@@ -361,7 +398,9 @@ class StepContext:
         """
         pixels, cold = self.pixels(path), dark < HOT_FILL * self.full_dn
         seen = software_image(pixels, self.file.config.tracker.detector)
-        return DarkSubtracted(path, seen - dark, float(pixels[cold].max(initial=0.0)), float(np.median(dark)))
+        return DarkSubtracted(
+            path, seen - dark, float(pixels[cold].max(initial=0.0)), float(np.median(dark))
+        )
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN, of a mosaic its superpixels."""
@@ -375,7 +414,10 @@ class StepContext:
     def full_dn(self) -> float:
         """The level at which the tracker saturates: its ADC's last code, or its full well, DN."""
         detector = self.file.config.tracker.detector
-        return min(2.0**detector.bits - 1, detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn)
+        return min(
+            2.0**detector.bits - 1,
+            detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn,
+        )
 
     def is_too_bright(self, looked: DarkSubtracted) -> bool:
         """Whether pixels are near the end of the tracker's range."""
@@ -385,5 +427,7 @@ class StepContext:
         """The code of about a quarter of the light. Raises InputError where none is left."""
         lower = int(np.floor(code / LIGHT_STEP ** (1 / 2.2)))
         if lower < 1:
-            raise InputError("the tracker is saturated by the darkest code; expose shorter, and write [tracker] exposure_s so")
+            raise InputError(
+                "the tracker is saturated by the darkest code; expose shorter, and write [tracker] exposure_s so"
+            )
         return lower

@@ -19,7 +19,12 @@ from scipy.special import ndtr
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import chart
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.effective_psf import Found, dots_of_image, draw_effective, fit_effective
+from hilstar.instruments.calibrate.effective_psf import (
+    Found,
+    dots_of_image,
+    draw_effective,
+    fit_effective,
+)
 from hilstar.instruments.calibrate.first_light.context import (
     DarkSubtracted,
     Figure,
@@ -30,7 +35,14 @@ from hilstar.instruments.calibrate.first_light.context import (
     Verdict,
 )
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern
-from hilstar.instruments.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, dot_image, lit_for, plan_seen_dots
+from hilstar.instruments.calibrate.geometric.dots import (
+    DOT_PX,
+    DotPlan,
+    SeenScreen,
+    dot_image,
+    lit_for,
+    plan_seen_dots,
+)
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.tracker.settings import DetectorSettings
 
@@ -121,22 +133,32 @@ class _Fitted(NamedTuple):
     has_settled: bool
 
 
-def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, noise: DotNoise | None = None) -> Sharpness:
+def sharpness(
+    image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, noise: DotNoise | None = None
+) -> Sharpness:
     """Measure the sharpness of dots in an image (h, w) above its dark frame.
 
     A dot is a square of about `dot_side_px` tracker px, turned by `turn_deg` in the image. Raises
     InputError where too few dots are there, or none stands alone.
     """
     background = noisiest_background(image)
-    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+    settings = CentroidSettings(
+        threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5
+    )
     found = find_stars(image, settings, background)
     if len(found) < MIN_DOTS:
-        raise InputError(f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look at the focus")
+        raise InputError(
+            f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look at the focus"
+        )
     turn = math.radians(turn_deg)
     half_side = dot_side_px / 2 * (abs(math.cos(turn)) + abs(math.sin(turn)))
     # The wings of a first look at the dots: the blob's pixels are those above the threshold.
     blob_px = math.sqrt(float(np.median(found.pixels)) / math.pi)
-    half = int(np.clip(math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX))
+    half = int(
+        np.clip(
+            math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX
+        )
+    )
     # Where dots stand closer together, smaller squares hold less of the wings and the fit's error
     # says so.
     smallest = math.ceil(half_side + MIN_WINGS_PX)
@@ -185,7 +207,10 @@ def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, 
     whole = (column >= half) & (column < width - half) & (row >= half) & (row < height - half)
     kept = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
     steps = np.arange(-half, half + 1)
-    values = image[(row[kept, None] + steps)[:, :, None], (column[kept, None] + steps)[:, None, :]] - level
+    values = (
+        image[(row[kept, None] + steps)[:, :, None], (column[kept, None] + steps)[:, None, :]]
+        - level
+    )
     return _Dots(np.asarray(values, dtype=np.float64), x_px[kept], y_px[kept], half)
 
 
@@ -222,9 +247,13 @@ def _first_places(dots: _Dots) -> FloatArray:
 def _amplitudes(own: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Light and background (n, 1, 1) of dots with a model (n, k, k), by least squares."""
     flat = own - own.mean(axis=(1, 2), keepdims=True)
-    flux = (flat * values).sum(axis=(1, 2), keepdims=True) / np.maximum((flat**2).sum(axis=(1, 2), keepdims=True), 1e-300)
+    flux = (flat * values).sum(axis=(1, 2), keepdims=True) / np.maximum(
+        (flat**2).sum(axis=(1, 2), keepdims=True), 1e-300
+    )
     flux = np.maximum(flux, FLUX_FLOOR)
-    return flux, values.mean(axis=(1, 2), keepdims=True) - flux * own.mean(axis=(1, 2), keepdims=True)
+    return flux, values.mean(axis=(1, 2), keepdims=True) - flux * own.mean(
+        axis=(1, 2), keepdims=True
+    )
 
 
 def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, ...]:
@@ -247,7 +276,9 @@ def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, .
     )
 
 
-def _along(shape: _Shape, place: FloatArray, points: FloatArray, half: int) -> tuple[FloatArray, ...]:
+def _along(
+    shape: _Shape, place: FloatArray, points: FloatArray, half: int
+) -> tuple[FloatArray, ...]:
     """Along one axis, of each point's light in each pixel (n, p, k): the share, and its
     derivatives as in `_slopes`.
     """
@@ -264,10 +295,14 @@ def _along(shape: _Shape, place: FloatArray, points: FloatArray, half: int) -> t
 def _weights(own: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise) -> FloatArray:
     """One over the sigma of each pixel (n, k, k), by the model's light."""
     light = np.maximum(flux * own, 0.0)
-    return np.asarray(1 / np.sqrt(noise_dn**2 + light / noise.gain_e_per_dn + (noise.prnu * light) ** 2))
+    return np.asarray(
+        1 / np.sqrt(noise_dn**2 + light / noise.gain_e_per_dn + (noise.prnu * light) ** 2)
+    )
 
 
-def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise) -> _Fitted:
+def _fitted(
+    dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise
+) -> _Fitted:
     """The shape common to all dots and their places, fitted to their pixels.
 
     Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from
@@ -280,12 +315,17 @@ def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: 
         flux, level = _amplitudes(own, dots.values)
         weight = _weights(own, flux, noise_dn, noise)
         off = (dots.values - flux * own - level) * weight
-        columns = np.stack([own, np.ones_like(own), *(flux * each for each in slopes)], axis=1) * weight[:, None]
+        columns = (
+            np.stack([own, np.ones_like(own), *(flux * each for each in slopes)], axis=1)
+            * weight[:, None]
+        )
         columns = columns.reshape(len(own), 6, -1)
         right = columns @ off.reshape(len(own), -1, 1)
         normal = columns @ columns.transpose(0, 2, 1)
         normal += 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(6)
-        by_own = np.linalg.solve(normal[:, :4, :4], np.concatenate([normal[:, :4, 4:], right[:, :4]], axis=2))
+        by_own = np.linalg.solve(
+            normal[:, :4, :4], np.concatenate([normal[:, :4, 4:], right[:, :4]], axis=2)
+        )
         common = (normal[:, 4:, 4:] - normal[:, 4:, :4] @ by_own[:, :, :2]).sum(axis=0)
         aim = (right[:, 4:] - normal[:, 4:, :4] @ by_own[:, :, 2:]).sum(axis=0)[:, 0]
         chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(own), 1), 1.0)
@@ -299,7 +339,9 @@ def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: 
         sigma_px = float(np.clip(grown, *SIGMAS_PX))
         moved = by_own[:, 2:4, 2] - by_own[:, 2:4, :2] @ step
         places = places + np.clip(moved, -0.5, 0.5)
-        settled = bool(abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED)
+        settled = bool(
+            abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED
+        )
         side = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
         turn = math.atan2(*(shape.points[-1] - shape.points[0])[::-1]) - math.pi / 4
         shape = _Shape(_points(sigma_px, side, turn), sigma_px, side)
@@ -322,10 +364,15 @@ def _each_sigma(
     flux, level = _amplitudes(own, dots.values)
     weight = _weights(own, flux, noise_dn, noise)
     off = ((dots.values - flux * own - level) * weight).reshape(len(own), -1, 1)
-    columns = np.stack([own, np.ones_like(own), flux * by_x, flux * by_y, flux * by_sigma], axis=1) * weight[:, None]
+    columns = (
+        np.stack([own, np.ones_like(own), flux * by_x, flux * by_y, flux * by_sigma], axis=1)
+        * weight[:, None]
+    )
     columns = columns.reshape(len(own), 5, -1)
     normal = columns @ columns.transpose(0, 2, 1)
-    steps = np.linalg.solve(normal + 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(5), columns @ off)[:, 4, 0]
+    steps = np.linalg.solve(
+        normal + 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(5), columns @ off
+    )[:, 4, 0]
     each = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
     far = np.abs(each - np.median(each))
     return each, far <= WILD_SIGMAS * 1.4826 * max(float(np.median(far)), 1e-3 * shape.sigma_px)
@@ -362,7 +409,9 @@ def focus(context: StepContext) -> StepOutcome:
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
     sigma, error = found.psf_sigma_px, found.psf_sigma_error_px
     picture = context.session / "focus.svg"
-    finding = f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), the bench file has {wanted:.4g}"
+    finding = (
+        f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), the bench file has {wanted:.4g}"
+    )
     with chart(picture, finding, height_inch=6.0) as (axes,):
         dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
         axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
@@ -408,7 +457,9 @@ def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
     alone is known.
     """
     try:
-        return fit_effective(dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING)
+        return fit_effective(
+            dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING
+        )
     except InputError:
         return None
 
@@ -426,10 +477,14 @@ def sharp_dots(context: StepContext) -> SharpDots:
         if looked.raw_peak < DOT_FILL * context.full_dn:
             break
         code = context.darker(code)
-    return SharpDots(code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked)
+    return SharpDots(
+        code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked
+    )
 
 
-def seen_sharpness(image: FloatArray, seen: SeenScreen, detector: DetectorSettings, images: int = 1) -> Sharpness:
+def seen_sharpness(
+    image: FloatArray, seen: SeenScreen, detector: DetectorSettings, images: int = 1
+) -> Sharpness:
     """Measure the sharpness of dots of DOT_PX in the mean (h, w) of some images, above their dark
     frame.
 

@@ -37,7 +37,14 @@ from hilstar.instruments.calibrate.geometric.calibration import (
     rough_geometry,
     write_calibrated,
 )
-from hilstar.instruments.calibrate.geometric.dots import DotPlan, dot_image, joined, lit_for, plan_seen_dots, write_plan
+from hilstar.instruments.calibrate.geometric.dots import (
+    DotPlan,
+    dot_image,
+    joined,
+    lit_for,
+    plan_seen_dots,
+    write_plan,
+)
 from hilstar.instruments.calibrate.geometric.fit import FIELD_DEGREES
 from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images
 from hilstar.instruments.simulate.optics import BenchGeometry
@@ -76,15 +83,24 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     """
     monitor, tracker = geometry.monitor, geometry.tracker
     ratio = monitor.focal_length_px / tracker.focal_length_px
-    reach = FIGURE_REACH * min(*monitor.resolution_px, *(ratio * size for size in tracker.resolution_px))
+    reach = FIGURE_REACH * min(
+        *monitor.resolution_px, *(ratio * size for size in tracker.resolution_px)
+    )
     side = max(3, math.ceil(SQUARE_TRACKER_PX * ratio))
     if reach < SQUARES[0] * side:
-        raise InputError("the tracker sees too little of the monitor for a figure; look at the focal lengths and pixel pitches")
-    (middle_x,), (middle_y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in tracker.resolution_px))
+        raise InputError(
+            "the tracker sees too little of the monitor for a figure; look at the focal lengths and pixel pitches"
+        )
+    (middle_x,), (middle_y,) = geometry.to_monitor(
+        *(np.array([(size - 1) / 2]) for size in tracker.resolution_px)
+    )
     width, height = monitor.resolution_px
     if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
         middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
-    x_px, y_px = middle_x + reach * np.array([-1.0, 1.0, -1.0]), middle_y + reach * np.array([-1.0, -1.0, 1.0])
+    x_px, y_px = (
+        middle_x + reach * np.array([-1.0, 1.0, -1.0]),
+        middle_y + reach * np.array([-1.0, -1.0, 1.0]),
+    )
     return OrientationFigure(x_px, y_px, side, reach)
 
 
@@ -110,9 +126,16 @@ WAYS = {
     (0, 1, 1, 0): "with columns and rows swapped",
     (0, -1, -1, 0): "with columns and rows swapped, and turned by 180 degrees",
 }
-CORNERS = {(-1, -1): "top left", (1, -1): "top right", (-1, 1): "bottom left", (1, 1): "bottom right"}
+CORNERS = {
+    (-1, -1): "top left",
+    (1, -1): "top right",
+    (-1, 1): "bottom left",
+    (1, 1): "bottom right",
+}
 SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0, -1): "above it"}
-NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
+NOT_SEEN = (
+    "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +181,9 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     largest = np.argsort(-found.pixels, kind="stable")[:MAX_SPOTS]
     # By light, for a wide PSF makes spots of nearly one size of squares of three.
     radius_px = math.ceil(WINDOW_SIDES * math.sqrt(found.pixels.max()))
-    values, dx, dy = squares(image, background.level, found.x_px[largest], found.y_px[largest], radius_px)
+    values, dx, dy = squares(
+        image, background.level, found.x_px[largest], found.y_px[largest], radius_px
+    )
     light = values.sum(axis=(1, 2))
     brightest = np.argsort(-light, kind="stable")[: len(SQUARES)]
     step = light[brightest[:-1]] / np.maximum(light[brightest[1:]], 1e-9)
@@ -186,7 +211,9 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     seen = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
     scale = float(np.sqrt(abs(np.linalg.det(seen))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
-        raise InputError(f"the figure is {scale:.2f} times as large as the bench file says; look at focal lengths and pitches")
+        raise InputError(
+            f"the figure is {scale:.2f} times as large as the bench file says; look at focal lengths and pitches"
+        )
     ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
     way = max(ways, key=lambda each: float((ways[each] * seen).sum()))
     left = np.linalg.inv(ways[way]) @ seen / scale
@@ -238,7 +265,9 @@ class ScreenMounting:
     def matrix(self) -> FloatArray:
         """The matrix (2, 2) from the image's axes to the screen's, x right and y down."""
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
-        return np.asarray(np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn)
+        return np.asarray(
+            np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn
+        )
 
 
 def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
@@ -247,9 +276,19 @@ def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> Scree
     """
     wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
     flips = (False, True)
-    all_ways = [ScreenMounting(x, y, turn) for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))]
+    all_ways = [
+        ScreenMounting(x, y, turn)
+        for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))
+    ]
     right = [each for each in all_ways if np.allclose(each.matrix, wanted)]
-    return min(right, key=lambda each: (sum(map(ne, astuple(each), astuple(mounting))), each.flip_y, each.rotate_deg))
+    return min(
+        right,
+        key=lambda each: (
+            sum(map(ne, astuple(each), astuple(mounting))),
+            each.flip_y,
+            each.rotate_deg,
+        ),
+    )
 
 
 FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
@@ -266,15 +305,25 @@ def orientation(context: StepContext) -> StepOutcome:
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
     keys = ("flip_x", "flip_y", "rotate_deg")
-    changes = tuple(change for key in keys for change in context.change("monitor", key, getattr(after, key)))
+    changes = tuple(
+        change for key in keys for change in context.change("monitor", key, getattr(after, key))
+    )
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
-        changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)
+        changes += (
+            KeyChange(
+                table="monitor", key="resolution_px", before=[width, height], after=[height, width]
+            ),
+        )
     if changes:
-        now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
+        now, measured = _way(
+            replace(context, file=with_changes(context.file, changes)), "figure_001"
+        )
         # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit
         # takes either.
-        if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (now != UPRIGHT and not _is_oblique(measured)):
+        if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (
+            now != UPRIGHT and not _is_oblique(measured)
+        ):
             made = "; ".join(change.line for change in changes)
             raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
     way = f"first {WAYS[first]}, now upright" if changes else "upright"
@@ -284,9 +333,19 @@ def orientation(context: StepContext) -> StepOutcome:
     found, looked = measured
     turn_deg = found.whole_turn_deg
     picture = context.session / "orientation.svg"
-    draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
-    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": turn_deg, "turn_error_deg": found.turn_error_deg}
-    figures |= {SEEN_FOCAL: found.focal_length_px, **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True))}
+    draw_spots(
+        picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}"
+    )
+    figures = {
+        "seen": WAYS[first],
+        "scale": found.scale,
+        "turn_deg": turn_deg,
+        "turn_error_deg": found.turn_error_deg,
+    }
+    figures |= {
+        SEEN_FOCAL: found.focal_length_px,
+        **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True)),
+    }
     line = f"{way}, {found.scale:.4f} of the expected size, turned by {turn_deg:+.2f} deg"
     number = StepNumber(turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
     return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
@@ -296,7 +355,9 @@ def _is_oblique(measured: tuple[SeenFigure, DarkSubtracted] | None) -> bool:
     return measured is not None and abs(measured[0].turn_deg) > OBLIQUE_DEG
 
 
-def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
+def _way(
+    context: StepContext, name: str
+) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
     """The figure's orientation, and its measurement; None where a person pressed a key instead."""
     geometry = context.geometry()
     figure, keys = figure_for(geometry), keys_of_ways()
@@ -322,11 +383,15 @@ def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tu
 SQUARE_NAMES = ("corner", "right", "below")
 
 
-def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str) -> None:
+def draw_spots(
+    path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str
+) -> None:
     """Draw an image of the tracker (h, w) with a ring about each spot found."""
     with chart(path, finding, height_inch=6.4) as (axes,):
         low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
-        axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
+        axes.imshow(
+            np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0))
+        )
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
         # readable over stars and on black
         plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}
@@ -334,7 +399,14 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
             side = "right" if x > image.shape[1] / 2 else "left"
             away = -14 if side == "right" else 14
             axes.annotate(
-                name, (x, y), (away, 16), textcoords="offset points", ha=side, color=DARK[ORANGE], size=TEXT_PT + 1, bbox=plate
+                name,
+                (x, y),
+                (away, 16),
+                textcoords="offset points",
+                ha=side,
+                color=DARK[ORANGE],
+                size=TEXT_PT + 1,
+                bbox=plate,
             )
         axes.grid(visible=False)
         axes.set(xlabel="tracker x [px]", ylabel="tracker y [px]")
@@ -371,7 +443,11 @@ def geometry(context: StepContext) -> StepOutcome:
         "dots_planned": len(found.plan),
         "centroids_lost": int(found.lost),
         "centroids_false": int(found.false),
-        **{name: each.value for name, each in parameters_of(found).items() if "rotation" not in name},
+        **{
+            name: each.value
+            for name, each in parameters_of(found).items()
+            if "rotation" not in name
+        },
         "notes": "; ".join(notes_for_a_person(found)) or "none",
     }
     line = (
@@ -380,17 +456,28 @@ def geometry(context: StepContext) -> StepOutcome:
     )
     files = (output, picture, context.folder / "plan.csv", dark, *paths)
     rms, points = chosen.rms_arcsec, len(found.data)
-    number = StepNumber(rms, rms / math.sqrt(4 * points), "arcsec", "rms distance of held-out dots from where the fit has them")
+    number = StepNumber(
+        rms,
+        rms / math.sqrt(4 * points),
+        "arcsec",
+        "rms distance of held-out dots from where the fit has them",
+    )
     changes = context.names("collimator", "geometry", output)
     return StepOutcome("done", line, figures, files, (picture,), changes, number, _ends_of(found))
 
 
-def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark: Path) -> tuple[list[Path], Observed]:
+def _frames_of(
+    context: StepContext, plan: DotPlan, first: int, code: int, dark: Path
+) -> tuple[list[Path], Observed]:
     """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises
     InputError.
     """
     paths = [
-        context.take(Pattern(f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)))
+        context.take(
+            Pattern(
+                f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)
+            )
+        )
         for frame in range(plan.frames)
     ]
     size_px = context.file.config.tracker.resolution_px
@@ -407,5 +494,12 @@ def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
         for name in ("tilt_x_deg", "tilt_y_deg")
     ]
     if found.chosen.rms_arcsec > FAR * found.held_out_noise_arcsec:
-        tilts.append(FittedFigure("the degree of the lens's field", found.chosen.field_degree, -1.0, max(FIELD_DEGREES)))
+        tilts.append(
+            FittedFigure(
+                "the degree of the lens's field",
+                found.chosen.field_degree,
+                -1.0,
+                max(FIELD_DEGREES),
+            )
+        )
     return tuple(tilts)

@@ -36,7 +36,12 @@ from hilstar.display.render.presenter import Presenter, level_texture, window_co
 from hilstar.display.window.this_monitor import identity_here
 from hilstar.instruments.calibrate.geometric.observed import read_image
 from hilstar.instruments.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
-from hilstar.instruments.simulate.optics import BenchGeometry, DisplayColours, TwinOptics, seen_primaries
+from hilstar.instruments.simulate.optics import (
+    BenchGeometry,
+    DisplayColours,
+    TwinOptics,
+    seen_primaries,
+)
 from hilstar.instruments.simulate.simulator import TrackerBackground
 from hilstar.optics.frame_motion import Orientation
 from hilstar.server.bench.bench_file import BenchFile
@@ -165,7 +170,9 @@ def complete_images(folder: Path) -> dict[str, Path]:
     """The images in a directory by name without ending, except the newest, which may be
     incomplete.
     """
-    found = [path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE]
+    found = [
+        path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE
+    ]
     found.sort(key=lambda path: path.stat().st_mtime_ns)
     return {path.stem: path for path in found[:-1]}
 
@@ -200,7 +207,9 @@ class SerialDiode:
                 return listening[0].done
 
             monitor = replace(file.config.monitor, photodiode=KIND)
-            shown = display.blink(dataclasses.replace(file, config=replace(file.config, monitor=monitor)), begin)
+            shown = display.blink(
+                dataclasses.replace(file, config=replace(file.config, monitor=monitor)), begin
+            )
             return DiodeRecording(shown, listening[0].result())
 
 
@@ -223,7 +232,9 @@ def _go_on(window: "Window", stopped: bool) -> None:
         raise Stopped("stopped at the display; run the same command again to go on")
 
 
-def _presenter(file: BenchFile, window: "Window", codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
+def _presenter(
+    file: BenchFile, window: "Window", codes: CodeImage
+) -> tuple[Presenter, Callable[[], None]]:
     """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its
     texture.
     """
@@ -231,9 +242,17 @@ def _presenter(file: BenchFile, window: "Window", codes: CodeImage) -> tuple[Pre
     if codes.ndim == 3:
         packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
         colours, levels = np.unique(packed, return_inverse=True)
-        triples = np.stack([colours >> 32, colours >> 16 & 0xFFFF, colours & 0xFFFF], axis=1).astype(np.uint16)
+        triples = np.stack(
+            [colours >> 32, colours >> 16 & 0xFFFF, colours & 0xFFFF], axis=1
+        ).astype(np.uint16)
         codes = levels.reshape(codes.shape[:2]).astype(np.uint16)
-    view = ScreenView(monitor.resolution_px, window.size_px, monitor.bits, orientation_of(monitor), triples=triples)
+    view = ScreenView(
+        monitor.resolution_px,
+        window.size_px,
+        monitor.bits,
+        orientation_of(monitor),
+        triples=triples,
+    )
     texture = level_texture(window_context(), codes)
     return Presenter(texture, view), texture.release
 
@@ -262,10 +281,16 @@ class PatternDisplay(Closing):
                 self.forced += screen.forced
                 return timing
         except MachineError as error:
-            raise MachineError(f"{str(error).removesuffix('; or add --force')}; {SHOW_YOURSELF}") from error
+            raise MachineError(
+                f"{str(error).removesuffix('; or add --force')}; {SHOW_YOURSELF}"
+            ) from error
 
     def show_until(
-        self, file: BenchFile, pattern: Pattern, done: Callable[[], bool], on_key: Callable[[str], object] = lambda key: None
+        self,
+        file: BenchFile,
+        pattern: Pattern,
+        done: Callable[[], bool],
+        on_key: Callable[[str], object] = lambda key: None,
     ) -> None:
         """Show a pattern until `done()`, first called when the panel has settled; `on_key` gets the
         keys pressed.
@@ -388,13 +413,19 @@ class GrabCommand(_ShownHere):
     without {output}.
     """
 
-    def __init__(self, command: str, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
+    def __init__(
+        self, command: str, dark: Path | None = None, diode: SerialDiode | None = None
+    ) -> None:
         try:
             self._words = shlex.split(command)
         except ValueError as error:
-            raise InputError(f"--grab {command}: {error}; write it as on a command line, quotes in pairs") from error
+            raise InputError(
+                f"--grab {command}: {error}; write it as on a command line, quotes in pairs"
+            ) from error
         if not any("{output}" in word for word in self._words):
-            raise InputError(f"--grab {command}: has no {{output}}; write where your command takes the file's name")
+            raise InputError(
+                f"--grab {command}: has no {{output}}; write where your command takes the file's name"
+            )
         self._shows = any("{pattern}" in word for word in self._words)
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
         self.identity = f"grab: {command}"
@@ -407,12 +438,18 @@ class GrabCommand(_ShownHere):
         output = stem.with_name(stem.name + ".png")
         shown = stem.parent / PATTERN_FILE
         words = self._words
-        for name, value in (("output", str(output)), ("pattern", str(shown)), ("exposure_s", f"{exposure_s:.9g}")):
+        for name, value in (
+            ("output", str(output)),
+            ("pattern", str(shown)),
+            ("exposure_s", f"{exposure_s:.9g}"),
+        ):
             words = [word.replace(f"{{{name}}}", value) for word in words]
         # an interrupted attempt may have left one, and a command that writes nothing must fail
         output.unlink(missing_ok=True)
         if self._shows and pattern.later:
-            raise InputError("a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here")
+            raise InputError(
+                "a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here"
+            )
         if self._shows:
             monitor = file.config.monitor
             write_codes_png(shown, on_screen(pattern.codes, orientation_of(monitor)), monitor.bits)
@@ -432,7 +469,9 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
             try:
                 started.append(ended.enter_context(Child(words, keeps_stdout=False)))
             except OSError as error:
-                raise NoImage(f"--grab: {words[0]} cannot be run ({error.strerror}); write a command that can") from error
+                raise NoImage(
+                    f"--grab: {words[0]} cannot be run ({error.strerror}); write a command that can"
+                ) from error
         return started[0].poll() is not None or time.monotonic() > end_s
 
     with ExitStack() as ended:
@@ -440,15 +479,21 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
         child, code = started[0], started[0].poll()
     command = shortened(shlex.join(words))
     if child.too_much:
-        raise NoImage(f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less")
+        raise NoImage(
+            f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less"
+        )
     if code is None:
-        raise NoImage(f"--grab: {command} took over {GRAB_TIMEOUT_S:.0f} s; run it by hand to see why")
+        raise NoImage(
+            f"--grab: {command} took over {GRAB_TIMEOUT_S:.0f} s; run it by hand to see why"
+        )
     if code:
         lines = child.err.strip().splitlines()
         why = f": {shortened(lines[-1])}" if lines else ""
         raise NoImage(f"--grab: {command} ended with code {code}{why}")
     if not output.is_file() or not output.stat().st_size:
-        raise NoImage(f"--grab: {command} wrote no image; it has to write {{output}}, as PNG or FITS")
+        raise NoImage(
+            f"--grab: {command} wrote no image; it has to write {{output}}, as PNG or FITS"
+        )
 
 
 def _wait(done: Callable[[], bool]) -> None:
@@ -468,12 +513,22 @@ class ByHand(_ShownHere):
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Wait for a complete image of the pattern."""
-        exposed = "" if exposure_s == file.config.tracker.exposure_s else f", exposed for {exposure_s:.4g} s,"
-        asked = f"now save the tracker's image{exposed} as {stem}.png (or .fits); q on the display ends"
-        self._display.show_until(file, pattern, _once_asked(asked, lambda: _saved(stem) is not None))
+        exposed = (
+            ""
+            if exposure_s == file.config.tracker.exposure_s
+            else f", exposed for {exposure_s:.4g} s,"
+        )
+        asked = (
+            f"now save the tracker's image{exposed} as {stem}.png (or .fits); q on the display ends"
+        )
+        self._display.show_until(
+            file, pattern, _once_asked(asked, lambda: _saved(stem) is not None)
+        )
         return _saved(stem) or stem
 
-    def look_or_key(self, file: BenchFile, pattern: Pattern, stem: Path, keys: Mapping[str, str]) -> Path | str:
+    def look_or_key(
+        self, file: BenchFile, pattern: Pattern, stem: Path, keys: Mapping[str, str]
+    ) -> Path | str:
         """The image of the pattern, or the key that says how it looks; `keys` has their
         meanings.
         """
@@ -542,8 +597,12 @@ class VirtualBench(ImageSource):
         self._glow_e_per_s: FloatArray = self._mosaic.grey(self._optics.glow_e_per_s(self._panel))
         background = TrackerBackground(config, truth.folder, self.geometry.tracker, refuse=False)
         self._sky_e_per_s: FloatArray = background.steady_e / tracker.exposure_s
-        uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
-        self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
+        uniformity = (
+            1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
+        )
+        self._white_e_per_s: FloatArray = (
+            np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
+        )
         self._units: dict[bytes, FloatArray] = {}
         self._last: tuple[bytes, FloatArray] | None = None
         self._newest: tuple[Path, CodeImage] | None = None
@@ -554,17 +613,26 @@ class VirtualBench(ImageSource):
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The tracker's image of a pattern: a PNG of 16 bits."""
         mine, its = orientation_of(file.config.monitor), orientation_of(self.truth.config.monitor)
-        frames = [np.ascontiguousarray(off_screen(on_screen(codes, mine), its)) for codes in pattern.frames]
+        frames = [
+            np.ascontiguousarray(off_screen(on_screen(codes, mine), its))
+            for codes in pattern.frames
+        ]
         shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
-        image = self._image_e_per_s([frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)])
-        half_ns = round(NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2)
+        image = self._image_e_per_s(
+            [frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)]
+        )
+        half_ns = round(
+            NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2
+        )
         light = (image + self._glow_e_per_s) * self._warmth((self._on_for_ns + half_ns) / NS_PER_S)
         self._on_for_ns += 2 * half_ns
         return self._exposed(light, exposure_s, stem)
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image of a monitor that is switched off."""
-        return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
+        return self._exposed(
+            np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem
+        )
 
     def _warmth(self, on_for_s: float) -> float:
         """Light relative to that of a warm monitor, by the truth's [certify.virtual]; the first
@@ -586,11 +654,15 @@ class VirtualBench(ImageSource):
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """A simulated photodiode: the true panel's delay and scan-out, with a little jitter."""
-        return virtual_diode(file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode"))))
+        return virtual_diode(
+            file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode")))
+        )
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         mean_e = (light_e_per_s + self._sky_e_per_s) * exposure_s
-        rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
+        rng = np.random.default_rng(
+            (self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode()))
+        )
         pixels = self._detector.expose(mean_e, exposure_s, rng)
         image, path = png_of(pixels), stem.with_name(stem.name + ".png")
         written(path, lambda file: file.write(image))
@@ -655,7 +727,12 @@ class VirtualBench(ImageSource):
     def _primaries(self) -> FloatArray:
         if self._panel.primaries:
             white = self._panel.flux_at_white_e_per_s
-            return np.array([one.response.light * (one.flux_at_white_e_per_s / white) for one in self._panel.primaries])
+            return np.array(
+                [
+                    one.response.light * (one.flux_at_white_e_per_s / white)
+                    for one in self._panel.primaries
+                ]
+            )
         monitor = self.truth.config.monitor
         return primary_lights(calibration_source(monitor, self.truth.folder), monitor.bits)
 
@@ -664,18 +741,26 @@ class VirtualBench(ImageSource):
         self._optics.close()
 
 
-def virtual_diode(file: BenchFile, truth: BenchFile, seconds: float, rng: np.random.Generator) -> DiodeRecording:
+def virtual_diode(
+    file: BenchFile, truth: BenchFile, seconds: float, rng: np.random.Generator
+) -> DiodeRecording:
     """Edges of a true panel's delay and scan-out, with the jitter of swaps and of the truth's
     `[certify.virtual]`.
     """
     frames = int(seconds * file.config.monitor.refresh_hz)
     period_ns = NS_PER_S / file.config.monitor.refresh_hz
-    swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
+    swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(
+        np.int64
+    )
     shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
     monitor = replace(truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
     delay_ms = monitor.panel_delay_ms + swap_to_square_ms(monitor)
-    late_ms = delay_ms + rng.normal(0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns))
-    return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ms * NS_PER_MS).astype(np.int64), shown.level))
+    late_ms = delay_ms + rng.normal(
+        0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns)
+    )
+    return DiodeRecording(
+        shown, Edges(shown.host_ns + np.rint(late_ms * NS_PER_MS).astype(np.int64), shown.level)
+    )
 
 
 def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
@@ -684,10 +769,18 @@ def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
     screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]
     if screens[0] != screens[1]:
         sizes = "{} x {} px and the bench file's is {} x {}".format(*screens[1], *screens[0])
-        raise InputError(f"{truth.path}: [monitor] resolution_px: its screen is {sizes}; write the same screen")
+        raise InputError(
+            f"{truth.path}: [monitor] resolution_px: its screen is {sizes}; write the same screen"
+        )
     if mine.monitor.bits != its.monitor.bits:
-        raise InputError(f"{truth.path}: [monitor] bits = {its.monitor.bits} and the bench file says {mine.monitor.bits}")
+        raise InputError(
+            f"{truth.path}: [monitor] bits = {its.monitor.bits} and the bench file says {mine.monitor.bits}"
+        )
     if mine.tracker.resolution_px != its.tracker.resolution_px:
-        raise InputError(f"{truth.path}: [tracker] resolution_px is not the bench file's; write the same tracker")
+        raise InputError(
+            f"{truth.path}: [tracker] resolution_px is not the bench file's; write the same tracker"
+        )
     if its.render.bit_stealing:
-        raise InputError(f"{truth.path}: [render] bit_stealing is for the bench that shows; leave it out of the truth")
+        raise InputError(
+            f"{truth.path}: [render] bit_stealing is for the bench that shows; leave it out of the truth"
+        )

@@ -9,7 +9,15 @@ from pathlib import Path
 from hilstar.basics.charts import capital
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import Markup, banner_of, escaped, measured, page_of, picture_of, table_of
+from hilstar.basics.html_pages import (
+    Markup,
+    banner_of,
+    escaped,
+    measured,
+    page_of,
+    picture_of,
+    table_of,
+)
 from hilstar.basics.reading import MAX_TOML_BYTES, read_bytes, read_text
 from hilstar.instruments.calibrate.first_light.context import SessionFile, StepRecord
 from hilstar.instruments.calibrate.first_light.session import STEPS, SessionStep
@@ -34,7 +42,11 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
         _banner(session.steps),
         *(banner_of("bad", "Forced", each) for each in session.forced),
         f'<nav class="steps">{"".join(_link(record) for record in session.steps)}</nav>',
-        *(_card(folder, step, records[step.name], session) for step in STEPS if step.name in records),
+        *(
+            _card(folder, step, records[step.name], session)
+            for step in STEPS
+            if step.name in records
+        ),
         '<section class="card"><header><h2>The bench file</h2></header><div class="words">',
         f"<p>{escaped(beats)}</p>" if beats else "",
         f"<pre>{escaped(difference or 'nothing was changed')}</pre></div>",
@@ -51,7 +63,11 @@ def _banner(records: list[StepRecord]) -> str:
     passed = f"{len(by['done'])} of {len(records)} steps passed"
     missed = f"; not measured: {', '.join(by['skipped'])}" if by["skipped"] else ""
     if by["failed"]:
-        return banner_of("bad", f"Not ready: {', '.join(by['failed'])} failed", f"{passed}{missed}. Each card says what to do.")
+        return banner_of(
+            "bad",
+            f"Not ready: {', '.join(by['failed'])} failed",
+            f"{passed}{missed}. Each card says what to do.",
+        )
     if missed or len(records) < len(STEPS):
         return banner_of("warn", "What was measured is in order", f"{passed}{missed}.")
     return banner_of("ok", "The bench is ready", f"All {len(records)} steps passed.")

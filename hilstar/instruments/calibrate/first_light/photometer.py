@@ -100,25 +100,38 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     Raises InputError where too little of the monitor is seen.
     """
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sides = *(ratio * size for size in geometry.monitor.resolution_px), *geometry.tracker.resolution_px
+    sides = (
+        *(ratio * size for size in geometry.monitor.resolution_px),
+        *geometry.tracker.resolution_px,
+    )
     side = min(SHARE * min(sides), MAX_SIDE_TRACKER_PX) / ratio
     sparsest = 2 ** math.ceil(math.log2(max(APART_TRACKER_PX / ratio, 1.0)))
     cells = int(side // sparsest)
     if cells < MIN_DOTS:
-        raise InputError("the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches")
-    (x,), (y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px))
+        raise InputError(
+            "the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches"
+        )
+    (x,), (y,) = geometry.to_monitor(
+        *(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px)
+    )
     corner = []  # the top left of a square about the middle of what is seen, kept on the screen
     for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
         wanted = middle if math.isfinite(middle) else (size - 1) / 2
-        corner.append(int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest)))
+        corner.append(
+            int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest))
+        )
     left, top = corner
     margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
     rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
     periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
-    return DotField(left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)), periods
+    return DotField(
+        left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)
+    ), periods
 
 
-def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float) -> tuple[slice, slice]:
+def _seen(
+    geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float
+) -> tuple[slice, slice]:
     """The rows and columns of the tracker's image that the square and its wings cover."""
     along = np.linspace(0, side - 1, 33)
     low, high = np.zeros_like(along), np.full_like(along, side - 1)
@@ -131,7 +144,9 @@ def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: f
     for part, size in zip(place, geometry.tracker.resolution_px, strict=True):
         first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
         if first < 0 or last > size:
-            raise InputError("the dots are not whole in the tracker's field; look at [collimator] and run the geometry again")
+            raise InputError(
+                "the dots are not whole in the tracker's field; look at [collimator] and run the geometry again"
+            )
         ends.append(slice(first, last))
     return ends[1], ends[0]
 
@@ -144,7 +159,9 @@ def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
     differ by several percent.
     """
     y, x = np.mgrid[rows.start : rows.stop + 1, columns.start : columns.stop + 1] - 0.5
-    corner_x, corner_y = (part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel()))
+    corner_x, corner_y = (
+        part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel())
+    )
     # Half the cross product of a quadrangle's diagonals.
     down_x, down_y = corner_x[1:, 1:] - corner_x[:-1, :-1], corner_y[1:, 1:] - corner_y[:-1, :-1]
     up_x, up_y = corner_x[:-1, 1:] - corner_x[1:, :-1], corner_y[:-1, 1:] - corner_y[1:, :-1]
@@ -175,7 +192,9 @@ def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> Floa
     """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is
     tracker px per monitor px.
     """
-    return np.array([float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods])
+    return np.array(
+        [float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods]
+    )
 
 
 class Range(NamedTuple):
@@ -462,7 +481,9 @@ class Photometer:
                 )
             self.exposure_s /= LESS
         else:
-            raise InputError(f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at stray light")
+            raise InputError(
+                f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at stray light"
+            )
         if probe:
             self.exposure_s *= FILL / fill
         dark = self._part(self._take("black", Range(1), BLACK))
@@ -556,7 +577,9 @@ class Photometer:
             look = self._look(f"{name}_{at.period}", at, patch)
             lights.append(look.sum_dn - dark[at.times])
         if lights[1] <= 0:
-            raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
+            raise InputError(
+                f"dots of code {patch.code} have no light in the tracker; look at what the screen shows"
+            )
         return lights[0], lights[1]
 
     def _brightest(
@@ -676,7 +699,9 @@ class Photometer:
         effects = np.zeros((len(values.light), len(longer), STEP_PHASES))
         for order, reading in lit.items():
             place = longer.index(reading.at.times)
-            effects[order, place] = self._rounded(reading.at, reading.light_dn) * values.per_dn[order]
+            effects[order, place] = (
+                self._rounded(reading.at, reading.light_dn) * values.per_dn[order]
+            )
         for pair, link in zip(pairs, links, strict=True):
             off = np.zeros((len(longer), STEP_PHASES))
             ranges = zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True)
@@ -740,7 +765,9 @@ class Photometer:
         cell_px = (at.period * self.ratio) ** 2
         return dots * cell_px * rounded_light(level_dn, dark_dn, self.scatter.dn_per_e)
 
-    def _with_black(self, planned: list[Patch], light: FloatArray) -> tuple[FloatArray, float | None]:
+    def _with_black(
+        self, planned: list[Patch], light: FloatArray
+    ) -> tuple[FloatArray, float | None]:
         """Light (n,) with the black level, DN/s, and that level's standard error, None where it was
         not measured.
         """

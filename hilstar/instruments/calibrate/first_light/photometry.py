@@ -21,13 +21,32 @@ from hilstar.display.calibration import (
 )
 from hilstar.display.primaries import channel_matrix
 from hilstar.display.response import Response
-from hilstar.instruments.calibrate.first_light.context import Figure, StepContext, StepNumber, StepOutcome
-from hilstar.instruments.calibrate.first_light.photometer import LONGEST_S, Assumed, Photometer, Readings
+from hilstar.instruments.calibrate.first_light.context import (
+    Figure,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+)
+from hilstar.instruments.calibrate.first_light.photometer import (
+    LONGEST_S,
+    Assumed,
+    Photometer,
+    Readings,
+)
 from hilstar.instruments.calibrate.measurements import PRIMARIES
-from hilstar.instruments.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+from hilstar.instruments.calibrate.photometric import (
+    Provenance,
+    calibrate_photometric,
+    draw_calibration,
+)
 from hilstar.instruments.calibrate.plan import Patch, PlanSettings, plan_patches
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_calibration, bench_primaries, calibration_source, named_channels
+from hilstar.server.bench.build import (
+    bench_calibration,
+    bench_primaries,
+    calibration_source,
+    named_channels,
+)
 from hilstar.server.bench.config.bench_config import drives_apart
 from hilstar.tracker.settings import DetectorSettings
 
@@ -45,19 +64,30 @@ def photometry(context: StepContext) -> StepOutcome:
     monitor = context.file.config.monitor
     if not context.patches:
         how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
-        return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
+        return StepOutcome(
+            "skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}"
+        )
     assumed = calibration_of(context)
     apart = drives_apart(context.file.config)
     channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing or apart else "w"
     planned = plan_for(monitor.bits, context.patches, channels)
     by_channel = {"w": assumed.response.light}
     if apart:
-        responses = primary_responses(calibration_source(monitor, context.file.folder), monitor.bits)
+        responses = primary_responses(
+            calibration_source(monitor, context.file.folder), monitor.bits
+        )
         shares = shares_of_white(context.file)
-        by_channel = {name: share * one.light for name, share, one in zip(channels, shares, responses, strict=True)}
+        by_channel = {
+            name: share * one.light
+            for name, share, one in zip(channels, shares, responses, strict=True)
+        }
     elif channels != "w":
         by_channel = dict(
-            zip(channels, primary_lights(calibration_source(monitor, context.file.folder), monitor.bits), strict=True)
+            zip(
+                channels,
+                primary_lights(calibration_source(monitor, context.file.folder), monitor.bits),
+                strict=True,
+            )
         )
     light = Assumed(by_channel, assumed.response.black)
     readings = Photometer(context, context.psf_sigma_px, light, PAIRS, LONGEST_S).read(planned)
@@ -65,7 +95,11 @@ def photometry(context: StepContext) -> StepOutcome:
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
     found = calibrate_photometric(
-        measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits, context.source.monitor
+        measured,
+        output,
+        Provenance("", "", instrument, "DN/s"),
+        monitor.bits,
+        context.source.monitor,
     )
     files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
     if assumed.uniformity is not None:
@@ -75,14 +109,19 @@ def photometry(context: StepContext) -> StepOutcome:
     now = written.response
     figures = _response_figures(context, readings, found, assumed.response, now)
     if written.weights is not None:
-        figures["shares_of_white"] = ", ".join(f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True))
+        figures["shares_of_white"] = ", ".join(
+            f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True)
+        )
     off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
     off_mag = response_error_mag(assumed.response, now)
     with chart(before, f"The bench file's response is off by {off}") as (axes,):
         axes.plot(now.light[-len(off_mag) :], off_mag, color=INK)
         axes.axhline(0, color=MUTED, linewidth=0.8)
         axes.set_xscale("log")
-        axes.set(xlabel="measured light over white [share]", ylabel="fainter than in the bench file [mag]")
+        axes.set(
+            xlabel="measured light over white [share]",
+            ylabel="fainter than in the bench file [mag]",
+        )
         axes.invert_yaxis()
     return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
 
@@ -96,7 +135,9 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
         for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1)
     ]
     if len(plans[0]) > patches:
-        raise InputError(f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none")
+        raise InputError(
+            f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none"
+        )
     return [planned for planned in plans if len(planned) <= patches][-1]
 
 
@@ -106,7 +147,9 @@ def shares_of_white(file: BenchFile) -> FloatArray:
     """
     primaries = bench_primaries(file.config.monitor, file.folder)
     if primaries is None:
-        raise InputError("[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b")
+        raise InputError(
+            "[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b"
+        )
     matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
     return np.asarray(matrix.e_per_s.sum(axis=0))
 
@@ -129,7 +172,9 @@ def _response_figures(
         "bench_file_off_max_mag": float(np.abs(off).max()),
         "black_level": now.black,
         "black_level_in_bench_file": before.black,
-        "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
+        "black_level_measured": "yes"
+        if readings.black_known
+        else "no: give --dark, an image with the monitor switched off",
         "held_out_rms_mag": max(each["rms_mag"] for each in held),
         "held_out_p95_mag": max(MAG_PER_RELATIVE * each["p95_percent"] / 100 for each in held),
         "held_out_p95_sigmas": max(each["p95_sigmas"] for each in held),
@@ -140,7 +185,9 @@ def _response_figures(
         "codes": found["codes"],
         "exposure_s": readings.exposure_s,
         "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
-        "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
+        "links_max_mag": max(
+            (abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0
+        ),
         "links_max_sigmas": max((link.sigmas for link in readings.links), default=0.0),
         **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
     }
@@ -159,7 +206,10 @@ def rounds_alike(detector: DetectorSettings) -> bool:
 
 
 def _judged(
-    context: StepContext, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]
+    context: StepContext,
+    figures: dict[str, Figure],
+    files: tuple[Path, ...],
+    pictures: tuple[Path, ...],
 ) -> StepOutcome:
     """The step's outcome: done, with the response named in the bench file, unless it misses the
     limits of [verify].
@@ -180,7 +230,9 @@ def _judged(
     differs = float(figures["links_max_mag"]) > limit_mag
     if differs and float(figures["links_max_sigmas"]) > SURE_SIGMAS:
         why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
-        line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
+        line = (
+            f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
+        )
         return StepOutcome("failed", line, figures, files, pictures, number=number)
     is_off = float(figures["held_out_p95_mag"]) > limit_mag
     if is_off and float(figures["held_out_p95_sigmas"]) > SURE_SIGMAS:

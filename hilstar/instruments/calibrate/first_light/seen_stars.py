@@ -78,7 +78,9 @@ class StarSpot:
         # twelfth of its area each.
         drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
         own = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
-        x, y = (math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True))
+        x, y = (
+            math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True)
+        )
         detector = context.file.config.tracker.detector
         return cls((x, y), detector.gain_e_per_dn, detector.prnu)
 
@@ -118,7 +120,9 @@ class StarSpot:
     def _shares(self) -> tuple[FloatArray, FloatArray]:
         """Shares of a star's light in its window (k, k), and pixels' offsets along x (k,)."""
         offset = np.arange(-self.radius_px, self.radius_px + 1.0)
-        x, y = (ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma) for sigma in self.sigma_px)
+        x, y = (
+            ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma) for sigma in self.sigma_px
+        )
         return np.outer(y, x), offset
 
     def light_noise_mag(self, dn: FloatArray, noise_dn: float) -> FloatArray:
@@ -143,7 +147,9 @@ class StarSpot:
         dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
         rounded = np.zeros((len(dn), STEP_PHASES))
         for star, light_dn in enumerate(dn.tolist()):
-            rounded[star] = rounded_light(light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn)
+            rounded[star] = rounded_light(
+                light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn
+            )
         return shares.size * rounded
 
     def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
@@ -179,7 +185,9 @@ class Beyond(NamedTuple):
         weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
         more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
         at_least = max(more, 0.0)
-        error = math.sqrt(2 * float((weight**2 * (noise**2 + at_least) ** 2).sum())) / float(weight.sum())
+        error = math.sqrt(2 * float((weight**2 * (noise**2 + at_least) ** 2).sum())) / float(
+            weight.sum()
+        )
         bounds = (more, more - ONE_SIDED * error, more + ONE_SIDED * error)
         sigma, low, high = (math.sqrt(max(each, 0.0)) for each in bounds)
         return cls(sigma, low, high)
@@ -279,9 +287,7 @@ class Scatter:
         elif self.by_place > self.by_light:
             why = f"{self.by_place:.0%} of it follows the place on the screen: measure that (--again uniformity)"
         else:
-            why = (
-                f"{self.by_light:.0%} of it follows the light asked for: measure the response (--again photometry, --patches N)"
-            )
+            why = f"{self.by_light:.0%} of it follows the light asked for: measure the response (--again photometry, --patches N)"
         return f"{told}; {why}"
 
 
@@ -307,21 +313,33 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
     dark, dark_paths = _mean_dark(context, frames)
     with open_bench(context.file) as bench:
         shown = []
-        for q_icrs_to_cam in _fields(bench, context, spot, math.sqrt(2) * noisiest_background(dark).noise):
+        for q_icrs_to_cam in _fields(
+            bench, context, spot, math.sqrt(2) * noisiest_background(dark).noise
+        ):
             frame = bench.frame(q_icrs_to_cam)
             levels: tuple[Levels, ...] = (frame.levels,)
             # with `temporal` the frames of an exposure
             exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
             if len(exposed) > 1:
-                levels = tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
+                levels = tuple(
+                    Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy())
+                    for number in exposed
+                )
             codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
             shown.append((codes, _alone(bench, context, frame, levels, spot)))
     fields = []
     for number, (codes, wanted) in enumerate(shown):
-        names = [f"stars_{number:03}", *(f"stars_{number:03}_{again:02}" for again in range(1, frames))]
+        names = [
+            f"stars_{number:03}",
+            *(f"stars_{number:03}_{again:02}" for again in range(1, frames)),
+        ]
         looked = [context.look(Pattern(name, codes[0], codes[1:]), dark) for name in names]
         fields.append(_compared(context, looked, wanted, spot))
-    arrays = [field.name for field in dataclasses.fields(StarsSeen) if field.name not in {"lost", "frames", "images"}]
+    arrays = [
+        field.name
+        for field in dataclasses.fields(StarsSeen)
+        if field.name not in {"lost", "frames", "images"}
+    ]
     seen = StarsSeen(
         **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
         lost=sum(each.lost for each in fields),
@@ -340,7 +358,11 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
             f"{told}; {seen.lost} that should be bright enough are not there: measure the response (--again photometry), look"
             " at [render] flux_at_white_e_per_s, or run the geometry again (--again geometry)"
         )
-    wide = f"a star's sigma is {spot.mean_sigma_px:.1f} px" if spot.mean_sigma_px > 2 else "the field has few bright stars"
+    wide = (
+        f"a star's sigma is {spot.mean_sigma_px:.1f} px"
+        if spot.mean_sigma_px > 2
+        else "the field has few bright stars"
+    )
     return (
         f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag, so that faint stars are shown"
         " brighter, or a larger [sky] faintest_v_mag"
@@ -353,7 +375,9 @@ def _mean_dark(context: StepContext, frames: int) -> tuple[FloatArray, tuple[Pat
     return np.asarray(np.mean([context.read(path) for path in paths], axis=0)), tuple(paths)
 
 
-def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float) -> list[FloatArray]:
+def _fields(
+    bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float
+) -> list[FloatArray]:
     """Attitudes (4,) of the fields with the most stars that can be read, of random ones and of
     those at bright stars.
     """
@@ -366,7 +390,9 @@ def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float)
     attitudes = [np.asarray(q / np.linalg.norm(q)) for q in rng.normal(size=(RANDOM_ATTITUDES, 4))]
     which = np.flatnonzero(readable)
     brightest = which[np.argsort(-dn[which], kind="stable")][:POINTED_ATTITUDES]
-    for boresight, other in zip(stars.directions(brightest), rng.normal(size=(len(brightest), 3)), strict=True):
+    for boresight, other in zip(
+        stars.directions(brightest), rng.normal(size=(len(brightest), 3)), strict=True
+    ):
         right = np.cross(other, boresight)
         right /= np.linalg.norm(right)
         attitudes.append(from_matrix(np.stack([right, np.cross(boresight, right), boresight])))
@@ -385,10 +411,16 @@ def _fields(bench: Bench, context: StepContext, spot: StarSpot, noise_dn: float)
         counts.append(int(inside.sum()))
     order = np.argsort(-np.array(counts), kind="stable")[:MAX_FIELDS]
     before = np.concatenate([[0], np.cumsum(np.array(counts)[order])[:-1]])
-    return [attitudes[k] for place, k in enumerate(order) if place < FIELDS or before[place] < ENOUGH_STARS]
+    return [
+        attitudes[k]
+        for place, k in enumerate(order)
+        if place < FIELDS or before[place] < ENOUGH_STARS
+    ]
 
 
-def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], spot: StarSpot) -> ExpectedStars:
+def _alone(
+    bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], spot: StarSpot
+) -> ExpectedStars:
     """The isolated stars of a frame that are drawn whole, with their expected places in the
     tracker's image.
     """
@@ -402,7 +434,9 @@ def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Level
     # No planets: their light is known to 0.05 mag only, and a disc may be wide.
     kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
     kept &= bench.stars.row[frame.star] >= 0
-    kept &= (place > edge_px).all(axis=1) & (place < np.array([width, height]) - 1 - edge_px).all(axis=1)
+    kept &= (place > edge_px).all(axis=1) & (place < np.array([width, height]) - 1 - edge_px).all(
+        axis=1
+    )
     kept &= (screen > MIN_EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
     finite = np.where(np.isfinite(place), place, -1e6)
     light = np.asarray(truth["electrons_per_s"], dtype=np.float64)
@@ -432,7 +466,9 @@ def _codes_mag(
     """
     shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)
     geometry = context.geometry()
-    reach = math.ceil((spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px)
+    reach = math.ceil(
+        (spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
+    )
     off = []
     for x, y in np.rint(screen_px).astype(np.intp):
         part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
@@ -442,7 +478,9 @@ def _codes_mag(
     return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))
 
 
-def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot) -> StarsSeen:
+def _compared(
+    context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot
+) -> StarsSeen:
     """The stars found in the mean of a field's images, against those that should be there."""
     image = np.asarray(np.mean([each.image for each in looked], axis=0))
     background = noisiest_background(image, 1 / len(looked))
@@ -456,7 +494,9 @@ def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: Expect
     expected_dn = wanted.e_per_s * context.exposure_s / spot.gain_e_per_dn
     brighter = 1.0
     if near.sum() >= MIN_STARS:  # the screen may give more or less light than the bench file says
-        brighter = float(np.median(found.flux[nearest[near]] / spot.window_share / expected_dn[near]))
+        brighter = float(
+            np.median(found.flux[nearest[near]] / spot.window_share / expected_dn[near])
+        )
     matched = near.copy()
     dn = found.flux[nearest[near]] / spot.window_share
     matched[near] = spot.light_noise_mag(dn, noise_dn) < READ_MAG

@@ -35,7 +35,13 @@ from hilstar.instruments.calibrate.first_light.context import (
 )
 from hilstar.instruments.calibrate.first_light.focus import focus
 from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
-from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
+from hilstar.instruments.calibrate.first_light.image_sources import (
+    ImageSource,
+    NoImage,
+    Pattern,
+    Stopped,
+    complete_images,
+)
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
 from hilstar.instruments.calibrate.first_light.uniformity import uniformity, warm_up
@@ -52,16 +58,24 @@ def latency(context: StepContext) -> StepOutcome:
     """Measure the panel's delay and set it in the bench file. Raises InputError, MachineError."""
     monitor = context.file.config.monitor
     if not monitor.photodiode_px:
-        return StepOutcome("skipped", "not measured: [monitor] photodiode_px is 0, so no square is shown for a photodiode")
+        return StepOutcome(
+            "skipped",
+            "not measured: [monitor] photodiode_px is 0, so no square is shown for a photodiode",
+        )
     watched = context.source.diode(context.file, WATCHED_S)
     if watched is None:
         how = "--diode serial:/dev/ttyX@BAUD, with the display on this machine; or `hilstar latency` with the ledger of a run"
-        return StepOutcome("skipped", f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}")
+        return StepOutcome(
+            "skipped",
+            f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}",
+        )
     paired = pair(watched.seen, watched.shown, NS_PER_S / monitor.refresh_hz)
     found = summarise(paired, context.file.config)
     picture = context.session / "latency.svg"
     draw_latency(picture, paired, found)
-    delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
+    delay_ms = checked_delay_ms(
+        0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"]
+    )
     error_ms = found["panel_delay_u_ms"]
     figures: dict[str, Figure] = {
         "panel_delay_ms": delay_ms,
@@ -87,8 +101,12 @@ def latency(context: StepContext) -> StepOutcome:
         *context.change("monitor", "panel_delay_ms", delay_ms),
         *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
     )
-    number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
-    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else changes, number)
+    number = StepNumber(
+        delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row"
+    )
+    return StepOutcome(
+        "done", line, figures, (picture,), (picture,), () if agrees else changes, number
+    )
 
 
 MS_PER_S = 1000.0
@@ -110,16 +128,25 @@ def display(context: StepContext) -> StepOutcome:
     """Measure the display. Raises MachineError for one that is not as the bench file has it."""
     timing = context.source.gate(context.file)
     if timing is None:
-        return StepOutcome("skipped", f"no display of this program's own ({context.source.identity.partition(':')[0]})")
+        return StepOutcome(
+            "skipped",
+            f"no display of this program's own ({context.source.identity.partition(':')[0]})",
+        )
     figures: dict[str, Figure] = {"period_ms": timing.period_ms, "dropped": timing.dropped}
     if timing.paced_by_screen:
         figures["refresh_hz"] = MS_PER_S / timing.period_ms
     if timing.modes_hz:
         figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
-    paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
+    paced = (
+        ""
+        if timing.paced_by_screen
+        else "; the display has no refresh of its own, frames are paced by software"
+    )
     forced = "".join(f"; forced: {each}" for each in context.source.forced)
     line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}"
-    number = StepNumber(timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next")
+    number = StepNumber(
+        timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next"
+    )
     return StepOutcome("done", line, figures, number=number)
 
 
@@ -151,12 +178,26 @@ class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 STEPS_FILE = Path(__file__).with_name("steps.toml")
 STEPS = tuple(
     msgspec.structs.replace(step, name=name)
-    for name, step in msgspec.toml.decode(STEPS_FILE.read_bytes(), type=dict[str, SessionStep]).items()
+    for name, step in msgspec.toml.decode(
+        STEPS_FILE.read_bytes(), type=dict[str, SessionStep]
+    ).items()
 )
 NAMES = tuple(step.name for step in STEPS)
 RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
     run.__name__.replace("_", "-"): run
-    for run in (machine, display, orientation, focus, warm_up, geometry, uniformity, photometry, scale, latency, verify)
+    for run in (
+        machine,
+        display,
+        orientation,
+        focus,
+        warm_up,
+        geometry,
+        uniformity,
+        photometry,
+        scale,
+        latency,
+        verify,
+    )
 }
 
 
@@ -218,13 +259,24 @@ class FirstLightSession:
         frames: int = 0,
         progress: Callable[[str], object] = lambda line: None,
     ) -> None:
-        self._watch, self._watched_s, self._frames, self._progress = watch, watched_s, frames, Progress(progress)
+        self._watch, self._watched_s, self._frames, self._progress = (
+            watch,
+            watched_s,
+            frames,
+            Progress(progress),
+        )
         self.folder, self.file, self.source, self.patches = folder, file, source, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
         if found is not None and found.bench != bench:
-            raise InputError(f"{folder}: is the session of {found.bench}; write another directory for {file.path}")
-        self.records = {} if found is None else {record.name: record for record in found.steps if record.name in NAMES}
+            raise InputError(
+                f"{folder}: is the session of {found.bench}; write another directory for {file.path}"
+            )
+        self.records = (
+            {}
+            if found is None
+            else {record.name: record for record in found.steps if record.name in NAMES}
+        )
         self.unfinished = {} if found is None else dict(found.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
@@ -237,7 +289,9 @@ class FirstLightSession:
             write_whole(before, self.file.path.read_bytes())
         for number, step in enumerate(STEPS):
             if step.name not in again and self._is_done(number):
-                say(f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}")
+                say(
+                    f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}"
+                )
                 continue
             record = self._run(number, step.name in again, say)
             self.records[step.name] = record
@@ -251,7 +305,12 @@ class FirstLightSession:
         """
         step = STEPS[number]
         record = self.records.get(step.name)
-        if record is None or record.verdict == "failed" or step.name in self.unfinished or self._unmet(step) is not None:
+        if (
+            record is None
+            or record.verdict == "failed"
+            or step.name in self.unfinished
+            or self._unmet(step) is not None
+        ):
             return False
         if record.verdict == "skipped" and step.needs:
             return False  # it lacked a step that has been done by now
@@ -267,7 +326,11 @@ class FirstLightSession:
                 return name
         for name in step.needs:
             record = self.records.get(name)
-            if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
+            if (
+                record is None
+                or record.verdict == "failed"
+                or (record.verdict == "skipped" and name != "display")
+            ):
                 return name
         return None
 
@@ -357,14 +420,22 @@ class FirstLightSession:
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
         kept = {
-            table: {key: value for key, value in config[table].items() if f"{table}.{key}" not in later}
+            table: {
+                key: value for key, value in config[table].items() if f"{table}.{key}" not in later
+            }
             for table in tables or step.tables
         }
-        named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
+        named = {
+            text: sha256_of(self.file.folder / text)
+            for text in _texts(kept)
+            if _is_file(self.file.folder / text)
+        }
         monitor = self.source.monitor
         shown_on = f" on {monitor.name()}" if monitor is not None and monitor.edid_sha256 else ""
         seen_by = self.source.identity + shown_on if step.tables else platform.python_version()
-        return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
+        return hashlib.sha256(
+            msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")
+        ).hexdigest()
 
     def as_file(self, running: str | None = None) -> SessionFile:
         """The contents of session.json."""
@@ -388,7 +459,11 @@ class FirstLightSession:
         record = self.records.get("display")
         figures = {} if record is None else record.figures
         refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
-        return beat_of(self.file.config, None if refresh_hz is None else float(refresh_hz), [float(hz) for hz in modes])
+        return beat_of(
+            self.file.config,
+            None if refresh_hz is None else float(refresh_hz),
+            [float(hz) for hz in modes],
+        )
 
 
 def _finite(value: Figure) -> Figure:
@@ -417,7 +492,9 @@ def _is_file(path: Path) -> bool:
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Lock a directory against a second session (InputError); a kill releases the lock."""
-    lock = lock_alone(folder / LOCK_FILE, "another first-light session works there; wait for its end")
+    lock = lock_alone(
+        folder / LOCK_FILE, "another first-light session works there; wait for its end"
+    )
     try:
         yield
     finally:

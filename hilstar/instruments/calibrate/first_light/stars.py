@@ -13,8 +13,21 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, INK, MUTED, SMALL_PT, chart, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
-from hilstar.instruments.calibrate.first_light.context import Figure, StepContext, StepNumber, StepOutcome, Verdict
-from hilstar.instruments.calibrate.first_light.seen_stars import FAR, MIN_STARS, READ_MAG, Beyond, StarsSeen, see_stars
+from hilstar.instruments.calibrate.first_light.context import (
+    Figure,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
+from hilstar.instruments.calibrate.first_light.seen_stars import (
+    FAR,
+    MIN_STARS,
+    READ_MAG,
+    Beyond,
+    StarsSeen,
+    see_stars,
+)
 from hilstar.instruments.calibrate.scale import UNSURE_MAG, scale_of
 from hilstar.instruments.verify.summary import summarise
 from hilstar.instruments.verify.summary import verify as run_twin
@@ -59,7 +72,13 @@ def verify(context: StepContext) -> StepOutcome:
     picture, light = context.session / "verify.svg", context.session / "verify-light.svg"
     rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
     width_px = context.file.config.tracker.resolution_px[0]
-    draw_residuals(picture, seen.place_px, seen.residual_px, width_px, f"{len(seen.place_px)} stars are {rms} from the sky")
+    draw_residuals(
+        picture,
+        seen.place_px,
+        seen.residual_px,
+        width_px,
+        f"{len(seen.place_px)} stars are {rms} from the sky",
+    )
     line = f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them, {noise_words(seen)}"
     line += f"; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
     pictures = [picture]
@@ -80,7 +99,9 @@ def verify(context: StepContext) -> StepOutcome:
     figures |= {
         "twin_passed": str(twin["passed"]).lower(),
         "twin_stars": twin["stars"],
-        "twin_zero_point_mag": "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"],
+        "twin_zero_point_mag": "not known"
+        if twin["zero_point_mag"] is None
+        else twin["zero_point_mag"],
         "twin_flux_p95_mag": twin["flux_error_mag"].p95 or 0.0,
         "twin_centroid_p95_px": twin["centroid_error_px"].p95 or 0.0,
     }
@@ -94,8 +115,15 @@ def verify(context: StepContext) -> StepOutcome:
     verdict: Verdict = "failed" if reasons else "done"
     rms_arcsec = float(figures["star_rms_arcsec"])
     error = rms_arcsec / math.sqrt(4 * len(off_px))  # from an rms over two axes
-    number = StepNumber(rms_arcsec, error, "arcsec", f"rms distance of {len(off_px)} stars from where the sky has them")
-    return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number)
+    number = StepNumber(
+        rms_arcsec,
+        error,
+        "arcsec",
+        f"rms distance of {len(off_px)} stars from where the sky has them",
+    )
+    return StepOutcome(
+        verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number
+    )
 
 
 def noise_words(seen: StarsSeen) -> str:
@@ -147,7 +175,9 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
     cure = "write a longer [tracker] exposure_s"
     if wanted <= MAX_ASKED_FRAMES:
         cure = f"{wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker] exposure_s"
-    return [f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %; {cure}"]
+    return [
+        f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %; {cure}"
+    ]
 
 
 def _twin(context: StepContext) -> TwinVerdict:
@@ -158,7 +188,9 @@ def _twin(context: StepContext) -> TwinVerdict:
     glow = found.measured.glow
     known = float(context.known.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
     limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
-    return judge(dataclasses.replace(found.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit)))
+    return judge(
+        dataclasses.replace(found.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit))
+    )
 
 
 def _twin_file(context: StepContext) -> BenchFile:
@@ -168,10 +200,16 @@ def _twin_file(context: StepContext) -> BenchFile:
     truth, file = context.truth, context.file
     if truth is None:
         return file
-    monitor, collimator, folder = truth.config.monitor, truth.config.collimator, truth.folder.resolve()
+    monitor, collimator, folder = (
+        truth.config.monitor,
+        truth.config.collimator,
+        truth.folder.resolve(),
+    )
     limits = {name: getattr(file.config.verify, name) for name in LIMITS}
     known = Verify(
-        **limits, true_calibration=str(calibration_source(monitor, folder)), true_flux_at_white_e_per_s=_white_e_per_s(truth)
+        **limits,
+        true_calibration=str(calibration_source(monitor, folder)),
+        true_flux_at_white_e_per_s=_white_e_per_s(truth),
     )
     if collimator.geometry is not None:
         known = replace(known, true_geometry=str(folder / collimator.geometry))
@@ -185,7 +223,9 @@ def _twin_file(context: StepContext) -> BenchFile:
     return dataclasses.replace(file, config=replace(file.config, verify=known))
 
 
-def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tuple[dict[str, Figure], str]:
+def _light_figures(
+    context: StepContext, seen: StarsSeen, picture: Path
+) -> tuple[dict[str, Figure], str]:
     """The errors of the stars' light without their common zero point, and what is wrong where
     they scatter too far.
     """
@@ -196,14 +236,17 @@ def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tupl
     p95 = float(np.percentile(spread, 95))
     finding = f"the light of {len(off)} stars is {p95:.3f} mag from the sky's at 95 %, {zero_point:+.3f} mag in common"
     from_middle = np.hypot(*seen.screen[seen.sure].T)
-    draw_light(picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding, from_middle)
+    draw_light(
+        picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding, from_middle
+    )
     scatter = seen.scatter(off, seen.sure)
     figures: dict[str, Figure] = {
         "flux_stars": len(off),
         "flux_rms_mag": float(np.sqrt((spread**2).mean())),
         "flux_p95_mag": p95,
         "flux_max_mag": float(spread.max()),
-        "flux_beyond_noise_p95_mag": P95_OF_ONE * Beyond.of(off - zero_point, seen.noise_mag[seen.sure]).sigma,
+        "flux_beyond_noise_p95_mag": P95_OF_ONE
+        * Beyond.of(off - zero_point, seen.noise_mag[seen.sure]).sigma,
         "flux_zero_point_mag": zero_point,
         "flux_scatter_mag": scatter.rms_mag,
         "flux_error_mag": scatter.error_mag,
@@ -212,7 +255,9 @@ def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tupl
     return figures, scatter.finding
 
 
-def _star_reasons(context: StepContext, figures: dict[str, Figure], *, is_scattered: bool) -> list[str]:
+def _star_reasons(
+    context: StepContext, figures: dict[str, Figure], *, is_scattered: bool
+) -> list[str]:
     """The limits of [verify] that the stars miss, with advice; not their light again where its
     scatter has been told.
     """
@@ -238,15 +283,26 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
     truth = context.truth
     assert truth is not None
     width, height = context.resolution_px
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)))
-    mine, its = (bench_camera(file.config, file.folder).rays(x, y) for file in (context.file, truth))
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
+    )
+    mine, its = (
+        bench_camera(file.config, file.folder).rays(x, y) for file in (context.file, truth)
+    )
     mine, its = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (mine, its))
     off = np.linalg.norm(np.cross(mine, its), axis=1) * ARCSEC_PER_RAD
     known = np.isfinite(off)
     if not known.any():
-        raise InputError("no place of the screen has a direction both in the bench file and in the truth; look at the truth")
+        raise InputError(
+            "no place of the screen has a direction both in the bench file and in the truth; look at the truth"
+        )
     rms, largest = float(np.sqrt((off[known] ** 2).mean())), float(off[known].max())
-    return {"truth_rms_arcsec": rms, "truth_max_arcsec": largest, "truth_share_of_screen": float(known.mean())}
+    return {
+        "truth_rms_arcsec": rms,
+        "truth_max_arcsec": largest,
+        "truth_share_of_screen": float(known.mean()),
+    }
 
 
 READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
@@ -271,7 +327,11 @@ def scale(context: StepContext) -> StepOutcome:
             " brightest_v_mag)"
         )
     wanted, noise_mag = seen.e_per_s[used], seen.noise_mag[used]
-    ratios = seen.dn[used] * context.file.config.tracker.detector.gain_e_per_dn / (wanted * context.exposure_s)
+    ratios = (
+        seen.dn[used]
+        * context.file.config.tracker.detector.gain_e_per_dn
+        / (wanted * context.exposure_s)
+    )
     found = scale_of(white, ratios, noise_mag)
     scatter = seen.scatter(np.asarray(magnitude(ratios)), used)
     by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
@@ -296,12 +356,22 @@ def scale(context: StepContext) -> StepOutcome:
         "stars": len(ratios),
     }
     if context.truth is not None:
-        figures["truth_off_mag"] = magnitude(found.flux_at_white_e_per_s / _white_e_per_s(context.truth))
+        figures["truth_off_mag"] = magnitude(
+            found.flux_at_white_e_per_s / _white_e_per_s(context.truth)
+        )
     figures["scatter_error_mag"] = scatter.error_mag
     brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
-    line = f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
+    line = (
+        f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
+    )
     picture = context.session / "scale.svg"
-    draw_light(picture, wanted, magnitude(ratios), noise_mag, f"{line}; they agree to {found.scatter_mag:.3f} mag")
+    draw_light(
+        picture,
+        wanted,
+        magnitude(ratios),
+        noise_mag,
+        f"{line}; they agree to {found.scatter_mag:.3f} mag",
+    )
     readings = context.session / READINGS_FILE
     sigma_dn = noise_mag / MAG_PER_RELATIVE * seen.dn[used]
     write_csv(
@@ -311,21 +381,41 @@ def scale(context: StepContext) -> StepOutcome:
     )
     files = (picture, readings, *seen.images)
     error_e_per_s = found.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
-    number = StepNumber(found.flux_at_white_e_per_s, error_e_per_s, "e-/s", "light of one pixel at white, in the tracker")
+    number = StepNumber(
+        found.flux_at_white_e_per_s,
+        error_e_per_s,
+        "e-/s",
+        "light of one pixel at white, in the tracker",
+    )
     unsure_mag = max(UNSURE_MAG, FAR * scatter.error_mag)
-    wrong = [f"they disagree by {found.scatter_mag:.3f} mag"] if found.scatter_mag > unsure_mag else []
+    wrong = (
+        [f"they disagree by {found.scatter_mag:.3f} mag"] if found.scatter_mag > unsure_mag else []
+    )
     if error_mag > UNSURE_MAG:
         wrong.append("they are too noisy: write a longer [tracker] exposure_s")
     if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
-        wrong.append(f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag")
+        wrong.append(
+            f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag"
+        )
     if wrong:
         why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
-        return StepOutcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,), number=number)
+        return StepOutcome(
+            "failed",
+            f"{line}, but {' and '.join(wrong)}: {why}",
+            figures,
+            files,
+            (picture,),
+            number=number,
+        )
     verdict: Verdict = "failed" if scatter.finding else "done"
     line += f", but {scatter.finding}" if scatter.finding else ""
     changes = (
-        *context.change("render", "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")),
-        *context.change("certify", "flux_at_white_relative", float(f"{error_mag / MAG_PER_RELATIVE:.3g}")),
+        *context.change(
+            "render", "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")
+        ),
+        *context.change(
+            "certify", "flux_at_white_relative", float(f"{error_mag / MAG_PER_RELATIVE:.3g}")
+        ),
     )
     agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
     return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else changes, number)
@@ -336,7 +426,9 @@ def _white_e_per_s(file: BenchFile) -> float:
         return bench.flux_at_white_e_per_s
 
 
-def trend(e_per_s: FloatArray, off_mag: FloatArray, weight: FloatArray | float = 1.0) -> tuple[float, float]:
+def trend(
+    e_per_s: FloatArray, off_mag: FloatArray, weight: FloatArray | float = 1.0
+) -> tuple[float, float]:
     """The change of `off_mag` (n,) from the faintest to the brightest star, magnitudes, and its
     error.
 
@@ -371,7 +463,9 @@ def draw_light(
     `from_middle` (n,), half sides.
     """
     panels = [("light asked for [e-/s]", e_per_s)]
-    panels += [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
+    panels += (
+        [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
+    )
     with chart(path, finding, panels=len(panels), share_x=False) as drawn:
         for axes, (name, along) in zip(drawn, panels, strict=True):
             axes.errorbar(along, off_mag, noise_mag, fmt="o", markersize=4, color=INK, ecolor=MUTED)
@@ -381,12 +475,16 @@ def draw_light(
         drawn[0].set_xscale("log")
 
 
-def draw_residuals(path: Path, place: FloatArray, residual: FloatArray, width_px: int, finding: str) -> None:
+def draw_residuals(
+    path: Path, place: FloatArray, residual: FloatArray, width_px: int, finding: str
+) -> None:
     """Draw places (n, 2) of stars on the tracker, and their residuals (n, 2) as arrows."""
     with chart(path, finding, height_inch=6.4) as (axes,):
         largest = max(float(np.hypot(*residual.T).max()), 1e-9)
         look = {"angles": "xy", "scale_units": "xy", "width": 0.003, "color": BLUE}
-        arrows = axes.quiver(*place.T, *residual.T, scale=largest / (MAX_ARROW_SHARE * width_px), **look)
+        arrows = axes.quiver(
+            *place.T, *residual.T, scale=largest / (MAX_ARROW_SHARE * width_px), **look
+        )
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
         axes.quiverkey(arrows, 0.75, 1.03, largest, f"{largest:.3f} px, the longest", **key)
         axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")

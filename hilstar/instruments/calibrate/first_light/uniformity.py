@@ -32,7 +32,13 @@ from hilstar.instruments.calibrate.first_light.focus import dot_code
 from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.instruments.calibrate.first_light.photometry import calibration_of
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
-from hilstar.instruments.calibrate.warm_up import AHEAD_S, S_PER_H, fitted_white, judge_warm_up, watch_white
+from hilstar.instruments.calibrate.warm_up import (
+    AHEAD_S,
+    S_PER_H,
+    fitted_white,
+    judge_warm_up,
+    watch_white,
+)
 from hilstar.server.bench.build import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
 
@@ -119,7 +125,9 @@ def uniformity(context: StepContext) -> StepOutcome:
     dots, images = see_dots(context)
     size_px, assumed = context.resolution_px, calibration_of(context)
     known = assumed.uniformity_map(size_px)
-    as_known = np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
+    as_known = (
+        np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
+    )
     against = map_of(dots, dots.light / as_known, size_px)
     found = map_of(dots, dots.light, size_px)
     figures = _figures(context, dots, found, against)
@@ -137,10 +145,21 @@ def uniformity(context: StepContext) -> StepOutcome:
     if against.is_even:
         line += "; the bench file has it so" if known is not None else "; nothing was written"
     else:
-        source, path = calibration_source(context.file.config.monitor, context.file.folder), context.session / FILE
-        grid, today = None if found.is_even else found.grid, datetime.datetime.now(datetime.UTC).date().isoformat()
-        relative, bits = float(figures["map_error_mag"]) / MAG_PER_RELATIVE, context.file.config.monitor.bits
-        files += with_uniformity(source, bits, path, grid, context.source.monitor, today, relative=relative)
+        source, path = (
+            calibration_source(context.file.config.monitor, context.file.folder),
+            context.session / FILE,
+        )
+        grid, today = (
+            None if found.is_even else found.grid,
+            datetime.datetime.now(datetime.UTC).date().isoformat(),
+        )
+        relative, bits = (
+            float(figures["map_error_mag"]) / MAG_PER_RELATIVE,
+            context.file.config.monitor.bits,
+        )
+        files += with_uniformity(
+            source, bits, path, grid, context.source.monitor, today, relative=relative
+        )
         changes = context.names("monitor", "calibration", path)
         line += "; what the tracker's own lens darkens is part of it"
     noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
@@ -150,7 +169,9 @@ def uniformity(context: StepContext) -> StepOutcome:
     verdict: Verdict = "failed" if noisy else "done"
     darkest = 100 * float(figures["darkest_of_brightest"])
     error = darkest * math.sqrt(2) * float(figures["map_error_mag"]) / MAG_PER_RELATIVE
-    number = StepNumber(darkest, error, "%", "light at the darkest place of the screen, of that at the brightest")
+    number = StepNumber(
+        darkest, error, "%", "light at the darkest place of the screen, of that at the brightest"
+    )
     # A finer map than the last was not tried: where dots still differ by more than their noise, it
     # may be needed.
     ends = FittedFigure("the map's rows", found.grid.shape[0], 0.0, ROWS[-1])
@@ -163,11 +184,18 @@ def warm_up(context: StepContext) -> StepOutcome:
     tracker.
     """
     if not context.watched_s:
-        how = "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
+        how = (
+            "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
+        )
         return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
     period = _spacing(context).period
     firsts = [period // 2, period // 2]
-    dark, file, lit, number = context.read(context.dark()), context.file, np.zeros(0, dtype=np.bool_), 0
+    dark, file, lit, number = (
+        context.read(context.dark()),
+        context.file,
+        np.zeros(0, dtype=np.bool_),
+        0,
+    )
     code, _ = _unsaturated(context, dark, "white", [firsts], period)
     codes = _shown(firsts, period, code, context.resolution_px)
     cold, beside = dark < HOT_FILL * context.full_dn, lit
@@ -183,35 +211,58 @@ def warm_up(context: StepContext) -> StepOutcome:
         if not lit.size:
             lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & cold
             if not lit.any():
-                raise InputError(f"no dot of code {code} is seen; look at the focus, and whether the screen is on")
+                raise InputError(
+                    f"no dot of code {code} is seen; look at the focus, and whether the screen is on"
+                )
             beside = binary_dilation(lit, iterations=RING_PX) & cold & ~lit
         # What black pixels glow more than in the dark frame is no light of the dots.
         return float(looked.image[lit].sum() - looked.image[beside].mean() * lit.sum())
 
     hold = Pattern("white", codes)
     t_s, light = watch_white(
-        read, context.source.clock_ns, lambda seconds: context.source.hold(file, hold, seconds), context.watched_s
+        read,
+        context.source.clock_ns,
+        lambda seconds: context.source.hold(file, hold, seconds),
+        context.watched_s,
     )
     found, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
     table, picture = context.session / "warm-up.csv", context.session / "warm-up.svg"
     write_csv(table, ("t_s", "light_dn"), zip(t_s.tolist(), light.tolist(), strict=True))
     with chart(picture, found.line) as (axes,):
         axes.plot(t_s / 60, 100 * light / light[-1], ".", color=MUTED, markersize=4)
-        axes.plot(t_s / 60, 100 * fitted_white(found, t_s, light) / light[-1], color=BLUE, label=found.law)
+        axes.plot(
+            t_s / 60, 100 * fitted_white(found, t_s, light) / light[-1], color=BLUE, label=found.law
+        )
         axes.set(xlabel="time [min]", ylabel="white over the last reading [%]")
         label_ends(axes)
-    figures: dict[str, Figure] = {name: value for name, value in asdict(found).items() if name != "is_stable"}
+    figures: dict[str, Figure] = {
+        name: value for name, value in asdict(found).items() if name != "is_stable"
+    }
     figures |= {"readings": len(light), "stable": "yes" if found.is_stable else "no"}
     if context.truth is not None:
         virtual = context.truth.config.certify.virtual
         tau_s, change = 60 * virtual.warm_up_min, virtual.cold_percent / 100
-        slope = change / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
+        slope = (
+            change / tau_s * math.exp(-ended_s / tau_s)
+            + virtual.drift_percent_per_h / 100 / S_PER_H
+        )
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
-        stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
+        stable_s = tau_s * math.log(
+            max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit
+        )
         # by its exponential alone
         figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)
-    changes = context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}")) if found.is_stable else ()
-    per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
+    changes = (
+        context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}"))
+        if found.is_stable
+        else ()
+    )
+    per_h = StepNumber(
+        found.drift_percent_per_h,
+        found.drift_error_percent_per_h,
+        "%/h",
+        "drift of white at the last reading",
+    )
     return StepOutcome(
         "done" if found.is_stable else "failed",
         found.line if found.is_stable else f"{found.line}; {found.cure}",
@@ -238,24 +289,32 @@ def _spacing(context: StepContext) -> DotSpacing:
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sigma_px = math.hypot(context.psf_sigma_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
-    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)
+    period = max(
+        math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2
+    )
     return DotSpacing(sigma_px, period, min(REACH * period, REACH_SIGMAS * sigma_px / ratio))
 
 
 def _check_brightness(context: StepContext, looked: DarkSubtracted, code: int) -> None:
     if context.is_too_bright(looked):
-        raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
+        raise InputError(
+            f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step"
+        )
 
 
 def _said(found: UniformityMap, assumed: bool) -> str:
     if found.is_even:
-        return "the light is even over the screen" + (", where the bench file has it uneven" if assumed else "")
+        return "the light is even over the screen" + (
+            ", where the bench file has it uneven" if assumed else ""
+        )
     seen = found.at_dots[found.used]
     rows, columns = found.grid.shape
     return f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of {rows} x {columns}"
 
 
-def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap) -> dict[str, Figure]:
+def _figures(
+    context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap
+) -> dict[str, Figure]:
     seen = found.at_dots[found.used]
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
@@ -270,9 +329,15 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
     }
     if context.truth is not None:
         monitor = context.truth.config.monitor
-        true = bench_calibration(context.truth.config, context.truth.folder).uniformity_map(monitor.resolution_px)
+        true = bench_calibration(context.truth.config, context.truth.folder).uniformity_map(
+            monitor.resolution_px
+        )
         if monitor.resolution_px == context.resolution_px:
-            its = np.ones(len(dots.light)) if true is None else true[dots.y, dots.x].astype(np.float64)
+            its = (
+                np.ones(len(dots.light))
+                if true is None
+                else true[dots.y, dots.x].astype(np.float64)
+            )
             figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
     return figures
 
@@ -327,7 +392,9 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     for firsts, looked in zip(lattices, looks, strict=True):
         noise_dn = noisiest_background(looked.image).noise
         first = np.array(firsts)
-        parts.append(_sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size))
+        parts.append(
+            _sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size)
+        )
     paths = [dark_path, *(looked.path for looked in looks)]
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
@@ -362,7 +429,14 @@ class DotSums(NamedTuple):
 
 
 def _sums(
-    looked_at: FloatArray, image: FloatArray, bad: BoolArray, *, firsts: IntArray, period: int, reach: float, size: IntArray
+    looked_at: FloatArray,
+    image: FloatArray,
+    bad: BoolArray,
+    *,
+    firsts: IntArray,
+    period: int,
+    reach: float,
+    size: IntArray,
 ) -> DotSums:
     """The dots without a bad pixel in reach, and the sum of the image (h, w) in reach of each.
 
@@ -380,7 +454,11 @@ def _sums(
     whole = np.bincount(index, minlength=total) > 0
     whole &= np.bincount(index, bad.ravel()[inside], minlength=total) == 0
     which = np.flatnonzero(whole)
-    return DotSums(firsts[0] + which % counts[0] * period, firsts[1] + which // counts[0] * period, light[which])
+    return DotSums(
+        firsts[0] + which % counts[0] * period,
+        firsts[1] + which // counts[0] * period,
+        light[which],
+    )
 
 
 def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:
@@ -389,15 +467,22 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     """
     width, height = resolution_px
     shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
-    shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[:1]
+    shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[
+        :1
+    ]
     designs = [_design(dots, shape, resolution_px) for shape in shapes]
     relative = light / np.median(light)
     used = _tame(relative, designs[-1], shapes[-1])
     fold = np.random.default_rng(SEED).integers(0, FOLDS, len(light))
-    squares = [_held_out(relative, design, shape, used, fold) for design, shape in zip(designs, shapes, strict=True)]
+    squares = [
+        _held_out(relative, design, shape, used, fold)
+        for design, shape in zip(designs, shapes, strict=True)
+    ]
     best = min(squares, key=lambda each: float(each[used].mean()))
     worse = [(each - best)[used] for each in squares]
-    place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
+    place = next(
+        k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each))
+    )
     grid = _fitted(relative[used], designs[place][used], shapes[place])
     square = float(squares[place][used].mean())
     count = int(used.sum())
@@ -458,7 +543,9 @@ def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, in
     dot, sides = np.arange(len(dots.x)), [(y, x) for y in down for x in across]
     fields = np.concatenate([y[0] * shape[1] + x[0] for y, x in sides])
     weights = np.concatenate([y[1] * x[1] for y, x in sides])
-    return csr_array((weights, (np.tile(dot, len(sides)), fields)), shape=(len(dot), math.prod(shape)))
+    return csr_array(
+        (weights, (np.tile(dot, len(sides)), fields)), shape=(len(dot), math.prod(shape))
+    )
 
 
 def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
@@ -496,16 +583,22 @@ def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:
     used = np.ones(len(light), dtype=np.bool_)
     for _ in range(3):
         off = light / (design @ _fitted(light[used], design[used], shape)) - 1
-        used = np.abs(off) < WILD_SIGMAS * max(MAD_TO_SIGMA * float(np.median(np.abs(off[used]))), 1e-6)
+        used = np.abs(off) < WILD_SIGMAS * max(
+            MAD_TO_SIGMA * float(np.median(np.abs(off[used]))), 1e-6
+        )
     return used
 
 
-def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: BoolArray, fold: IntArray) -> FloatArray:
+def _held_out(
+    light: FloatArray, design: Any, shape: tuple[int, int], used: BoolArray, fold: IntArray
+) -> FloatArray:
     """The squared relative error of each dot (n,) in a map made without it."""
     squares = np.zeros(len(light))
     for each in range(FOLDS):
         out, kept = fold == each, used & (fold != each)
-        squares[out] = (light[out] / (design[out] @ _fitted(light[kept], design[kept], shape)) - 1) ** 2
+        squares[out] = (
+            light[out] / (design[out] @ _fitted(light[kept], design[kept], shape)) - 1
+        ) ** 2
     return squares
 
 
@@ -513,7 +606,10 @@ def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: s
     """Draw how much fainter each used dot is than the brightest place, and than the map, over
     the screen.
     """
-    x, y, light, mapped = (each[found.used] for each in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots))
+    x, y, light, mapped = (
+        each[found.used]
+        for each in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots)
+    )
     panels = {
         "fainter than the brightest place [mag]": np.asarray(magnitude(light / mapped.max())),
         "fainter than the map has it [mag]": np.asarray(magnitude(light / mapped)),
@@ -521,7 +617,9 @@ def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: s
     with chart(path, finding, panels=2) as both:
         for axes, (name, off_mag) in zip(both, panels.items(), strict=True):
             low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
-            shown = axes.scatter(x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4))
+            shown = axes.scatter(
+                x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4)
+            )
             shown.set_rasterized(True)  # thousands of dots
             axes.figure.colorbar(shown, ax=axes, label=name)
             axes.set(aspect="equal", ylabel="monitor y [px]")

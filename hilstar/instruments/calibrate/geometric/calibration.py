@@ -32,7 +32,12 @@ from hilstar.instruments.calibrate.geometric.match import (
 from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.optics.camera import Lens
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
+from hilstar.server.bench.cameras import (
+    before_detector,
+    bench_camera,
+    ideal_monitor,
+    tracker_camera,
+)
 
 SEED = 1  # for the random samples of dots: one calibration gives one file
 KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
@@ -106,7 +111,12 @@ class Calibrated:
 
 
 def calibrate_files(
-    file: BenchFile, observed: Sequence[Path], plan: Path, dark: Path | None, *, tracker_is_ideal: bool
+    file: BenchFile,
+    observed: Sequence[Path],
+    plan: Path,
+    dark: Path | None,
+    *,
+    tracker_is_ideal: bool,
 ) -> Calibrated:
     """Fit the geometry of a bench file to a table of centroids, or to the tracker's images.
     Raises InputError.
@@ -115,27 +125,37 @@ def calibrate_files(
     dots = read_plan(plan)
     width, height = config.monitor.resolution_px
     if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
-        raise InputError(f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew")
+        raise InputError(
+            f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew"
+        )
     if observed[0].suffix.lower() == ".csv":
         if len(observed) > 1:
-            raise InputError(f"{observed[1]}: one table is read; write all centroids into {observed[0]}")
+            raise InputError(
+                f"{observed[1]}: one table is read; write all centroids into {observed[0]}"
+            )
         seen = read_observed(observed[0])
     else:
         seen = measure_images(observed, dark, config.tracker.resolution_px, dot_sigma_px(file))
     return calibrate_seen(file, dots, seen, tracker_is_ideal=tracker_is_ideal)
 
 
-def calibrate_seen(file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool) -> Calibrated:
+def calibrate_seen(
+    file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool
+) -> Calibrated:
     """Fit the geometry of a bench file to centroids of planned dots. Raises InputError."""
     known = tracker_is_ideal or file.config.tracker.distortion is not None
-    return calibrate_geometry(plan, nominal_of(file), seen, np.random.default_rng(SEED), tracker_known=known)
+    return calibrate_geometry(
+        plan, nominal_of(file), seen, np.random.default_rng(SEED), tracker_known=known
+    )
 
 
 def nominal_of(file: BenchFile) -> fits.Nominal:
     """The geometry that a bench file has without its geometry file. Raises InputError."""
     config = file.config
     q_cam_to_mon = np.array(config.collimator.q_cam_to_mon)
-    return fits.Nominal(ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder))
+    return fits.Nominal(
+        ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder)
+    )
 
 
 def seen_screen_of(file: BenchFile) -> SeenScreen:
@@ -143,7 +163,10 @@ def seen_screen_of(file: BenchFile) -> SeenScreen:
     about. Raises InputError.
     """
     tracker = tracker_camera(file.config.tracker, file.folder)
-    monitor, is_sure = bench_camera(file.config, file.folder), file.config.collimator.geometry is not None
+    monitor, is_sure = (
+        bench_camera(file.config, file.folder),
+        file.config.collimator.geometry is not None,
+    )
     return SeenScreen(monitor, tracker, is_sure, psf_sigma_of(file))
 
 
@@ -152,7 +175,9 @@ def dot_sigma_px(file: BenchFile) -> float:
     InputError.
     """
     nominal = nominal_of(file)
-    return SeenScreen(nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)).dot_sigma_px
+    return SeenScreen(
+        nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)
+    ).dot_sigma_px
 
 
 def psf_sigma_of(file: BenchFile) -> float:
@@ -184,7 +209,12 @@ def _too_few(data: fits.MatchedDots) -> InputError:
 
 
 def calibrate_geometry(
-    plan: DotPlan, nominal: fits.Nominal, seen: Observed, rng: np.random.Generator, *, tracker_known: bool
+    plan: DotPlan,
+    nominal: fits.Nominal,
+    seen: Observed,
+    rng: np.random.Generator,
+    *,
+    tracker_known: bool,
 ) -> Calibrated:
     """Fit a bench's geometry to what the tracker saw of the dots.
 
@@ -209,7 +239,9 @@ def calibrate_geometry(
     chosen = fits.best_of(models)
     final = bounded_to_field(problem, fits.fit(problem, chosen.model, chosen.field_degree, data))
     uncertainty = fits.uncertainty_of(problem, final, data)
-    calibrated = Calibrated(problem, data, final, models, chosen, uncertainty, len(seen), tracker_known)
+    calibrated = Calibrated(
+        problem, data, final, models, chosen, uncertainty, len(seen), tracker_known
+    )
     _refuse_gaps(calibrated)
     expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
     if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
@@ -231,7 +263,10 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     if all(inside.all() for inside in _in_view(fit, x_px, y_px)):
         return fit
     width, height = geometry.tracker.resolution_px
-    corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
+    corners = (
+        np.array([-0.5, width - 0.5, -0.5, width - 0.5]),
+        np.array([-0.5, -0.5, height - 0.5, height - 0.5]),
+    )
     reach = 0.0
     for pose in range(len(geometry.q_poses)):
         rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
@@ -243,7 +278,11 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
 
 
 def matched(
-    plan: DotPlan, nominal: fits.Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
+    plan: DotPlan,
+    nominal: fits.Nominal,
+    seen: Observed,
+    look: FirstLook,
+    tracker_names: tuple[str, ...] = (),
 ) -> tuple[fits.Problem, fits.MatchedDots]:
     """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to
     fit, and its data.
@@ -254,19 +293,30 @@ def matched(
     refuse_motion(data)
     nominal = turned(plan, nominal, look)
     for _ in range(MATCH_ROUNDS):
-        problem = fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX)
+        problem = fits.Problem(
+            plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
+        )
         # The largest model that these centroids can determine.
-        names = next((names for names in (fits.BROWN_CONRADY, fits.RADIAL) if len(data) > 2 * len(names)), fits.PINHOLE)
-        model = fits.Model(names, tracker_names if names is fits.BROWN_CONRADY else (), len(look.q_poses))
+        names = next(
+            (names for names in (fits.BROWN_CONRADY, fits.RADIAL) if len(data) > 2 * len(names)),
+            fits.PINHOLE,
+        )
+        model = fits.Model(
+            names, tracker_names if names is fits.BROWN_CONRADY else (), len(look.q_poses)
+        )
         rough = fits.fit(problem, model, 0, data)
         reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
         data = match_by_geometry(plan, seen, rough.geometry, reach_px)
         if len(data) < MIN_DOTS:
             break
-    return fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX), data
+    return fits.Problem(
+        plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
+    ), data
 
 
-def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0) -> list[BoolArray]:
+def _in_view(
+    fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0
+) -> list[BoolArray]:
     """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than
     `edge_px` from its edge.
     """
@@ -288,7 +338,10 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
     found = np.zeros(len(plan), dtype=bool)
     found[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px
-    column, row = (np.clip((place * 3 / size).astype(int), 0, 2) for place, size in ((plan.x_px, width), (plan.y_px, height)))
+    column, row = (
+        np.clip((place * 3 / size).astype(int), 0, 2)
+        for place, size in ((plan.x_px, width), (plan.y_px, height))
+    )
     for r, vertical in enumerate(CELLS[1]):
         for c, sideways in enumerate(CELLS[0]):
             here = (column == c) & (row == r) & wanted
@@ -323,7 +376,12 @@ def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
         "model": chosen.name,
         "poses": len(found.problem.q_poses),
         "dots": {"planned": len(found.plan), "recognised": found.recognised},
-        "centroids": {"given": found.centroids, "matched": len(found.data), "lost": found.lost, "false": found.false},
+        "centroids": {
+            "given": found.centroids,
+            "matched": len(found.data),
+            "lost": found.lost,
+            "false": found.false,
+        },
         "noise_px": found.problem.noise_px,
         "noise_arcsec": found.noise_arcsec,
         "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
@@ -343,14 +401,19 @@ def _both(error: fits.Candidate | fits.Uncertainty) -> dict[str, float]:
 def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
     """What the figures alone do not say."""
     if len(found.problem.q_poses) == 1:
-        notes: tuple[str, ...] = (ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,)
+        notes: tuple[str, ...] = (
+            ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,
+        )
     else:
         notes = () if found.tracker_known else (ROUND,)
     lens = found.fit.geometry.monitor.lens
     if lens is None or not math.isfinite(lens.max_tangent):
         return notes
     known_deg = math.degrees(math.atan(lens.max_tangent))
-    return (*notes, f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out")
+    return (
+        *notes,
+        f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out",
+    )
 
 
 def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
@@ -368,7 +431,9 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
         "tilt_x_deg": (math.degrees(lens.tilt_rad[0]), math.degrees(sigma.get("tilt_x", 0.0))),
         "tilt_y_deg": (math.degrees(lens.tilt_rad[1]), math.degrees(sigma.get("tilt_y", 0.0))),
     }
-    for name, value in zip(("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True):
+    for name, value in zip(
+        ("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True
+    ):
         values[name] = (value, sigma.get(name, 0.0))
     own = found.fit.geometry.tracker.lens or Lens()
     for name, value in zip(fits.TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
@@ -377,7 +442,9 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
 
 
-def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity: MonitorIdentity | None = None) -> list[str]:
+def write_calibrated(
+    path: Path, found: Calibrated, plot: Path | None, identity: MonitorIdentity | None = None
+) -> list[str]:
     """Write the geometry file with its errors and its monitor, and its chart if `plot`; their
     names. Raises InputError.
     """
@@ -389,13 +456,22 @@ def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity:
         noise_px=found.problem.noise_px,
         rms_arcsec=uncertainty.rms_arcsec,
         max_arcsec=uncertainty.max_arcsec,
-        map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)],
-        modes_arcsec=[[float(f"{value:.5g}") for value in mode] for mode in uncertainty.modes_arcsec],
+        map_arcsec=[
+            [round(float(value), 4) for value in row]
+            for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)
+        ],
+        modes_arcsec=[
+            [float(f"{value:.5g}") for value in mode] for mode in uncertainty.modes_arcsec
+        ],
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()
-    made = MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses))
-    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity))
+    made = MadeTable(
+        by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses)
+    )
+    write_geometry(
+        path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity)
+    )
     if plot is not None:
         draw_geometry(plot, found)
     return [str(each) for each in (path, plot) if each is not None]
@@ -405,13 +481,25 @@ def lines_of(found: Calibrated) -> list[str]:
     """The calibration as lines of text."""
     chosen, error, noise = found.chosen, found.uncertainty, found.held_out_noise_arcsec
     rows = [
-        ("dots", f"{found.recognised} of {len(found.plan)} recognised in {len(found.problem.q_poses)} pose(s)"),
+        (
+            "dots",
+            f"{found.recognised} of {len(found.plan)} recognised in {len(found.problem.q_poses)} pose(s)",
+        ),
         ("centroids", f"{len(found.data)} matched, {found.lost} lost, {found.false} false"),
         ("centroid noise", f"{found.problem.noise_px:.4f} px, {found.noise_arcsec:.2f} arcsec"),
-        *((m.name, f"{m.rms_arcsec:.3f} / {m.max_arcsec:.3f} arcsec (rms / max of held-out dots)") for m in found.models),
+        *(
+            (m.name, f"{m.rms_arcsec:.3f} / {m.max_arcsec:.3f} arcsec (rms / max of held-out dots)")
+            for m in found.models
+        ),
         ("chosen", chosen.name),
-        ("held-out dots", f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max; noise: {noise:.3f}"),
-        ("a star's place", f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)"),
+        (
+            "held-out dots",
+            f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max; noise: {noise:.3f}",
+        ),
+        (
+            "a star's place",
+            f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)",
+        ),
     ]
     width = max(len(name) for name, _ in rows) + 2
     return [f"{name:{width}}{text}" for name, text in rows] + list(notes_for_a_person(found))
@@ -419,7 +507,10 @@ def lines_of(found: Calibrated) -> list[str]:
 
 def draw_geometry(path: Path, found: Calibrated) -> None:
     """Draw the error of a star's place over the screen, and the dots' residuals as arrows."""
-    error, (width, height) = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px
+    error, (width, height) = (
+        found.uncertainty.map_arcsec,
+        found.problem.nominal.monitor.resolution_px,
+    )
     finding = (
         f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
         f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
@@ -429,16 +520,28 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
     right, down = (np.bincount(place, part) / count for part in residual)
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
     median = max(float(np.median(np.hypot(right, down))), 1e-9)
-    with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (places, residuals):
-        image = places.imshow(error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis")
-        places.figure.colorbar(image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5)
+    with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (
+        places,
+        residuals,
+    ):
+        image = places.imshow(
+            error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis"
+        )
+        places.figure.colorbar(
+            image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5
+        )
         places.set_title("Error of a star's place")
         x, y = found.plan.x_px[dot], found.plan.y_px[dot]
         look = {"angles": "xy", "scale_units": "xy", "width": 0.002, "color": BLUE}
         arrows = residuals.quiver(x, y, right, down, scale=median / (ARROW_SHARE * width), **look)
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
         residuals.quiverkey(arrows, 0.75, 1.05, median, f"{median * to_arcsec:.2g} arcsec", **key)
-        residuals.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="monitor x [px]")
+        residuals.set(
+            xlim=(-0.5, width - 0.5),
+            ylim=(height - 0.5, -0.5),
+            aspect="equal",
+            xlabel="monitor x [px]",
+        )
         residuals.set_title("Mean residual of each dot; key: their median")
         for axes in (places, residuals):
             axes.set_ylabel("monitor y [px]")

@@ -75,7 +75,9 @@ class DotPlan:
         return len(self.x_px)
 
 
-def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
+def plan_dots(
+    resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator
+) -> DotPlan:
     """Plan dots over the whole screen, about `dots_per_frame` lit in each frame. Raises
     InputError where that is impossible.
     """
@@ -103,7 +105,9 @@ def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
     InputError for too many.
     """
     weight = _weight(frames)
-    tried = (_codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2))
+    tried = (
+        _codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2)
+    )
     lit = next((codes for codes in tried if codes is not None), None)
     if lit is None:
         raise InputError(
@@ -152,7 +156,12 @@ class SeenScreen:
         (n,).
         """
         width, height = self.monitor.resolution_px
-        on_screen = (x_px >= EDGE_PX) & (x_px <= width - 1 - EDGE_PX) & (y_px >= EDGE_PX) & (y_px <= height - 1 - EDGE_PX)
+        on_screen = (
+            (x_px >= EDGE_PX)
+            & (x_px <= width - 1 - EDGE_PX)
+            & (y_px >= EDGE_PX)
+            & (y_px <= height - 1 - EDGE_PX)
+        )
         rays = self.monitor.rays(x_px, y_px)
         u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
         wide, high = self.tracker.resolution_px
@@ -163,7 +172,12 @@ class SeenScreen:
             half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
             margin_px = max(half_dot_px + EDGE_PX, dot_centroids(self.dot_sigma_px).radius_px + 1)
         with np.errstate(invalid="ignore"):
-            in_field = (u >= margin_px) & (u <= wide - 1 - margin_px) & (v >= margin_px) & (v <= high - 1 - margin_px)
+            in_field = (
+                (u >= margin_px)
+                & (u <= wide - 1 - margin_px)
+                & (v >= margin_px)
+                & (v <= high - 1 - margin_px)
+            )
         return np.asarray(on_screen & in_field)
 
     def box(self) -> tuple[FloatArray, FloatArray]:
@@ -177,7 +191,9 @@ class SeenScreen:
         u, v = (part.ravel() for part in np.meshgrid(along_x, along_y))
         rays = self.tracker.rays(u, v)
         of_field = np.stack(self.monitor.project(rays @ self.monitor.cam_to_image.T), axis=1)
-        screen_x, screen_y = (np.linspace(EDGE_PX, size - 1 - EDGE_PX, GRID) for size in (width, height))
+        screen_x, screen_y = (
+            np.linspace(EDGE_PX, size - 1 - EDGE_PX, GRID) for size in (width, height)
+        )
         of_screen = np.stack([part.ravel() for part in np.meshgrid(screen_x, screen_y)], axis=1)
         places = np.concatenate([of_field[np.isfinite(of_field).all(axis=1)], of_screen])
         seen = places[self.shows(*places.T)]
@@ -193,14 +209,21 @@ def lit_for(seen: SeenScreen) -> int:
     sees, through its PSF.
     """
     ratio = seen.tracker_px_a_monitor_px
-    apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px))
+    apart_px = max(
+        MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px)
+    )
     low, high = seen.box()
-    x, y = (part.ravel() for part in np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))))
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)))
+    )
     area_px = float(np.prod(high - low)) * float(seen.shows(x, y).mean()) * ratio**2
     return int(np.clip(area_px / apart_px**2, MIN_LIT_DOTS, MAX_LIT_DOTS))
 
 
-def plan_seen_dots(seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
+def plan_seen_dots(
+    seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator
+) -> DotPlan:
     """Plan dots over the part of the screen that the tracker sees. Raises InputError where that
     is impossible.
     """
@@ -223,7 +246,9 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     k = np.arange(TRIED * count)
     unit = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
     edge = np.linspace(0.0, 1.0, GRID)
-    rim = np.concatenate([np.column_stack(part) for part in ((edge, 0 * edge), (edge, 1 + 0 * edge))])
+    rim = np.concatenate(
+        [np.column_stack(part) for part in ((edge, 0 * edge), (edge, 1 + 0 * edge))]
+    )
     unit = np.concatenate([unit, rim, rim[:, ::-1]])
     places = np.rint(low + unit * (high - low))
     is_seen = seen.shows(*places.T)
@@ -250,10 +275,14 @@ def joined(first: DotPlan, second: DotPlan) -> DotPlan:
     lit = np.zeros((len(first) + len(second), first.frames + second.frames), dtype=bool)
     lit[: len(first), : first.frames] = first.lit
     lit[len(first) :, first.frames :] = second.lit
-    return DotPlan(np.concatenate([first.x_px, second.x_px]), np.concatenate([first.y_px, second.y_px]), lit)
+    return DotPlan(
+        np.concatenate([first.x_px, second.x_px]), np.concatenate([first.y_px, second.y_px]), lit
+    )
 
 
-def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.random.Generator) -> BoolArray | None:
+def _codes_apart(
+    count: int, frames: int, weight: int, distance: int, rng: np.random.Generator
+) -> BoolArray | None:
     codes = np.zeros((count, frames), dtype=bool)
     load = np.zeros(frames)
     for k in range(count):
@@ -281,18 +310,26 @@ def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, Flo
     unit = np.concatenate([corners, spread])[:count]
     size = np.array(resolution_px) - 1 - 2 * EDGE_PX
     if (size < 1).any():
-        raise InputError(f"a screen of {resolution_px[0]} x {resolution_px[1]} px is too small for dots")
+        raise InputError(
+            f"a screen of {resolution_px[0]} x {resolution_px[1]} px is too small for dots"
+        )
     places = np.rint(EDGE_PX + unit * size)
     return places[:, 0], places[:, 1]
 
 
-def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int) -> npt.NDArray[np.uint16]:
+def dot_image(
+    plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int
+) -> npt.NDArray[np.uint16]:
     """Code values (h, w) of a frame: each lit dot is a square of DOT_PX of `white` about its
     place.
     """
     width, height = resolution_px
     image = np.zeros((height, width), dtype=np.uint16)
-    for x, y in zip(plan.x_px[plan.lit[:, frame]].astype(int), plan.y_px[plan.lit[:, frame]].astype(int), strict=True):
+    for x, y in zip(
+        plan.x_px[plan.lit[:, frame]].astype(int),
+        plan.y_px[plan.lit[:, frame]].astype(int),
+        strict=True,
+    ):
         image[y - DOT_PX // 2 :, x - DOT_PX // 2 :][:DOT_PX, :DOT_PX] = white
     return image
 
@@ -300,7 +337,11 @@ def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: 
 def write_plan(path: Path, plan: DotPlan) -> None:
     """Write plan.csv, a row for each lit dot of each frame."""
     places = np.stack([plan.x_px, plan.y_px], axis=1).astype(int).tolist()
-    lit = ((frame, dot) for frame in range(plan.frames) for dot in np.flatnonzero(plan.lit[:, frame]).tolist())
+    lit = (
+        (frame, dot)
+        for frame in range(plan.frames)
+        for dot in np.flatnonzero(plan.lit[:, frame]).tolist()
+    )
     write_csv(path, PLAN_COLUMNS, ((frame, dot, *places[dot]) for frame, dot in lit))
 
 
@@ -352,8 +393,12 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     screen_px = orientation.screen_px(monitor.resolution_px)
     white = 2**monitor.bits - 1
     triples = np.array([[0, 0, 0], [white, white, white]], dtype=np.uint16)
-    with Window(WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)) as window:
-        view = ScreenView(monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples)
+    with Window(
+        WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)
+    ) as window:
+        view = ScreenView(
+            monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples
+        )
         context = window_context()
         for frame in range(plan.frames):
             levels = dot_image(plan, frame, monitor.resolution_px, 1).astype(np.uint8)

@@ -80,15 +80,22 @@ class Geometry:
     q_poses: FloatArray
 
 
-def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: FloatArray) -> Geometry:
+def geometry_of(
+    model: Model, nominal: Nominal, q_poses: FloatArray, numbers: FloatArray
+) -> Geometry:
     """The cameras of parameters (size,); the poses' rotations are applied after `q_poses`
     (poses, 4).
     """
     values = dict.fromkeys(STEPS, 0.0)
-    values |= {name: STEPS[name] * float(number) for name, number in zip(model.names, numbers, strict=False)}
+    values |= {
+        name: STEPS[name] * float(number)
+        for name, number in zip(model.names, numbers, strict=False)
+    }
     # The principal point moves with a turn, so that the image's middle stays: else the loss has one
     # long valley in the two.
-    follow = np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
+    follow = (
+        np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
+    )
     turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
     q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
     cx, cy = nominal.monitor.principal_point_px
@@ -103,15 +110,26 @@ def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: Fl
     )
     tracker, rest = nominal.tracker, numbers[len(model.names) :]
     if model.tracker_names:
-        own = {name: TRACKER_STEPS[name] * float(n) for name, n in zip(model.tracker_names, rest, strict=False)}
-        radial, tangential = (own["tracker_k1"], own["tracker_k2"], 0.0), (own["tracker_p1"], own["tracker_p2"])
+        own = {
+            name: TRACKER_STEPS[name] * float(n)
+            for name, n in zip(model.tracker_names, rest, strict=False)
+        }
+        radial, tangential = (
+            (own["tracker_k1"], own["tracker_k2"], 0.0),
+            (own["tracker_p1"], own["tracker_p2"]),
+        )
         tracker = replace(tracker, lens=Lens(radial, tangential))
     steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
-    turned = [multiply(from_rotation_vector(step), pose) for step, pose in zip(steps, q_poses[1:], strict=True)]
+    turned = [
+        multiply(from_rotation_vector(step), pose)
+        for step, pose in zip(steps, q_poses[1:], strict=True)
+    ]
     return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))
 
 
-def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+def directions_in_cam(
+    geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px: FloatArray
+) -> FloatArray:
     """Directions (n, 3) in cam of pixels in the tracker's image, each seen in its own pose."""
     u, v = geometry.tracker.tangents(x_px, y_px)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
@@ -197,7 +215,9 @@ class _Loss:
         x, y = field.reshape(2, -1)
         camera = geometry.monitor
         residual = ResidualField.of_terms(x, y, self.field_degree, camera.resolution_px)
-        return replace(geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=residual)))
+        return replace(
+            geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=residual))
+        )
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
         return self._off(self.geometry(numbers))
@@ -212,26 +232,37 @@ class _Loss:
         For the lens they are finite differences without the field, which hardly changes along a
         step; the field is linear.
         """
-        lens, own = numbers[: self.model.size], len(self.model.names) + len(self.model.tracker_names)
+        lens, own = (
+            numbers[: self.model.size],
+            len(self.model.names) + len(self.model.tracker_names),
+        )
         poses = (len(lens) - own) // 3
         # A pose turns its own centroids alone: one trial turns all poses about one axis.
         turns = np.hstack([np.zeros((3, own)), np.tile(np.eye(3), (1, poses))])[: 3 * poses]
         steps = DIFFERENCE * np.vstack([np.eye(own, len(lens)), turns])
         bare, *varied = (
-            geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n) for n in (0 * lens, *steps)
+            geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n)
+            for n in (0 * lens, *steps)
         )
         seen = self.data.seen
         # the same for all terms of the monitor's camera
         directions = directions_in_cam(bare, seen.pose, seen.x_px, seen.y_px)
         base = self._off(bare, directions) if self.field_degree else off
-        offs = [self._off(g, directions if n < len(self.model.names) else None) for n, g in enumerate(varied)]
+        offs = [
+            self._off(g, directions if n < len(self.model.names) else None)
+            for n, g in enumerate(varied)
+        ]
         slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
         is_its = np.tile(seen.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
         columns = np.hstack([slope[:, :own], np.where(is_its, np.tile(slope[:, own:], poses), 0.0)])
         if not self.field_degree:
             return columns
         terms = np.nan_to_num(
-            field_terms(*_places_px(bare, self.data, directions), bare.monitor.resolution_px, self.field_degree)
+            field_terms(
+                *_places_px(bare, self.data, directions),
+                bare.monitor.resolution_px,
+                self.field_degree,
+            )
         )
         terms /= (self.problem.monitor_px_per_px * seen.sigma_px * self.problem.noise_px)[:, None]
         return np.hstack([columns, _blocks(terms)])
@@ -248,7 +279,13 @@ class _Loss:
         return float(each.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
 
 
-def fit(problem: Problem, model: Model, field_degree: int, data: MatchedDots, start: FloatArray | None = None) -> Fit:
+def fit(
+    problem: Problem,
+    model: Model,
+    field_degree: int,
+    data: MatchedDots,
+    start: FloatArray | None = None,
+) -> Fit:
     """Fit a model with a residual field of a total degree (0 for none) to `data`, starting at
     `start`.
     """
@@ -280,7 +317,12 @@ def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
         else:
             return numbers
         gain = value - new_value
-        numbers, off, value, damping = numbers + step, new_off, new_value, max(damping / 10, MIN_DAMPING)
+        numbers, off, value, damping = (
+            numbers + step,
+            new_off,
+            new_value,
+            max(damping / 10, MIN_DAMPING),
+        )
         if gain <= MIN_GAIN:
             break
     return numbers
@@ -304,10 +346,14 @@ def residuals_sigma(
 ) -> FloatArray:
     """The residuals (2 n,), x then y, each in its own sigma."""
     sigma = data.seen.sigma_px * problem.noise_px
-    return np.concatenate([part / sigma for part in residuals_px(problem, geometry, data, directions)])
+    return np.concatenate(
+        [part / sigma for part in residuals_px(problem, geometry, data, directions)]
+    )
 
 
-def _places_px(geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+def _places_px(
+    geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Places of the centroids (n,) on the monitor by a geometry, px."""
     if directions is None:
         directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
@@ -327,7 +373,9 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
         if len(group) > 2:
             share = np.sqrt(len(group) / (len(group) - 1))
             for part in (data.seen.x_px, data.seen.y_px):
-                deviations.append(share * (part[group] - part[group].mean()) / data.seen.sigma_px[group])
+                deviations.append(
+                    share * (part[group] - part[group].mean()) / data.seen.sigma_px[group]
+                )
     if not deviations:
         return None
     return float(MAD_TO_SIGMA * np.median(np.abs(np.concatenate(deviations))))
@@ -367,13 +415,21 @@ class Candidate:
         return float(np.hypot(*self.off_arcsec.T).max())
 
 
-def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ...]) -> list[Candidate]:
+def candidates(
+    problem: Problem, data: MatchedDots, tracker_names: tuple[str, ...]
+) -> list[Candidate]:
     """Every model that the number of centroids allows, simplest first, each with its error on
     held-out dots.
     """
     poses = len(problem.q_poses)
-    wanted = [("pinhole", PINHOLE, 0), ("pinhole + k1", RADIAL, 0), ("Brown-Conrady + tilt", BROWN_CONRADY, 0)]
-    wanted += [(f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES]
+    wanted = [
+        ("pinhole", PINHOLE, 0),
+        ("pinhole + k1", RADIAL, 0),
+        ("Brown-Conrady + tilt", BROWN_CONRADY, 0),
+    ]
+    wanted += [
+        (f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES
+    ]
     found: list[Candidate] = []
     for name, names, degree in wanted:
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
@@ -387,7 +443,9 @@ def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ..
     return found
 
 
-def held_out(problem: Problem, name: str, model: Model, degree: int, data: MatchedDots) -> Candidate:
+def held_out(
+    problem: Problem, name: str, model: Model, degree: int, data: MatchedDots
+) -> Candidate:
     """The error of a model on each dot by a fit to the others, a fifth of the dots at a time."""
     dots = np.unique(data.dot)
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
@@ -398,10 +456,17 @@ def held_out(problem: Problem, name: str, model: Model, degree: int, data: Match
         out = fold[data.dot] == k
         if out.any() and not out.all():
             trained = fit(problem, model, degree, data.at(np.flatnonzero(~out)), start)
-            off[out] = np.stack(residuals_px(problem, trained.geometry, data.at(np.flatnonzero(out))), axis=1)
-    arcsec = np.nan_to_num(off, nan=np.inf) * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
+            off[out] = np.stack(
+                residuals_px(problem, trained.geometry, data.at(np.flatnonzero(out))), axis=1
+            )
+    arcsec = (
+        np.nan_to_num(off, nan=np.inf) * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
+    )
     count = np.bincount(data.dot, minlength=len(fold))[dots]
-    means = np.stack([np.bincount(data.dot, arcsec[:, k], minlength=len(fold))[dots] / count for k in (0, 1)], axis=1)
+    means = np.stack(
+        [np.bincount(data.dot, arcsec[:, k], minlength=len(fold))[dots] / count for k in (0, 1)],
+        axis=1,
+    )
     return Candidate(name, model, degree, dots, means)
 
 
@@ -479,23 +544,36 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
     # times its transpose: the covariance
     root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])
-    scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)), _scatter_of_dots(data, off, rows.shape[1]))
+    scale = max(
+        1.0, MAD_TO_SIGMA * float(np.median(left)), _scatter_of_dots(data, off, rows.shape[1])
+    )
     if is_simpler:
         # One step of Gauss and Newton from the simple lens to the whole one, as one more error
         # beside the covariance's.
         downhill = rows.T @ (weight * off) + prior**2 * fit.numbers
         root = np.column_stack([root, root @ (root.T @ downhill) / scale])
-    steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
+    steps = [STEPS[name] for name in fit.model.names] + [
+        TRACKER_STEPS[name] for name in fit.model.tracker_names
+    ]
     spread = scale * np.linalg.norm(root, axis=1)
     names = (*fit.model.names, *fit.model.tracker_names)
     sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
-    along = (np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True))
+    along = (
+        np.linspace(-0.5, size - 0.5, n)
+        for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True)
+    )
     to_arcsec = scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
-    place_x, place_y = _slopes_of_places(problem, fit, *(part.ravel() for part in np.meshgrid(*along)))
+    place_x, place_y = _slopes_of_places(
+        problem, fit, *(part.ravel() for part in np.meshgrid(*along))
+    )
     slopes = np.stack([place_x, place_y]) @ root * to_arcsec
-    in_field = np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
+    in_field = (
+        np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
+    )
     seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
-    row, column = distance_transform_edt((~seen).astype(np.int64), return_distances=False, return_indices=True)
+    row, column = distance_transform_edt(
+        (~seen).astype(np.int64), return_distances=False, return_indices=True
+    )
     # a place that was not seen has those of its neighbour
     slopes = slopes[:, (row * seen.shape[1] + column).ravel()]
     variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
@@ -516,7 +594,9 @@ def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
     x_px, y_px = np.concatenate(places, axis=1)
     width, height = monitor.resolution_px
     with np.errstate(invalid="ignore"):
-        on_screen = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+        on_screen = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (
+            np.abs(y_px - (height - 1) / 2) <= height / 2
+        )
     return x_px[on_screen], y_px[on_screen]
 
 
@@ -551,9 +631,15 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
     """The geometry with one parameter slightly larger, and the same residual field."""
     step = np.zeros(fit.model.size)
     step[number] = DIFFERENCE
-    varied = geometry_of(fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step)
+    varied = geometry_of(
+        fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step
+    )
     field = fit.geometry.monitor.lens.field if fit.geometry.monitor.lens is not None else None
-    lens = varied.monitor.lens if field is None else replace(varied.monitor.lens or Lens(), field=field)
+    lens = (
+        varied.monitor.lens
+        if field is None
+        else replace(varied.monitor.lens or Lens(), field=field)
+    )
     return replace(varied, monitor=replace(varied.monitor, lens=lens))
 
 
@@ -562,17 +648,26 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
     numbers).
     """
     base = residuals_sigma(problem, fit.geometry, data)
-    varied = [residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)]
+    varied = [
+        residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)
+    ]
     slopes = np.stack([(each - base) / DIFFERENCE for each in varied], axis=1)
     if not fit.field_degree:
         return np.asarray(slopes)
     dots = problem.plan
-    terms = field_terms(dots.x_px[data.dot], dots.y_px[data.dot], problem.nominal.monitor.resolution_px, fit.field_degree)
+    terms = field_terms(
+        dots.x_px[data.dot],
+        dots.y_px[data.dot],
+        problem.nominal.monitor.resolution_px,
+        fit.field_degree,
+    )
     terms = terms / (problem.monitor_px_per_px * data.seen.sigma_px * problem.noise_px)[:, None]
     return np.hstack([slopes, _blocks(terms)])
 
 
-def _slopes_of_places(problem: Problem, fit: Fit, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _slopes_of_places(
+    problem: Problem, fit: Fit, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Derivatives of the places of the directions now at (x, y) by each number, monitor px (n,
     numbers), along x and y.
     """

@@ -22,7 +22,12 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAD_TO_SIGMA
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
-from hilstar.instruments.calibrate.geometric.fit import Geometry, MatchedDots, Nominal, directions_in_cam
+from hilstar.instruments.calibrate.geometric.fit import (
+    Geometry,
+    MatchedDots,
+    Nominal,
+    directions_in_cam,
+)
 from hilstar.instruments.calibrate.geometric.observed import Observed
 
 MAX_LINK_PX = 3.0  # a dot's centroids lie closer together than this in the tracker's image
@@ -57,12 +62,16 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
     area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
     link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
     pairs = cKDTree(places).query_pairs(link_px, output_type="ndarray")
-    linked = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
+    linked = coo_matrix(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places))
+    )
     group = np.asarray(connected_components(linked, directed=False)[1], dtype=np.intp)
     pattern = np.zeros((int(group.max()) + 1 if len(group) else 0, plan.frames), dtype=bool)
     inside = seen.frame < plan.frames
     pattern[group[inside], seen.frame[inside]] = True
-    far = pattern.astype(np.int32) @ (~plan.lit).T.astype(np.int32) + (~pattern).astype(np.int32) @ plan.lit.T.astype(np.int32)
+    far = pattern.astype(np.int32) @ (~plan.lit).T.astype(np.int32) + (~pattern).astype(
+        np.int32
+    ) @ plan.lit.T.astype(np.int32)
     if far.shape[1] < 2 or not len(far):
         return Decoded(*(np.zeros(0, dtype=kind) for kind in (np.intp, float, float)))
     order = np.argsort(far, axis=1, kind="stable")
@@ -106,7 +115,11 @@ def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
     """
     scale = np.sqrt(2.0) / np.maximum(np.sqrt(x.var(axis=-1) + y.var(axis=-1)), 1e-300)
     zero, one = np.zeros_like(scale), np.ones_like(scale)
-    rows = [[scale, zero, -scale * x.mean(axis=-1)], [zero, scale, -scale * y.mean(axis=-1)], [zero, zero, one]]
+    rows = [
+        [scale, zero, -scale * x.mean(axis=-1)],
+        [zero, scale, -scale * y.mean(axis=-1)],
+        [zero, zero, one],
+    ]
     return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
@@ -132,8 +145,18 @@ ORIENTATIONS = {
     (-1, 0, 0, -1): "upside down: add 180 to [monitor] rotate_deg",
     (0, 1, -1, 0): "turned by 90 degrees: add 270 to [monitor] rotate_deg, or turn the tracker",
     (0, -1, 1, 0): "turned by 270 degrees: add 90 to [monitor] rotate_deg, or turn the tracker",
-    (0, 1, 1, 0): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
-    (0, -1, -1, 0): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
+    (
+        0,
+        1,
+        1,
+        0,
+    ): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
+    (
+        0,
+        -1,
+        -1,
+        0,
+    ): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
 }
 ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
     "in reverse order": lambda frame, frames: frames - 1 - frame,
@@ -153,7 +176,9 @@ class FirstLook:
     q_poses: FloatArray
 
 
-def first_look(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstLook:
+def first_look(
+    plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator
+) -> FirstLook:
     """The maps of all poses. Raises InputError for codes that match nothing, and for an image
     that is mirrored or turned.
     """
@@ -197,10 +222,14 @@ def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     turn, _ = Rotation.align_vectors(seen, _rays_of(look.maps[0], x_px, y_px))
     q_cam_to_mon = from_matrix(turn.as_matrix())
-    return Nominal(replace(monitor, cam_to_image=to_matrix(q_cam_to_mon)), q_cam_to_mon, nominal.tracker)
+    return Nominal(
+        replace(monitor, cam_to_image=to_matrix(q_cam_to_mon)), q_cam_to_mon, nominal.tracker
+    )
 
 
-def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FloatArray | None:
+def _map_of(
+    plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator
+) -> FloatArray | None:
     """The projective map (3, 3) from tracker tangents to monitor px that most decoded dots fit;
     None where few fit any.
 
@@ -210,7 +239,13 @@ def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Gene
     u, v = nominal.tracker.tangents(found.x_px, found.y_px)
     x, y = plan.x_px[found.dot], plan.y_px[found.dot]
     best = np.zeros(len(u), dtype=bool)
-    fours = np.array([rng.choice(len(u), 4, replace=False) for _ in range(TRIALS if len(u) >= MIN_DECODED else 0)], dtype=int)
+    fours = np.array(
+        [
+            rng.choice(len(u), 4, replace=False)
+            for _ in range(TRIALS if len(u) >= MIN_DECODED else 0)
+        ],
+        dtype=int,
+    )
     fours = fours[np.isfinite((u + v)[fours]).all(axis=-1)].reshape(-1, 4)
     for trial in homography(u[fours], v[fours], x[fours], y[fours]):
         seen_x, seen_y = mapped(trial, u, v)
@@ -223,7 +258,9 @@ def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Gene
     return homography(u[best], v[best], x[best], y[best])
 
 
-def _why_no_map(plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng: np.random.Generator) -> str:
+def _why_no_map(
+    plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng: np.random.Generator
+) -> str:
     where = f"pose {pose}: " if pose else ""
     for words, reorder in ORDERS.items():
         frame = reorder(seen.frame, plan.frames)
@@ -245,13 +282,17 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     seen, told = np.stack(mapped(matrix, u, v)), np.stack(nominal.monitor.project(rays))
     relative = (seen[:, 1:] - seen[:, :1]) @ np.linalg.inv(told[:, 1:] - told[:, :1])
     relative /= np.sqrt(abs(np.linalg.det(relative)))
-    turn_deg = float(np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1])))
+    turn_deg = float(
+        np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
+    )
     if np.linalg.det(relative) > 0 and abs(turn_deg) < MAX_TURN_DEG:
         return
     nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, relative.ravel())))
     words = ORIENTATIONS[nearest]
     if words is not None:
-        raise InputError(f"the tracker sees the monitor {words}, show the dots again, and take new frames")
+        raise InputError(
+            f"the tracker sees the monitor {words}, show the dots again, and take new frames"
+        )
 
 
 def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> MatchedDots:
@@ -266,7 +307,9 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
     return _nearest(plan, seen, x_px, y_px, FIRST_REACH * plan.extent_px)
 
 
-def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> MatchedDots:
+def match_by_geometry(
+    plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float
+) -> MatchedDots:
     """Match each centroid to the lit dot nearest to it by a fitted geometry, within `reach_px`
     on the monitor.
     """
@@ -275,11 +318,15 @@ def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_p
     return _nearest(plan, seen, x_px, y_px, reach_px)
 
 
-def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float) -> MatchedDots:
+def _nearest(
+    plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float
+) -> MatchedDots:
     dot: IntArray = np.full(len(seen), -1, dtype=np.intp)
     for pose in range(int(seen.pose.max()) + 1):
         for frame in range(plan.frames):
-            here = np.flatnonzero((seen.frame == frame) & (seen.pose == pose) & np.isfinite(x_px + y_px))
+            here = np.flatnonzero(
+                (seen.frame == frame) & (seen.pose == pose) & np.isfinite(x_px + y_px)
+            )
             lit = np.flatnonzero(plan.lit[:, frame])
             if not len(here) or not len(lit):
                 continue

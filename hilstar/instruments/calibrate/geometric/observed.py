@@ -50,7 +50,9 @@ class Observed:
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        joined = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in COLUMNS}
+        joined = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in COLUMNS
+        }
         return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
 
 
@@ -85,13 +87,18 @@ THRESHOLD_SIGMA = 8.0
 # A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter
 # by 0.4 px in one of 1.5 px.
 MIN_WINDOW_SIGMA_PX = 1.5
-IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
+IMAGE_ADVICE = (
+    "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
+)
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
 POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
 
 
 def measure_images(
-    paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int], dot_sigma_px: float = MIN_WINDOW_SIGMA_PX
+    paths: Sequence[Path],
+    dark: Path | None,
+    resolution_px: tuple[int, int],
+    dot_sigma_px: float = MIN_WINDOW_SIGMA_PX,
 ) -> Observed:
     """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
 
@@ -105,8 +112,12 @@ def measure_images(
     places = [_centroids(path, resolution_px, under, settings) for path in paths_of.values()]
     count = [len(x) for x, _ in places]
     if not sum(count):
-        raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
-    frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True))
+        raise InputError(
+            f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer"
+        )
+    frame_of, pose_of = (
+        np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True)
+    )
     x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
     return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
 
@@ -114,7 +125,9 @@ def measure_images(
 def dot_centroids(dot_sigma_px: float) -> CentroidSettings:
     """How the places of dots of about `dot_sigma_px` in the tracker's image are measured."""
     window_sigma_px = max(dot_sigma_px, MIN_WINDOW_SIGMA_PX)
-    return CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px)
+    return CentroidSettings(
+        threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px
+    )
 
 
 def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
@@ -128,7 +141,9 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
             raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
         frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
         if (frame, pose) in found:
-            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]}; {IMAGE_ADVICE}")
+            raise InputError(
+                f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]}; {IMAGE_ADVICE}"
+            )
         found[frame, pose] = path
     return found
 
@@ -140,14 +155,18 @@ def _centroids(
     top = float(image.max())
     saturated = int((image == top).sum())
     if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
-        raise InputError(f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker")
+        raise InputError(
+            f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker"
+        )
     above = image if under is None else image - under
     found = find_stars(above, settings, noisiest_background(above))
     kept = ~found.at_edge
     return found.x_px[kept], found.y_px[kept]
 
 
-def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE) -> FloatArray:
+def read_image(
+    path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE
+) -> FloatArray:
     """A grey image (h, w) as float64, first row at the top, of this (width, height) if any.
     Raises InputError.
     """
@@ -171,7 +190,9 @@ def read_exposed(
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {advice}")
     if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
-        sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(*image.shape, *resolution_px)
+        sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(
+            *image.shape, *resolution_px
+        )
         raise InputError(f"{path}: {sizes}; give whole images, or set the key")
     return np.asarray(image, dtype=np.float64), exposure_s
 
@@ -185,7 +206,9 @@ def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None)
         raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
 
 
-def _picture(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:
+def _picture(
+    path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None
+) -> npt.NDArray[Any]:
     from PIL import Image
 
     try:

@@ -60,16 +60,24 @@ def lead_ns(config: BenchConfig) -> int:
     in, then the panel.
     """
     monitor = config.monitor
-    return round((monitor.period_ms + monitor.panel_delay_ms + monitor.panel_scanout_ms / 2) * NS_PER_MS)
+    return round(
+        (monitor.period_ms + monitor.panel_delay_ms + monitor.panel_scanout_ms / 2) * NS_PER_MS
+    )
 
 
-def filled_timeline(samples: list[AttitudeSample], prediction: Prediction, settings: AttitudeSettings) -> Timeline:
+def filled_timeline(
+    samples: list[AttitudeSample], prediction: Prediction, settings: AttitudeSettings
+) -> Timeline:
     """A timeline with the bench file's settings and these samples, for one kind of prediction."""
     ahead_ms = settings.max_extrapolation_ms or AttitudeSettings().max_extrapolation_ms
     stale_ns = round(settings.stale_after_ms * NS_PER_MS)
-    timeline = Timeline(Policy(0 if prediction == "held" else round(ahead_ms * NS_PER_MS), stale_ns))
+    timeline = Timeline(
+        Policy(0 if prediction == "held" else round(ahead_ms * NS_PER_MS), stale_ns)
+    )
     for sample in samples:
-        timeline.add(replace(sample, rate_cam_rad_s=None) if prediction == "two samples" else sample)
+        timeline.add(
+            replace(sample, rate_cam_rad_s=None) if prediction == "two samples" else sample
+        )
     return timeline
 
 
@@ -98,8 +106,14 @@ def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> li
         for method in QUANTISATIONS:
             found += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
             if turns:
-                crude: list[tuple[Smear, Prediction]] = [("point", "rate"), ("path", "two samples"), ("point", "held")]
-                found += [Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude]
+                crude: list[tuple[Smear, Prediction]] = [
+                    ("point", "rate"),
+                    ("path", "two samples"),
+                    ("point", "held"),
+                ]
+                found += [
+                    Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude
+                ]
         found += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
         if turns:
             found.append(Combination("round", stealing, shallow, "cut", "point", "held"))
@@ -124,10 +138,14 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
     counts = np.array([len(rates) for rates in seen])
     if not counts.any():
-        raise InputError(f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger faintest_v_mag")
+        raise InputError(
+            f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger faintest_v_mag"
+        )
     typical = float(np.median(counts[counts > 0]))
     average = fields[np.argmin(np.abs(counts - typical))]
-    brightest = np.array([rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in seen])
+    brightest = np.array(
+        [rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in seen]
+    )
     faint, dense = fields[np.argmin(brightest)], fields[np.argmax(counts)]
     return (
         ChainScene("average field", "what most frames are", average),
@@ -172,7 +190,9 @@ class PanelExposure:
     def at_rest(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
         """The same where all frames are alike: by the first of them."""
         whole = self.weights.sum(axis=0, keepdims=True)
-        return replace(self, numbers=self.numbers[:1], light_ns=self.light_ns[:1], weights=whole).mean(light_of, size_px)
+        return replace(
+            self, numbers=self.numbers[:1], light_ns=self.light_ns[:1], weights=whole
+        ).mean(light_of, size_px)
 
 
 def exposure_s(bench: Bench) -> float:
@@ -197,13 +217,19 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     )
     begin_s = first_frame * period_s + START_S % period_s
     before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
-    numbers = np.arange(first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1)
+    numbers = np.arange(
+        first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1
+    )
     # How long after the middle row each row lights, (H, 1); each column of a panel that is turned,
     # (1, W).
     turned = bool(scan.down[0])
     along = np.arange(size[0] if turned else size[1], dtype=np.float64)
     middle = np.full(len(along), (size[1 if turned else 0] - 1) / 2)
-    late_s = scan.late_s(along, middle, size)[None, :] if turned else scan.late_s(middle, along, size)[:, None]
+    late_s = (
+        scan.late_s(along, middle, size)[None, :]
+        if turned
+        else scan.late_s(middle, along, size)[:, None]
+    )
     lit_s = numbers[:, None, None] * period_s + late_s
     # Weights add up to 1 over a whole number of refreshes: a panel that flashes gives a refresh's
     # light at once.
@@ -214,7 +240,9 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
         weights = ((lit_s >= begin_s) & (lit_s < begin_s + length_s)) * (period_s / length_s)
     used = weights.any(axis=(1, 2))
     kept = tuple(numbers[used].tolist())
-    return PanelExposure(begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used])
+    return PanelExposure(
+        begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used]
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,14 +264,18 @@ class Parts(Closing):
 
     def __init__(self, file: BenchFile) -> None:
         if not file.config.tracker.exposure_s:
-            raise InputError(f"{file.path}: [tracker] exposure_s = 0 gathers no light; write a longer one")
+            raise InputError(
+                f"{file.path}: [tracker] exposure_s = 0 gathers no light; write a longer one"
+            )
         sky = msgspec.structs.replace(file.config.sky, bodies=SkySettings().bodies)
         config = msgspec.structs.replace(file.config, sky=sky, spacecraft=SpacecraftSettings())
         self._file = replace(file, config=config)
         self._benches: dict[tuple[tuple[str, Any], ...], Bench] = {}
         stars = bench_stars(config, file.folder)
         if not len(stars):
-            raise InputError(f"{file.path}: [sky] faintest_v_mag leaves no star; write a larger one")
+            raise InputError(
+                f"{file.path}: [sky] faintest_v_mag leaves no star; write a larger one"
+            )
         self.faintest_v_mag = min(sky.faintest_v_mag, float(stars.v_mag.max().round(2)))
         self._stars = stars
         self._shallow: dict[tuple[float, float], Bench] = {}
@@ -260,21 +292,33 @@ class Parts(Closing):
             "motion_above_px": 0.0,
         }
         if combination.sprite == "coarse":
-            keys |= {"tolerance_mag": COARSER * render.tolerance_mag, "tolerance_px": COARSER * render.tolerance_px}
+            keys |= {
+                "tolerance_mag": COARSER * render.tolerance_mag,
+                "tolerance_px": COARSER * render.tolerance_px,
+            }
         bench = self._with(keys)
         if combination.faintest_v_mag >= self.faintest_v_mag:
             return bench
         key = id(bench), combination.faintest_v_mag
         if key not in self._shallow:
-            sky = msgspec.structs.replace(self._file.config.sky, faintest_v_mag=combination.faintest_v_mag)
-            stars = bench_stars(msgspec.structs.replace(self._file.config, sky=sky), self._file.folder)
-            self._shallow[key] = bench.with_stars(split_by_rate(stars, bench.faintest_shown_e_per_s)[0])
+            sky = msgspec.structs.replace(
+                self._file.config.sky, faintest_v_mag=combination.faintest_v_mag
+            )
+            stars = bench_stars(
+                msgspec.structs.replace(self._file.config, sky=sky), self._file.folder
+            )
+            self._shallow[key] = bench.with_stars(
+                split_by_rate(stars, bench.faintest_shown_e_per_s)[0]
+            )
         return self._shallow[key]
 
     def marks(self, movement: Movement) -> Marks:
         """What the marked combinations choose for a scene."""
         defaults = RenderSettings()
-        plain = {name: getattr(defaults, name) for name in ("effort", "quantisation", "bit_stealing", "motion_above_px")}
+        plain = {
+            name: getattr(defaults, name)
+            for name in ("effort", "quantisation", "bit_stealing", "motion_above_px")
+        }
         ahead = self._file.config.attitude.max_extrapolation_ms > 0
         return Marks(
             self._chosen(self._with(plain), movement, True),
@@ -284,14 +328,23 @@ class Parts(Closing):
 
     def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> Combination:
         render = bench.config.render
-        motion_px = abs(movement.rate_deg_s) * bench.scan.longest_s * bench.camera.scales_px_rad()[1] / DEG_PER_RAD
+        motion_px = (
+            abs(movement.rate_deg_s)
+            * bench.scan.longest_s
+            * bench.camera.scales_px_rad()[1]
+            / DEG_PER_RAD
+        )
         prediction: Prediction = "rate" if ahead or not movement.turns else "held"
-        drawn = motion_px > render.motion_above_px and render.motion != "off" and prediction != "held"
+        drawn = (
+            motion_px > render.motion_above_px and render.motion != "off" and prediction != "held"
+        )
         smear: Smear = "path" if drawn or not movement.turns else "point"
         if render.quantisation == "auto":
             raise AssertionError("the effort's plan has chosen")
         sprite: Sprite = "cut" if render.effort == "auto" else "full"
-        return Combination(render.quantisation, render.bit_stealing, self.faintest_v_mag, sprite, smear, prediction)
+        return Combination(
+            render.quantisation, render.bit_stealing, self.faintest_v_mag, sprite, smear, prediction
+        )
 
     def _with(self, keys: dict[str, Any]) -> Bench:
         """The bench with other keys of [render]."""

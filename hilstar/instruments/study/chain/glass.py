@@ -75,12 +75,18 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
     glass, or too few stars.
     """
     tracker = file.config.tracker
-    whole = None if tracker.optics.psf == GAUSSIAN else tracker_psf(replace(tracker, effort="full"), file.folder)
+    whole = (
+        None
+        if tracker.optics.psf == GAUSSIAN
+        else tracker_psf(replace(tracker, effort="full"), file.folder)
+    )
     if not isinstance(whole, GlassPsf):
         return []
     found = dict(_drawable(whole))
     with ExitStack() as stack:
-        simulators = {name: stack.enter_context(Simulator(file, psf=psf)) for name, psf in found.items()}
+        simulators = {
+            name: stack.enter_context(Simulator(file, psf=psf)) for name, psf in found.items()
+        }
         errors = _errors(next(iter(simulators.values())), whole, found, scene)
         if not errors:
             return []
@@ -91,8 +97,12 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         }
         taken = in_turn(works, MAX_ROUNDS, (QUICK_TIME_S if quick else TIME_S) / len(works))
     times: dict[str, Times] = {name: times_of(np.array(one)) for name, one in taken.items()}
-    fronts = pareto_front([errors[name][1] for name in found], [times[name].time_ms for name in found])
-    auto = least_tracker_psf(whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))[1].choice
+    fronts = pareto_front(
+        [errors[name][1] for name in found], [times[name].time_ms for name in found]
+    )
+    auto = least_tracker_psf(
+        whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
+    )[1].choice
     return [
         GlassRow(
             scene.name,
@@ -129,15 +139,23 @@ def _errors(
     lit = light.sum(axis=(1, 2)) > 0  # a corner may be dark
     if lit.sum() < MIN_STARS:
         return {}
-    kind, arcsec_per_px = tracker.config.verify.judge or "window", ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1]
+    kind, arcsec_per_px = (
+        tracker.config.verify.judge or "window",
+        ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1],
+    )
 
     def measured(stamps: FloatArray) -> FloatArray:
-        return np.stack([*star_places(stamps[lit], kind, whole.width_px), stamps[lit].sum(axis=(1, 2))])
+        return np.stack(
+            [*star_places(stamps[lit], kind, whole.width_px), stamps[lit].sum(axis=(1, 2))]
+        )
 
     def off(psf: Psf) -> tuple[int, float, float, float]:
         told = told_psf(psf, (row, column), 2 * reach + 1, shares)
         x, y, flux = measured(told(rows["x_px"] - column, rows["y_px"] - row))
-        place, percent = np.hypot(x - true[0], y - true[1]) * arcsec_per_px, 100 * (flux / true[2] - 1)
+        place, percent = (
+            np.hypot(x - true[0], y - true[1]) * arcsec_per_px,
+            100 * (flux / true[2] - 1),
+        )
         rms = [rounded(float(np.sqrt(np.mean(one**2)))) for one in (place, percent)]
         return len(place), rms[0], rms[1], rounded(float(np.abs(percent).max()))
 
@@ -147,7 +165,9 @@ def _errors(
 
 def glass_line(rows: list[GlassRow]) -> str:
     """What the PSFs cost, for a person."""
-    return f"PSF of the tracker's glass, {rows[0].scene}, {rows[0].stars} stars: " + "; ".join(row.words() for row in rows)
+    return f"PSF of the tracker's glass, {rows[0].scene}, {rows[0].stars} stars: " + "; ".join(
+        row.words() for row in rows
+    )
 
 
 def draw_glass(place: "Axes", light: "Axes", rows: list[GlassRow]) -> None:
@@ -166,11 +186,21 @@ def draw_glass(place: "Axes", light: "Axes", rows: list[GlassRow]) -> None:
                 RED if row.chosen else BLUE if row.on_front == "true" else INK,
             )
             axes.plot(
-                [max(at[0] - row.noise_ms, at[0] / 2), at[0] + row.noise_ms], [at[1]] * 2, color=colour, lw=1.0, alpha=0.4
+                [max(at[0] - row.noise_ms, at[0] / 2), at[0] + row.noise_ms],
+                [at[1]] * 2,
+                color=colour,
+                lw=1.0,
+                alpha=0.4,
             )
             axes.plot(*at, "o", color=colour, ms=6 if row.on_front == "true" else 4)
             words = row.psf + (f" ({row.chosen})" if row.chosen else "")
-            named.append((f"{words}: {two_digits(getattr(row, error))}, {two_digits(row.time_ms)} ms", at, colour))
+            named.append(
+                (
+                    f"{words}: {two_digits(getattr(row, error))}, {two_digits(row.time_ms)} ms",
+                    at,
+                    colour,
+                )
+            )
         axes.margins(0.06, 0.12)
         name_at_side(axes, named)
     light.set_xlabel("median time of a frame of the virtual tracker [ms]")

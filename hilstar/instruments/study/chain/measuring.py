@@ -20,7 +20,15 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate
 from hilstar.basics.units import ERROR_OF_MEDIAN, NS_PER_S
 from hilstar.instruments.study.chain import choices
-from hilstar.instruments.study.chain.tracker import Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off, points
+from hilstar.instruments.study.chain.tracker import (
+    Off,
+    StarJudge,
+    StudyTracker,
+    attitude_off_arcsec,
+    linear_light,
+    off,
+    points,
+)
 from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Spent, spent
 from hilstar.optics.frame_motion import CameraTurn, swept_sprites
@@ -58,7 +66,9 @@ class DrawingChain:
     def timeline(self, movement: Movement, light_ns: int) -> Timeline:
         """The samples received when the frame is started whose light is at `light_ns`."""
         samples = movement.samples(light_ns - choices.lead_ns(self.bench.config))
-        return choices.filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
+        return choices.filled_timeline(
+            samples, self.combination.prediction, self.bench.config.attitude
+        )
 
     def attitude(self, light_ns: int) -> Attitude:
         """The attitude at a frame's light, predicted from the samples received when the frame is
@@ -89,7 +99,9 @@ class DrawingChain:
 
     def sprite_px(self) -> str:
         """The sides of its sprites, px."""
-        sides = [side.side_px for side in self.bench.renderer.target.sides] or [self.bench.psf.footprint_px]
+        sides = [side.side_px for side in self.bench.renderer.target.sides] or [
+            self.bench.psf.footprint_px
+        ]
         low, high = min(sides), max(sides)
         return f"{low}" if low == high else f"{low} to {high}"
 
@@ -99,7 +111,9 @@ class DrawingChain:
 
         def draw() -> object:
             attitude = attitude_at(timeline, light_ns)
-            return self.bench.draw(attitude.q_icrs_to_cam, self.timed_frames, self.rate(attitude)).levels
+            return self.bench.draw(
+                attitude.q_icrs_to_cam, self.timed_frames, self.rate(attitude)
+            ).levels
 
         return spent(draw)
 
@@ -121,7 +135,9 @@ class DrawingChain:
     def _next(self) -> tuple[Timeline, int]:
         """The timeline of the next frame and its moment of light."""
         self.timed_frames += 1
-        light_ns = NS_PER_S + self.timed_frames * round(NS_PER_S / self.bench.config.monitor.refresh_hz)
+        light_ns = NS_PER_S + self.timed_frames * round(
+            NS_PER_S / self.bench.config.monitor.refresh_hz
+        )
         own = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
         return self.timeline(replace(self.movement, q_icrs_to_cam=own), light_ns), light_ns
 
@@ -241,18 +257,28 @@ def said(flag: bool) -> str:
 class SceneMeasurement:
     """A scene on a study's benches: its judges, one an exposure, and its combinations."""
 
-    def __init__(self, parts: choices.Parts, tracker: StudyTracker, scene: choices.ChainScene, plan: Rounds) -> None:
+    def __init__(
+        self, parts: choices.Parts, tracker: StudyTracker, scene: choices.ChainScene, plan: Rounds
+    ) -> None:
         self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
         self.movement = Movement(scene.q_icrs_to_cam, scene.rate_deg_s)
         self.marks: choices.Marks = parts.marks(self.movement)
-        found = choices.combinations(self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag)
+        found = choices.combinations(
+            self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag
+        )
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
         self.combinations = list(dict.fromkeys([*found, *marked]))
         # At rest each exposure has its stars at other sub-pixel phases.
-        step_rad = np.zeros(3) if self.movement.turns else np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
+        step_rad = (
+            np.zeros(3)
+            if self.movement.turns
+            else np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
+        )
         self.judges = []
         for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
-            moved = replace(self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k))
+            moved = replace(
+                self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k)
+            )
             self.judges.append(StarJudge(tracker, moved, choices.exposure(parts.own, number)))
 
     @property
@@ -262,7 +288,9 @@ class SceneMeasurement:
 
     def chain(self, combination: choices.Combination, exposure_number: int = 0) -> DrawingChain:
         """A combination with the movement of one exposure."""
-        return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
+        return DrawingChain(
+            combination, self.parts.bench(combination), self.judges[exposure_number].movement
+        )
 
     def outcomes(self) -> tuple[list[CombinationRow], list[StageTime]]:
         """Every combination's error and time, and the times of the stages of `auto`."""
@@ -270,7 +298,8 @@ class SceneMeasurement:
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
         rows = [self.row(chain, taken) for chain, taken in zip(chains, times, strict=True)]
         return rows, [
-            StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
+            StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES))
+            for stage, ms in zip(STAGES, stages, strict=True)
         ]
 
     def untimed(self) -> list[CombinationRow]:
@@ -318,11 +347,15 @@ def rms_of_known(values: Sequence[float]) -> float:
 
 def pooled(found: Sequence[Off]) -> tuple[float, float]:
     """The rms over the stars of several exposures, arcsec and mag."""
-    arcsec, mag = (np.concatenate([getattr(one, name) for one in found]) for name in ("arcsec", "mag"))
+    arcsec, mag = (
+        np.concatenate([getattr(one, name) for one in found]) for name in ("arcsec", "mag")
+    )
     return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
 
 
-def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[float]]:
+def timed(
+    chains: Sequence[DrawingChain], time_s: float, staged: int
+) -> tuple[list[Times], list[float]]:
     """The times of all chains, and the median times of STAGES, ms, of one of them.
 
     In rounds, each with an order of its own, so that other load on the machine affects all. A
@@ -364,20 +397,37 @@ def rounded(value: float) -> float:
 def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
     """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
     found = [
-        [judge.sky, *(judge.measure(scene.tracker.image_e(light, judge.seen)) for light in _lights(scene, combination, number))]
+        [
+            judge.sky,
+            *(
+                judge.measure(scene.tracker.image_e(light, judge.seen))
+                for light in _lights(scene, combination, number)
+            ),
+        ]
         for number, judge in enumerate(scene.judges)
     ]
 
     def between(before: int, after: int) -> tuple[float, float]:
-        return pooled([off(judge, one[after], one[before]) for judge, one in zip(scene.judges, found, strict=True)])
+        return pooled(
+            [
+                off(judge, one[after], one[before])
+                for judge, one in zip(scene.judges, found, strict=True)
+            ]
+        )
 
     parts = [between(k, k + 1) for k in range(len(STEPS))]
-    arcsec, mag = (float(np.sqrt(sum(value**2 for value in column))) for column in zip(*parts, strict=True))
+    arcsec, mag = (
+        float(np.sqrt(sum(value**2 for value in column))) for column in zip(*parts, strict=True)
+    )
     named = zip((*STEPS, RSS, WHOLE), (*parts, (arcsec, mag), between(0, -1)), strict=True)
-    return [ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named]
+    return [
+        ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named
+    ]
 
 
-def _lights(scene: SceneMeasurement, combination: choices.Combination, number: int) -> Iterator[FloatArray]:
+def _lights(
+    scene: SceneMeasurement, combination: choices.Combination, number: int
+) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
     chain, seen = scene.chain(combination, number), scene.judges[number].seen
     movement, bench, every = chain.movement, chain.bench, scene.parts.own.stars
@@ -387,11 +437,15 @@ def _lights(scene: SceneMeasurement, combination: choices.Combination, number: i
 
     def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> choices.Lit:
         if along_paths:
-            return linear_light(bench, swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf))
+            return linear_light(
+                bench, swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf)
+            )
         return linear_light(bench, points(bench, turn.q_icrs_to_cam, stars))
 
     def true(_: int, light_ns: int) -> choices.Lit:
-        return whole(every, CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns)), movement.turns)
+        return whole(
+            every, CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns)), movement.turns
+        )
 
     def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
         def light_of(_: int, light_ns: int) -> choices.Lit:

@@ -17,7 +17,13 @@ from hilstar.basics import charts
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
 from hilstar.instruments.study.chain.answers import answer_lines
-from hilstar.instruments.study.chain.choices import DENSE, QUANTISATIONS, Parts, five_scenes, shortened_line
+from hilstar.instruments.study.chain.choices import (
+    DENSE,
+    QUANTISATIONS,
+    Parts,
+    five_scenes,
+    shortened_line,
+)
 from hilstar.instruments.study.chain.glass import GlassRow, draw_glass, glass_line, glass_rows
 from hilstar.instruments.study.chain.measuring import (
     AUTO,
@@ -40,12 +46,19 @@ from hilstar.server.bench.bench_file import BenchFile
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (charts.PURPLE, charts.ORANGE, charts.GREEN, charts.BLUE), strict=True))
+COLOURS: dict[str, str] = dict(
+    zip(QUANTISATIONS, (charts.PURPLE, charts.ORANGE, charts.GREEN, charts.BLUE), strict=True)
+)
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
 FLOOR_SHARE = 1e-3  # share of the smallest error at which 0 is drawn on a logarithmic axis
 LESS = 0.9  # a point on the front is named if its error is below this share of the last named one's
 ALIKE = 1.5  # scenes of one rate are drawn once where auto's error differs by less than this factor
-WORDS = {"refresh": "panel's refresh", "codes": "quantisation", "sprites": "cut sprites", WHOLE: "all of it"}
+WORDS = {
+    "refresh": "panel's refresh",
+    "codes": "quantisation",
+    "sprites": "cut sprites",
+    WHOLE: "all of it",
+}
 CHOSEN = {DEFAULT: charts.INK, AUTO: charts.RED}
 OUTPUTS = (
     *(f"{name}{ending}" for name in ("chain", "chain_budget") for ending in (".png", ".svg")),
@@ -76,7 +89,12 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
     filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
     as_filed = dict(zip(filed, front([rows[k] for k in filed], "error_arcsec"), strict=True))
     return [
-        replace(row, on_front=said(a), on_front_mag=said(m), on_front_as_filed=said(as_filed.get(k, False)))
+        replace(
+            row,
+            on_front=said(a),
+            on_front_mag=said(m),
+            on_front_as_filed=said(as_filed.get(k, False)),
+        )
         for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
     ]
 
@@ -88,7 +106,10 @@ def without_fronts(row: CombinationRow) -> CombinationRow:
 
 def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
     """Whether each row is on the front of its time and `error`, the name of one of its columns."""
-    return [bool(on) for on in pareto_front([getattr(row, error) for row in rows], [row.time_ms for row in rows])]
+    return [
+        bool(on)
+        for on in pareto_front([getattr(row, error) for row in rows], [row.time_ms for row in rows])
+    ]
 
 
 def auto_of(rows: Sequence[CombinationRow]) -> int:
@@ -102,7 +123,9 @@ def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
     return all(getattr(row, name) == getattr(own, name) for name in given)
 
 
-def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[list[CombinationRow], list[CombinationRow]]:
+def beating(
+    rows: Sequence[CombinationRow], as_filed: bool = False
+) -> tuple[list[CombinationRow], list[CombinationRow]]:
     """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that
     effort may choose.
 
@@ -111,7 +134,9 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
     """
     own = rows[auto_of(rows)]
     kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
-    beats = beaten_by([row.error_arcsec for row in kept], [row.time_ms for row in kept])[kept.index(own)]
+    beats = beaten_by([row.error_arcsec for row in kept], [row.time_ms for row in kept])[
+        kept.index(own)
+    ]
     beyond: list[CombinationRow] = []
     within: list[CombinationRow] = []
     for row in (row for row, does in zip(kept, beats, strict=True) if does):
@@ -120,13 +145,21 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
     return beyond, within
 
 
-def scene_line(rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load) -> str:
+def scene_line(
+    rows: Sequence[CombinationRow],
+    budget: Sequence[ErrorPart],
+    stages: Sequence[StageTime],
+    load: Load,
+) -> str:
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and
     the largest part of each.
     """
     own, stands = rows[auto_of(rows)], NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
-    largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
+    largest, longest = (
+        max(steps, key=lambda part: part.error_arcsec),
+        max(stages, key=lambda one: one.time_ms),
+    )
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
     return (
         f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and {own.error_mag:.2g} mag off over"
@@ -137,7 +170,10 @@ def scene_line(rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stag
 
 def headline(rows: Sequence[CombinationRow], load: Load) -> str:
     """What the whole table says of `auto`; nothing on a busy machine."""
-    scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
+    scenes = [
+        [row for row in rows if row.scene == name]
+        for name in dict.fromkeys(row.scene for row in rows)
+    ]
     beaten = [own[0].scene for own in scenes if beating(own)[0]]
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
     said = f", not in {', '.join(beaten)}" if beaten else ""
@@ -153,7 +189,11 @@ def standing(rows: Sequence[CombinationRow]) -> str:
     beyond, within = beating(rows)
     own = rows[auto_of(rows)]
     if not beyond:
-        return f"on the front within the noise: {_compared(own, _nearest(within))}" if within else "on the front"
+        return (
+            f"on the front within the noise: {_compared(own, _nearest(within))}"
+            if within
+            else "on the front"
+        )
     best = _nearest(beyond)
     said = f"not on the front: {_compared(own, best)}: {why_not(own, best)}"
     if best in (own_beyond := beating(rows, as_filed=True)[0]):
@@ -181,17 +221,23 @@ def why_not(own: CombinationRow, other: CombinationRow) -> str:
     if other.prediction != own.prediction and own.prediction == "held":
         reasons.append("[attitude] max_extrapolation_ms = 0 is the bench file's choice")
     elif other.prediction != own.prediction:
-        reasons.append(f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)")
+        reasons.append(
+            f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)"
+        )
     if other.faintest_v_mag != own.faintest_v_mag:
         reasons.append("the catalogue's depth is the bench file's choice")
     if other.quantisation == "temporal":
-        reasons.append("temporal is right over an exposure, and effort asks for light that is right in each frame")
+        reasons.append(
+            "temporal is right over an exposure, and effort asks for light that is right in each frame"
+        )
     elif other.quantisation != own.quantisation:
         compared = f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase"
         reasons.append(f"{compared}, not by a field's rms")
     if other.sprite != own.sprite:
         coarse = other.sprite == "coarse"
-        reasons.append("coarse sprites are beyond the tolerance" if coarse else "cut sprites save nothing here")
+        reasons.append(
+            "coarse sprites are beyond the tolerance" if coarse else "cut sprites save nothing here"
+        )
     if other.smear != own.smear:
         reasons.append(f"{other.smear}s instead of {own.smear}s")
     return "; ".join(reasons)
@@ -222,7 +268,9 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
     return kept
 
 
-def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
+def draw(
+    path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]
+) -> None:
     """Error against time, a panel for each scene that differs, two for a glass. Raises
     InputError where it cannot write.
     """
@@ -231,10 +279,15 @@ def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str,
     if any(row.on_front == "true" for row in rows):
         note = f"The line is the front: nothing else is as right and as fast. {note}"
     count = len(scenes) + (2 if glass else 0)
-    with charts.chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
+    with charts.chart(
+        path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count
+    ) as grid:
         for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
             own = [row for row in rows if row.scene == scene]
-            axes.set_title(f"{scene}, {own[0].stars} stars" + (f" (the same in: {', '.join(alike)})" if alike else ""))
+            axes.set_title(
+                f"{scene}, {own[0].stars} stars"
+                + (f" (the same in: {', '.join(alike)})" if alike else "")
+            )
             axes.set(xscale="log", yscale="log", ylabel="star's place, rms [arcsec]")
             _scatter(axes, own)
         grid[len(scenes) - 1].set_xlabel("median time of a frame [ms]")
@@ -243,7 +296,9 @@ def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str,
 
 
 def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
-    floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
+    floor = FLOOR_SHARE * min(
+        (row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0
+    )
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
     if front:
@@ -253,11 +308,26 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
         colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
         early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
         axes.plot([early, late], [place[1]] * 2, color=colour, lw=1.0, alpha=0.4)
-        axes.plot(*place, "o", color=colour, ms=6 if on_front else 4, alpha=1 if on_front else 0.35, zorder=3)
+        axes.plot(
+            *place,
+            "o",
+            color=colour,
+            ms=6 if on_front else 4,
+            alpha=1 if on_front else 0.35,
+            zorder=3,
+        )
     axes.margins(0.06, 0.12)
     for row, place in zip(rows, at, strict=True):
         for name in row.chosen.split():
-            axes.plot(*place, "o", color=CHOSEN[name], ms=13 if name == AUTO else 17, mfc="none", mew=1.6, zorder=4)
+            axes.plot(
+                *place,
+                "o",
+                color=CHOSEN[name],
+                ms=13 if name == AUTO else 17,
+                mfc="none",
+                mew=1.6,
+                zorder=4,
+            )
     charts.name_at_side(axes, side_names(rows, at))
 
 
@@ -278,7 +348,9 @@ def side_names(
             label = f"{row.chosen.replace(' ', ', ')}: {arcsec} arcsec, {ms} ms"
             named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
     for quantisation, colour in COLOURS.items():
-        points = [point for point in zip(rows, at, strict=True) if point[0].quantisation == quantisation]
+        points = [
+            point for point in zip(rows, at, strict=True) if point[0].quantisation == quantisation
+        ]
         # The best of codes that have no place on the front.
         if points and all(colour != other for *_, other in named):
             row, place = min(points, key=lambda point: point[1][1])
@@ -291,12 +363,18 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     differs from `own`.
     """
     shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
-    moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
+    moving = (
+        f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
+    )
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
 def draw_budget(
-    path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load
+    path: Path,
+    rows: Sequence[CombinationRow],
+    budget: Sequence[ErrorPart],
+    stages: Sequence[StageTime],
+    load: Load,
 ) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs.
     Raises InputError.
@@ -304,7 +382,11 @@ def draw_budget(
     scenes = differing(rows)
     last = list(scenes)[-1]
     steps = [part.step for part in budget if part.scene == next(iter(scenes)) and part.step != RSS]
-    shown = [step for step in steps if any(p.error_arcsec or p.error_mag for p in budget if p.step == step)]
+    shown = [
+        step
+        for step in steps
+        if any(p.error_arcsec or p.error_mag for p in budget if p.step == step)
+    ]
     none = [WORDS.get(step, step) for step in steps if step not in shown]
     note = "Each step is charged with what it changes when it is added to an exact display" + (
         f"; {' and '.join(none)} change nothing here." if none else "."
@@ -312,29 +394,43 @@ def draw_budget(
     most = []
     for scene in scenes:
         parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
-        largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
-        most.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
+        largest = max(
+            parts,
+            key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf,
+        )
+        most.append(
+            f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}"
+        )
     longest = max(stages, key=lambda one: one.time_ms)
     errors = f"Of auto's error most is {', '.join(most)}"
     finding = load.title(f"{errors}; of its time most is {longest.stage}", errors)
     height = TITLE_INCH + BARS_INCH * len(scenes)
-    with charts.chart(path, finding, len(scenes), 3, note=load.note(note), share_x=False, height_inch=height) as grid:
+    with charts.chart(
+        path, finding, len(scenes), 3, note=load.note(note), share_x=False, height_inch=height
+    ) as grid:
         for k, scene in enumerate(scenes):
             by_step = {part.step: part for part in budget if part.scene == scene}
             place, light, times = grid[3 * k : 3 * k + 3]
             place.set_title(scene)
-            for axes, error, unit in ((place, "error_arcsec", "arcsec"), (light, "error_mag", "mag")):
+            for axes, error, unit in (
+                (place, "error_arcsec", "arcsec"),
+                (light, "error_mag", "mag"),
+            ):
                 values = [getattr(by_step[step], error) for step in shown]
                 colours = [charts.RED if step == WHOLE else charts.BLUE for step in shown]
                 charts.value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
                 axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
             light.set_yticklabels([])
             mine = [one for one in stages if one.scene == scene]
-            charts.value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], charts.PURPLE)
+            charts.value_bars(
+                times, [one.stage for one in mine], [one.time_ms for one in mine], charts.PURPLE
+            )
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> ChainStudy:
+def run(
+    file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]
+) -> ChainStudy:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
     `advance` hears how many scenes are done. Raises InputError, MachineError.
@@ -348,27 +444,49 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
         for number, scene in enumerate(scenes):
             measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
             if not measurement.star_count:
-                lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
+                lines.append(
+                    f"{scene.name}: not measured: no star stands alone and stays in view over the exposure"
+                )
                 continue
             outcomes, parts_of_time = measurement.outcomes()
-            own, parts_of_error = rows_of(outcomes), error_budget(measurement, measurement.marks.auto)
+            own, parts_of_error = (
+                rows_of(outcomes),
+                error_budget(measurement, measurement.marks.auto),
+            )
             judged.append((own, parts_of_error, parts_of_time))
             rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
             advance(number + 1)
         machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
         shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
     if not rows:
-        raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
+        raise InputError(
+            f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag"
+        )
     load = others.load()
     if load.busy:
         rows = [without_fronts(row) for row in rows]
-    lines = [*(scene_line(*scene, load) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
+    lines = [
+        *(scene_line(*scene, load) for scene in judged),
+        *lines,
+        *([glass_line(glass)] if glass else []),
+    ]
     make_directory(directory)
-    for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):
+    for name, records in (
+        ("chain", rows),
+        ("chain_budget", budget),
+        ("chain_time", stages),
+        ("chain_psf", glass),
+    ):
         if records:
             charts.write_records(directory / f"{name}.csv", records)
-    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([load.caution] if load.busy else [])]
+    notes = [
+        f"times on {machine}",
+        *([] if shortened is None else [shortened]),
+        *([load.caution] if load.busy else []),
+    ]
     draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages, load)
     right = not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
-    return ChainStudy([*lines, *notes], None if load.busy else right, answer_lines(rows, budget, load))
+    return ChainStudy(
+        [*lines, *notes], None if load.busy else right, answer_lines(rows, budget, load)
+    )

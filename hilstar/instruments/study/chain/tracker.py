@@ -17,7 +17,14 @@ from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, mag
 from hilstar.display.render.reference import add_stars
 from hilstar.instruments.assess.bench_effects import turn_between
 from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
-from hilstar.instruments.simulate.star_finder import MATCH_PX, StarFinder, crowded, seen_psf, shared, star_finder
+from hilstar.instruments.simulate.star_finder import (
+    MATCH_PX,
+    StarFinder,
+    crowded,
+    seen_psf,
+    shared,
+    star_finder,
+)
 from hilstar.instruments.study.chain.choices import Lit, PanelExposure, lead_ns
 from hilstar.instruments.study.predictors import Movement
 from hilstar.optics.camera import Camera
@@ -42,7 +49,9 @@ OTHERS_SHARE = 1e-3
 def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
     """Stars, by default all of the bench's, as whole sprites at an attitude."""
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    return make_sprites(bench.stars if stars is None else stars, icrs_to_image, bench.camera, bench.psf.footprint_px)
+    return make_sprites(
+        bench.stars if stars is None else stars, icrs_to_image, bench.camera, bench.psf.footprint_px
+    )
 
 
 def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArray:
@@ -53,8 +62,13 @@ def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArr
     if movement.turns:
         path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
         sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
-        nodes, weights = np.polynomial.legendre.leggauss(max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3))
-        times_s, shares = (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist(), (weights / 2).tolist()
+        nodes, weights = np.polynomial.legendre.leggauss(
+            max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3)
+        )
+        times_s, shares = (
+            (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist(),
+            (weights / 2).tolist(),
+        )
     total = np.zeros(bench.camera.resolution_px[::-1])
     for t_s, share in zip(times_s, shares, strict=True):
         sprites = points(bench, movement.at(round(t_s * NS_PER_S)))
@@ -158,7 +172,9 @@ class StarJudge:
             self._choose_paths(sky_e, *places_px)
         else:
             index = tracker.finder.match(sky_e, self._x_px, self._y_px).index
-            alone = ~shared(index) & ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.psf)
+            alone = ~shared(index) & ~crowded(
+                self._x_px, self._y_px, self._e, radius_px, tracker.psf
+            )
             self.judged = np.flatnonzero(self._wanted & (index >= 0) & alone)
         self.sky = self.measure(sky_e)
 
@@ -175,8 +191,13 @@ class StarJudge:
         if not found.any():
             return MeasuredStars(np.full((len(index), 3), np.nan), np.zeros(len(index)))
         index = np.where(found, index, 0)
-        directions = normalise(self.tracker.camera.rays(match.found.x_px[index], match.found.y_px[index]))
-        return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, match.found.flux[index], 0.0))
+        directions = normalise(
+            self.tracker.camera.rays(match.found.x_px[index], match.found.y_px[index])
+        )
+        return MeasuredStars(
+            np.where(found[:, None], directions, np.nan),
+            np.where(found, match.found.flux[index], 0.0),
+        )
 
     def _whole(self, star: IntArray) -> BoolArray:
         """Stars bright enough for the panel's `exact` that clip at no sub-pixel phase."""
@@ -211,7 +232,10 @@ class StarJudge:
         tracker, seen = self.tracker, self.seen
         count = max(5, math.ceil(self._path_px / PATH_STEP_PX))
         at_s = np.linspace(-self._late_s, seen.length_s + self._late_s, count) + seen.begin_s
-        turns = [tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S))) for t in at_s]
+        turns = [
+            tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S)))
+            for t in at_s
+        ]
         vectors = tracker.bench.stars.directions(self._star)
         places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
         return np.stack([x for x, _ in places]), np.stack([y for _, y in places])
@@ -221,18 +245,30 @@ class StarJudge:
             return MeasuredStars(np.zeros((0, 3)), np.zeros(0))
         width, light = image_e.shape[1], image_e.ravel()[self._pixels]
         row, column = np.divmod(self._pixels, width)
-        total, by_x, by_y = (np.add.reduceat(part, self._begins) for part in (light, light * column, light * row))
+        total, by_x, by_y = (
+            np.add.reduceat(part, self._begins) for part in (light, light * column, light * row)
+        )
         found = total > LOST_SHARE * self._e[self.judged]
         divisor = np.where(found, total, 1.0)
         directions = normalise(self.tracker.camera.rays(by_x / divisor, by_y / divisor))
-        return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0))
+        return MeasuredStars(
+            np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0)
+        )
 
     def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
         """Places on the tracker whose neighbourhood is whole on the detector and on the monitor."""
         tracker = self.tracker
         width, height = tracker.camera.resolution_px
-        inside = (x_px >= margin_px) & (x_px < width - 1 - margin_px) & (y_px >= margin_px) & (y_px < height - 1 - margin_px)
-        seen_x, seen_y = (part.reshape(x_px.shape) for part in tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel()))
+        inside = (
+            (x_px >= margin_px)
+            & (x_px < width - 1 - margin_px)
+            & (y_px >= margin_px)
+            & (y_px < height - 1 - margin_px)
+        )
+        seen_x, seen_y = (
+            part.reshape(x_px.shape)
+            for part in tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel())
+        )
         reach = tracker.bench.psf.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
         width, height = tracker.bench.camera.resolution_px
         inside &= (seen_x >= reach) & (seen_x < width - 1 - reach)
@@ -247,7 +283,9 @@ def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
     """
     lost = shown.lost | wanted.lost
     chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
-    arcsec = np.where(lost, judge.lost_arcsec, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD)
+    arcsec = np.where(
+        lost, judge.lost_arcsec, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD
+    )
     mag = magnitude(np.where(lost, 1.0, shown.light_e) / np.where(lost, 1.0, wanted.light_e))
     return Off(arcsec, np.where(lost, LOST_MAG, mag), lost)
 
@@ -259,5 +297,7 @@ def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[fl
     found = ~(shown.lost | wanted.lost)
     if found.sum() < 2:
         return math.nan, math.nan
-    x, y, z = ARCSEC_PER_RAD * turn_between(wanted.directions[found], shown.directions[found], np.ones(found.sum()))
+    x, y, z = ARCSEC_PER_RAD * turn_between(
+        wanted.directions[found], shown.directions[found], np.ones(found.sum())
+    )
     return math.hypot(x, y), abs(float(z))

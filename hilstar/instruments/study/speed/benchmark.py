@@ -77,7 +77,11 @@ MAX_STARS = 200_000  # NumPy's method takes 2.9 kB of memory for each
 RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
 # What the project set itself on two cores, ms: whole frames by image and stars, Python at
 # REFERENCE_PX by stars; how many times a still frame one may take that turns by 10 deg/s.
-AIMS_MS = {(report.REFERENCE_PX, 1000): 3.5, (report.REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
+AIMS_MS = {
+    (report.REFERENCE_PX, 1000): 3.5,
+    (report.REFERENCE_PX, 10_000): 10.0,
+    ((3840, 2160), 50_000): 40.0,
+}
 PYTHON_AIMS_MS = {1000: 0.2, 10_000: 1.0}
 TURNING_TIMES = 2.0
 START_AIM_MS = 1500.0
@@ -91,7 +95,9 @@ class BenchmarkScene:
     catalogue_count: int
 
 
-def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> BenchmarkScene:
+def scene(
+    bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator
+) -> BenchmarkScene:
     """A scene with exactly `count` stars in view: the brightest of `every`, then random ones in and
     around the view.
 
@@ -99,7 +105,9 @@ def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng
     where `every` is empty.
     """
     if not len(every):
-        raise InputError("bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag")
+        raise InputError(
+            "bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag"
+        )
     seen = bench.sprites(q_icrs_to_cam, every).star
     ranked = seen[np.argsort(every.v_mag[seen], kind="stable")]
     if len(ranked) >= count:
@@ -109,7 +117,9 @@ def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng
     vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
     faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
     sources = np.concatenate([np.arange(len(every)), rng.choice(faint, len(vectors))])
-    return BenchmarkScene(_sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked))
+    return BenchmarkScene(
+        _sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked)
+    )
 
 
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
@@ -129,9 +139,13 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
         across = np.sqrt(1 - z**2)
         vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
         x_px, y_px = camera.project(vectors)
-        seen = pack_sprites(x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px).star
+        seen = pack_sprites(
+            x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px
+        ).star
         if len(seen) >= wanted:
-            return np.asarray(vectors[: seen[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q)))
+            return np.asarray(
+                vectors[: seen[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q))
+            )
         tries *= 2
 
 
@@ -164,8 +178,12 @@ def numpy_linear(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> F
     columns = sprites.data["pixel"][:, :1] + steps
     rows = sprites.data["pixel"][:, 1:] + steps
     share_y = _shares(rows, sprites.y_px, sigma_px[1]) * sprites.data["electrons_per_s"][:, None]
-    light = (share_y[:, :, None] * _shares(columns, sprites.x_px, sigma_px[0])[:, None, :]).astype(np.float32)
-    inside = ((rows >= 0) & (rows < shape[0]))[:, :, None] & ((columns >= 0) & (columns < shape[1]))[:, None, :]
+    light = (share_y[:, :, None] * _shares(columns, sprites.x_px, sigma_px[0])[:, None, :]).astype(
+        np.float32
+    )
+    inside = ((rows >= 0) & (rows < shape[0]))[:, :, None] & (
+        (columns >= 0) & (columns < shape[1])
+    )[:, None, :]
     place = rows[:, :, None] * shape[1] + columns[:, None, :]
     np.add.at(image.ravel(), place[inside], light[inside])
     return image
@@ -176,7 +194,9 @@ def _shares(pixels: IntArray, centre_px: FloatArray, sigma_px: float) -> FloatAr
     return np.asarray(0.5 * np.diff(erf((edges - centre_px[:, None]) / (sigma_px * SQRT2)), axis=1))
 
 
-def _add_stars(image: Any, first: Any, centre_px: Any, electrons_per_s: Any, scale: Any, size: int) -> None:
+def _add_stars(
+    image: Any, first: Any, centre_px: Any, electrons_per_s: Any, scale: Any, size: int
+) -> None:
     """The plain loop that numba compiles: `first` (n, 2) is each footprint's first pixel,
     `scale` is 1 / (sigma sqrt 2).
     """
@@ -203,7 +223,9 @@ def _make_numba() -> Draw:
         first = sprites.data["pixel"] - (sprites.footprint_px - 1) // 2
         centre_px = np.stack([sprites.x_px, sprites.y_px])
         light = np.ascontiguousarray(sprites.data["electrons_per_s"])
-        add_stars(image, first, centre_px, light, 1 / (np.array(sigma_px) * SQRT2), sprites.footprint_px)
+        add_stars(
+            image, first, centre_px, light, 1 / (np.array(sigma_px) * SQRT2), sprites.footprint_px
+        )
         return image
 
     return draw
@@ -218,10 +240,14 @@ def _make_galsim() -> Draw:
         last = sprites.footprint_px - 1
         first = (sprites.data["pixel"] - last // 2).tolist()
         light = sprites.data["electrons_per_s"].tolist()
-        for (column, row), x, y, electrons in zip(first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True):
+        for (column, row), x, y, electrons in zip(
+            first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True
+        ):
             bounds = galsim.BoundsI(column, column + last, row, row + last) & image.bounds
             star = profile.withFlux(electrons)
-            star.drawImage(image=image[bounds], scale=1.0, center=galsim.PositionD(x, y), add_to_image=True)
+            star.drawImage(
+                image=image[bounds], scale=1.0, center=galsim.PositionD(x, y), add_to_image=True
+            )
         return np.asarray(image.array)
 
     return draw
@@ -233,10 +259,19 @@ def _make_photutils() -> Draw:
     table = import_module("astropy.table").QTable
 
     def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
-        stars = table({"x_0": sprites.x_px, "y_0": sprites.y_px, "flux": sprites.data["electrons_per_s"].astype(float)})
+        stars = table(
+            {
+                "x_0": sprites.x_px,
+                "y_0": sprites.y_px,
+                "flux": sprites.data["electrons_per_s"].astype(float),
+            }
+        )
         fwhm = {"x_fwhm": sigma_px[0] * FWHM_PER_SIGMA, "y_fwhm": sigma_px[1] * FWHM_PER_SIGMA}
         side = sprites.footprint_px | 1
-        return np.asarray(make_model_image(shape, model(**fwhm), stars, model_shape=(side, side)), dtype=np.float32)
+        return np.asarray(
+            make_model_image(shape, model(**fwhm), stars, model_shape=(side, side)),
+            dtype=np.float32,
+        )
 
     return draw
 
@@ -244,8 +279,16 @@ def _make_photutils() -> Draw:
 METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
     ("numpy", "separable erf differences and np.add.at; our stamps", lambda: numpy_linear),
     ("numba", "the same as a compiled loop on one core, compiled before; our stamps", _make_numba),
-    ("galsim", "drawImage of a Gaussian convolved with the pixel, by FFT; our stamps", _make_galsim),
-    ("photutils", "make_model_image of GaussianPRF, exact in the pixel; stamps of the next odd side", _make_photutils),
+    (
+        "galsim",
+        "drawImage of a Gaussian convolved with the pixel, by FFT; our stamps",
+        _make_galsim,
+    ),
+    (
+        "photutils",
+        "make_model_image of GaussianPRF, exact in the pixel; stamps of the next odd side",
+        _make_photutils,
+    ),
 )
 
 
@@ -276,7 +319,9 @@ class CellMeasurement(Closing):
     contexts.
     """
 
-    def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result) -> None:
+    def __init__(
+        self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result
+    ) -> None:
         self.bench, self.q, self.result = bench, q_icrs_to_cam, result
         self.cell_key = cell.width, cell.height, cell.stars
         self.shape = cell.height, cell.width
@@ -311,16 +356,23 @@ class CellMeasurement(Closing):
             self.result.agreement.append(report.Agreement(*self.cell_key, name, worst))
 
     def _keep(self, times_ms: dict[str, list[float]]) -> None:
-        self.result.python_ms.append(report.PythonTime(*self.cell_key, _spread(times_ms.pop("python"))))
+        self.result.python_ms.append(
+            report.PythonTime(*self.cell_key, _spread(times_ms.pop("python")))
+        )
         del times_ms["stages"]  # with its waits; its parts are kept
-        rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "turning", "linear_only")]
+        rows = [
+            ("hilstar", kind, times_ms.pop(kind))
+            for kind in ("whole_frame", "turning", "linear_only")
+        ]
         for kind in (*STAGES, *GPU_STAGES):
             if stage_ms := self.stage_ms.get(kind):
                 # without the first turn, as in `interleaved`
                 rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))
         rows += [(name, "linear_only", times) for name, times in times_ms.items()]
         for method, kind, times in rows:
-            self.result.rows.append(report.MethodTiming(*self.cell_key, method, kind, _spread(times)))
+            self.result.rows.append(
+                report.MethodTiming(*self.cell_key, method, kind, _spread(times))
+            )
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
         """Why a method is skipped here: its time for all stars, estimated from that for one star
@@ -330,22 +382,35 @@ class CellMeasurement(Closing):
             return None
 
         def fastest_s(count: int) -> float:
-            few = {name: getattr(self.sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
+            few = {
+                name: getattr(self.sprites, name)[:count]
+                for name in ("data", "star", "x_px", "y_px")
+            }
             part = replace(self.sprites, **few)
             return min(_seconds(lambda: draw(part, self.sigma_px, self.shape)) for _ in range(2))
 
         one_s = fastest_s(1)
         frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
-        return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s" if frame_s > budget_s else None
+        return (
+            f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
+            if frame_s > budget_s
+            else None
+        )
 
     def _draw_linear(self) -> Float32Array:
         self.linear.draw(self.sprites)
         return self.linear.linear()
 
     def _draw_stages(self) -> None:
-        stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
+        stars, camera, footprint_px = (
+            self.bench.shown_stars,
+            self.bench.camera,
+            self.staged.footprint_px,
+        )
         begin = time.perf_counter()
-        near, directions, rates_e_per_s = self.candidates.near(stars, self.icrs_to_image, camera, footprint_px / 2 + 1)
+        near, directions, rates_e_per_s = self.candidates.near(
+            stars, self.icrs_to_image, camera, footprint_px / 2 + 1
+        )
         culled = time.perf_counter()
         # make_sprites in its two halves.
         x_px, y_px = camera.project((self.icrs_to_image @ directions).T)
@@ -361,7 +426,12 @@ class CellMeasurement(Closing):
         """All of a frame that is not OpenGL."""
         white, size_px = self.bench.flux_at_white_e_per_s, self.bench.camera.resolution_px
         clipped_sprites(
-            self.bench.sprites(self.q), GaussianPsf(self.sigma_px), white, size_px, self.bench.uniformity, self.bench.darkest
+            self.bench.sprites(self.q),
+            GaussianPsf(self.sigma_px),
+            white,
+            size_px,
+            self.bench.uniformity,
+            self.bench.darkest,
         )
 
     def close(self) -> None:
@@ -370,7 +440,9 @@ class CellMeasurement(Closing):
         self.linear.close()
 
 
-def interleaved(works: dict[str, Callable[[], object]], rounds: int, budget_s: float) -> dict[str, list[float]]:
+def interleaved(
+    works: dict[str, Callable[[], object]], rounds: int, budget_s: float
+) -> dict[str, list[float]]:
     """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within
     `budget_s` each.
 
@@ -413,16 +485,22 @@ class BenchmarkPlan:
     file: BenchFile | None = None
 
 
-QUICK = BenchmarkPlan(sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1)
+QUICK = BenchmarkPlan(
+    sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1
+)
 
 
-def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> report.Result:
+def run(
+    plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]
+) -> report.Result:
     """Measure every cell of a plan; `advance` hears how many are done. Raises InputError,
     MachineError.
     """
     methods, missing = other_methods()
     others = OtherWork()
-    result = report.Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
+    result = report.Result(
+        this_machine(), does={name: does for name, does, _ in METHODS if name in methods}
+    )
     result.skipped += [report.Skipped(method=name, why=why) for name, why in missing.items()]
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:
@@ -433,13 +511,22 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
                 every = bench.shown_stars
                 for k, count in enumerate(plan.counts):
                     shown = scene(bench, every, q_icrs_to_cam, count, rng)
-                    result.scenes.append(report.SceneOrigin(*size, count, shown.catalogue_count, count - shown.catalogue_count))
+                    result.scenes.append(
+                        report.SceneOrigin(
+                            *size, count, shown.catalogue_count, count - shown.catalogue_count
+                        )
+                    )
                     with CellMeasurement(
-                        bench.with_stars(shown.stars), q_icrs_to_cam, report.Cell(*size, count), result
+                        bench.with_stars(shown.stars),
+                        q_icrs_to_cam,
+                        report.Cell(*size, count),
+                        result,
                     ) as cell:
                         cell.measure(methods, plan.rounds, plan.budget_s)
                     advance(place * len(plan.counts) + k + 1)
-            result.startup += [fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)]
+            result.startup += [
+                fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)
+            ]
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
@@ -472,18 +559,39 @@ def _aims(result: report.Result) -> list[report.Aim]:
     aims = []
     for (size, stars, method, kind), ms in at.items():
         where = f"{stars} stars, {size[0]} x {size[1]}"
-        still, numba = (at.get((size, stars, *key)) for key in (("hilstar", "whole_frame"), ("numba", "linear_only")))
+        still, numba = (
+            at.get((size, stars, *key))
+            for key in (("hilstar", "whole_frame"), ("numba", "linear_only"))
+        )
         if kind == "whole_frame" and (size, stars) in AIMS_MS:
             aims.append((f"whole frame to codes, {where}", AIMS_MS[size, stars], ms))
         elif kind == "turning" and still is not None:
-            aims.append((f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames", TURNING_TIMES * still, ms))
+            aims.append(
+                (
+                    f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames",
+                    TURNING_TIMES * still,
+                    ms,
+                )
+            )
         elif kind == "linear_only" and method == "hilstar" and numba is not None:
             aims.append((f"linear image, {where}, numba's time", numba, ms))
     for python in result.python_ms:
         if python.size == report.REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
-            aims.append((f"Python outside GL, {python.stars} stars", PYTHON_AIMS_MS[python.stars], python.ms.median))
-    starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == report.REFERENCE_PX]
+            aims.append(
+                (
+                    f"Python outside GL, {python.stars} stars",
+                    PYTHON_AIMS_MS[python.stars],
+                    python.ms.median,
+                )
+            )
+    starts = [
+        start.import_ms + start.first_frame_ms
+        for start in result.startup
+        if start.size == report.REFERENCE_PX
+    ]
     if starts:
         aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
     judged = not result.load.busy
-    return [report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims]
+    return [
+        report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims
+    ]

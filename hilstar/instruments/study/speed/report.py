@@ -168,11 +168,17 @@ def lines(result: Result) -> Iterator[str]:
         rows = [row for row in result.rows if row.size == size]
         counts = _counts(rows)
         yield ""
-        yield f"{_words(size) + ', ms (median)':{NAME}}" + "".join(f"{f'{count} stars':>{COLUMN}}" for count in counts)
+        yield f"{_words(size) + ', ms (median)':{NAME}}" + "".join(
+            f"{f'{count} stars':>{COLUMN}}" for count in counts
+        )
         for name, values in _named(rows).items():
-            yield f"{name:{NAME}}" + "".join(f"{_ms(values.get(count)):>{COLUMN}}" for count in counts)
+            yield f"{name:{NAME}}" + "".join(
+                f"{_ms(values.get(count)):>{COLUMN}}" for count in counts
+            )
         python = {row.stars: row.ms.median for row in result.python_ms if row.size == size}
-        yield f"{'  Python outside GL':{NAME}}" + "".join(f"{_ms(python.get(count)):>{COLUMN}}" for count in counts)
+        yield f"{'  Python outside GL':{NAME}}" + "".join(
+            f"{_ms(python.get(count)):>{COLUMN}}" for count in counts
+        )
     yield ""
     yield from _tracker_lines(result.tracker)
     yield from _notes(result)
@@ -185,7 +191,11 @@ def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
     for row in rows:
         if row is rows[0]:
             yield f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor (median)"
-        beside = "" if row.method == "hilstar" else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
+        beside = (
+            ""
+            if row.method == "hilstar"
+            else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
+        )
         yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"
     yield from [""] * bool(rows)
 
@@ -196,12 +206,20 @@ def _notes(result: Result) -> Iterator[str]:
     yield "stages are waited for, one after the other; gpu: the same by the driver's own timers"
     for name, does in result.does.items():
         worst = [row.worst_of_peak for row in result.agreement if row.method == name]
-        yield f"{name:11}{does}" + (f"; differs by at most {max(worst):.1g} of our brightest pixel" if worst else "; not run")
+        yield f"{name:11}{does}" + (
+            f"; differs by at most {max(worst):.1g} of our brightest pixel"
+            if worst
+            else "; not run"
+        )
     for row in result.scenes:
         if row.random:
             yield f"{_words(row.size)}, {row.stars} stars: {row.catalogue} from the catalogue, {row.random} random"
     for skipped in result.skipped:
-        where = "" if skipped.stars is UNSET else f" at {skipped.width} x {skipped.height}, {skipped.stars} stars"
+        where = (
+            ""
+            if skipped.stars is UNSET
+            else f" at {skipped.width} x {skipped.height}, {skipped.stars} stars"
+        )
         yield f"{skipped.method}{where}: {skipped.why}"
     yield (
         f"import {result.import_ms:.0f} ms, first frame {result.first_frame_ms:.0f} ms, "
@@ -218,7 +236,10 @@ def write(result: Result, folder: Path) -> None:
     """
     columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
     for name, rows in (("bench.csv", result.rows), ("tracker.csv", result.tracker)):
-        table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in rows]
+        table = [
+            (r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max)
+            for r in rows
+        ]
         write_csv(folder / name, columns, table)
     _draw(folder / "bench", result)
 
@@ -229,31 +250,53 @@ def _draw(path: Path, result: Result) -> None:
     down = -(-len(sizes) // across)
     height = 2.1 + 2.5 * down
     layout: dict[str, Any] = {"share_x": True, "share_y": True, "height_inch": height}
-    with chart(path, _finding(result), down, across, note=result.load.note("Medians, in turn."), **layout) as grid:
+    with chart(
+        path, _finding(result), down, across, note=result.load.note("Medians, in turn."), **layout
+    ) as grid:
         for axes in grid[len(sizes) :]:
             axes.set_axis_off()
         for axes, size in zip(grid, sizes, strict=False):
             rows = [row for row in result.rows if row.size == size and row.kind in OF_AN_IMAGE]
             for method, kind in dict.fromkeys((row.method, row.kind) for row in rows):
-                points = [(row.stars, row.ms.median) for row in rows if (row.method, row.kind) == (method, kind)]
+                points = [
+                    (row.stars, row.ms.median)
+                    for row in rows
+                    if (row.method, row.kind) == (method, kind)
+                ]
                 label, style = LABELS[kind]
-                axes.plot(*zip(*points, strict=True), style, color=COLOURS[method], ms=4, label=f"{method}, {label}")
+                axes.plot(
+                    *zip(*points, strict=True),
+                    style,
+                    color=COLOURS[method],
+                    ms=4,
+                    label=f"{method}, {label}",
+                )
             axes.set(title=_words(size), xscale="log", yscale="log")
             plain_ticks(axes.xaxis, _counts(rows))
         for axes in grid[-across:]:
             axes.set_xlabel("stars in view")
         for axes in grid[::across]:
             axes.set_ylabel("time of a frame [ms]")
-        handles = {label: line for axes in grid for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        handles = {
+            label: line
+            for axes in grid
+            for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
         grid[0].figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
 
 
 def _finding(result: Result) -> str:
     whole = [row for row in result.rows if row.kind == "whole_frame"]
     first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
-    parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
+    parts = [
+        f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}"
+        for row in (first, last)
+    ]
     where = f"{result.gl_renderer}, {result.machine.cores} cores"
-    return result.load.title(f"A whole frame takes {parts[0]} and {parts[1]} ({where})", "A whole frame beside other renderers")
+    return result.load.title(
+        f"A whole frame takes {parts[0]} and {parts[1]} ({where})",
+        "A whole frame beside other renderers",
+    )
 
 
 def _named(rows: Sequence[MethodTiming]) -> dict[str, dict[int, float]]:

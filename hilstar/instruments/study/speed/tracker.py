@@ -53,8 +53,12 @@ class Exposing:
     def numpy_noise(self) -> None:
         """NumPy's own draws: Poisson, normal read noise, DN."""
         mean_e = self.exposure.mean_e
-        charge = self.rng.poisson(mean_e) + self.rng.normal(0.0, self.detector.read_noise_e, mean_e.shape)
-        np.clip(np.rint(charge / self.detector.gain_e_per_dn), 0, 2**self.detector.bits - 1).astype(np.uint16)
+        charge = self.rng.poisson(mean_e) + self.rng.normal(
+            0.0, self.detector.read_noise_e, mean_e.shape
+        )
+        np.clip(np.rint(charge / self.detector.gain_e_per_dn), 0, 2**self.detector.bits - 1).astype(
+            np.uint16
+        )
 
     def galsim_noise(self) -> Work:
         """GalSim's CCD noise on the same image. Raises ImportError."""
@@ -96,7 +100,19 @@ class Exposing:
         plan = parse_plan(path, PLAN)
         own = (self.file.text, self.file.sha256, files_sha256(plan, self.folder))
         here = str(self.folder)
-        return Session(Job(str(path), PLAN, str(self.file.path), *own, CENTROIDS, here, 60.0, here, images=False))
+        return Session(
+            Job(
+                str(path),
+                PLAN,
+                str(self.file.path),
+                *own,
+                CENTROIDS,
+                here,
+                60.0,
+                here,
+                images=False,
+            )
+        )
 
 
 def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list[Skipped]]:
@@ -121,7 +137,9 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
             ("numpy", "exposure"): own.numpy_noise,
             ("hilstar", "find_stars"): lambda: find_stars(own.exposure.dn),
             ("hilstar", "case"): case,
-            ("hilstar", "verify"): lambda: verify(file, 1, np.random.default_rng(SEED), lambda done: None),
+            ("hilstar", "verify"): lambda: verify(
+                file, 1, np.random.default_rng(SEED), lambda done: None
+            ),
         }
         peers: dict[tuple[str, str], Callable[[], Work]] = {
             ("galsim", "exposure"): own.galsim_noise,
@@ -132,8 +150,15 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
             try:
                 works[name, kind] = make()
             except ImportError as error:
-                skipped.append(Skipped(method=name, why=f"{kind}: not installed ({error}): pip install 'hilstar[benchmark]'"))
-        by_name = {f"{name} {kind}": lambda turn, work=work: work() for (name, kind), work in works.items()}
+                skipped.append(
+                    Skipped(
+                        method=name,
+                        why=f"{kind}: not installed ({error}): pip install 'hilstar[benchmark]'",
+                    )
+                )
+        by_name = {
+            f"{name} {kind}": lambda turn, work=work: work() for (name, kind), work in works.items()
+        }
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
         cell = Cell(width, height, len(own.exposure.truth))
@@ -142,7 +167,9 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
     for name in unset:  # a campaign's worker sets them for its process
         os.environ.pop(name, None)
     rows = []
-    for name, kind in sorted(works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])):
+    for name, kind in sorted(
+        works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])
+    ):
         ms = [one.cpu_ms for one in times[f"{name} {kind}"]]
         spread = Spread(float(np.median(ms)), min(ms), max(ms))
         rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))

@@ -9,7 +9,17 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
+COLUMNS = (
+    "case",
+    "verdict",
+    "failing method",
+    "its failure",
+    "what happens",
+    "why",
+    "error",
+    "its error",
+    "tolerance",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +56,15 @@ class FailureCase:
         """The values of COLUMNS."""
         numbers = self.figures.error, self.figures.fault, self.figures.tolerance
         verdict = "right" if self.right else "WRONG"
-        return self.case, verdict, self.method, self.fails, self.happens, self.why, *map(float, numbers)
+        return (
+            self.case,
+            verdict,
+            self.method,
+            self.fails,
+            self.happens,
+            self.why,
+            *map(float, numbers),
+        )
 
 
 def recorded(name: str) -> list[FailureCase]:

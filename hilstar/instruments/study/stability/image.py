@@ -107,7 +107,9 @@ def by_renderer(on: Target) -> Iterator[Draw]:
         yield draw
 
 
-def _outer(on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]) -> FloatArray:
+def _outer(
+    on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]
+) -> FloatArray:
     """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
     px.
     """
@@ -118,7 +120,11 @@ def _outer(on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], F
 
 def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
     """One star with the Gaussian's value at the middle of each pixel, (h, w)."""
-    return _outer(on, sprites, lambda offset, sigma: np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
+    return _outer(
+        on,
+        sprites,
+        lambda offset, sigma: np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
+    )
 
 
 def half_float(on: Target, sprites: Sprites) -> FloatArray:
@@ -141,13 +147,20 @@ def _by_erf(on: Target, sprites: Sprites, erf_of: Callable[[FloatArray], FloatAr
 
 def nearest_pixel(on: Target, sprites: Sprites) -> FloatArray:
     """One star with all of its light in the nearest pixel."""
-    return _outer(on, sprites, lambda offset, _: (np.arange(len(offset)) == np.abs(offset).argmin()).astype(np.float64))
+    return _outer(
+        on,
+        sprites,
+        lambda offset, _: (np.arange(len(offset)) == np.abs(offset).argmin()).astype(np.float64),
+    )
 
 
 def erf_float32(value: FloatArray) -> FloatArray:
     """erf by splat.frag's rational polynomial, every step in float32; same shape."""
     x = np.clip(value, -4, 4).astype(np.float32)
-    above, below = (np.polyval(np.array(terms, dtype=np.float32), x * x) for terms in (ERF_NUMERATOR, ERF_DENOMINATOR))
+    above, below = (
+        np.polyval(np.array(terms, dtype=np.float32), x * x)
+        for terms in (ERF_NUMERATOR, ERF_DENOMINATOR)
+    )
     return np.asarray(x * above / below)
 
 
@@ -171,10 +184,13 @@ def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
         image = draw(one_star(256 + phase, 256.0, on))
         light = float(image.sum())
         flux_error = max(flux_error, abs(light - 1))
-        off_px = max(off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase))
+        off_px = max(
+            off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase)
+        )
         middle = np.rint(phase)
         across, down = (
-            pixel_shares(np.array([at]), sigma) for at, sigma in zip((middle - phase, 0.0), on.psf.width_px, strict=True)
+            pixel_shares(np.array([at]), sigma)
+            for at, sigma in zip((middle - phase, 0.0), on.psf.width_px, strict=True)
         )
         off = float(image[256, int(256 + middle)]) / float(across[0] * down[0]) - 1
         peak_error = max(peak_error, off, key=abs)
@@ -210,7 +226,10 @@ def wide_star() -> FailureCase:
     exact = linear_image(sprites, on.resolution_px, on.psf)
     with by_renderer(on) as draw:
         image = draw(sprites)
-    error, fault = (float(np.abs(shown - exact).max() / exact.max()) for shown in (image, half_float(on, sprites)))
+    error, fault = (
+        float(np.abs(shown - exact).max() / exact.max())
+        for shown in (image, half_float(on, sprites))
+    )
     return FailureCase(
         "sigma 20 px",
         "erf differences in half floats",
@@ -283,7 +302,9 @@ def star_on_pixel_edge() -> FailureCase:
     """A star where two pixels meet, and a hair to either side."""
     on, phases = target(SIGMA_PX), np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
-        off_px, fault_px = (star_errors(by, on, phases).centroid_px for by in (draw, partial(nearest_pixel, on)))
+        off_px, fault_px = (
+            star_errors(by, on, phases).centroid_px for by in (draw, partial(nearest_pixel, on))
+        )
     return FailureCase(
         "a star on a pixel's edge",
         "the nearest pixel",
@@ -297,8 +318,21 @@ def star_on_pixel_edge() -> FailureCase:
 def star_on_image_edge() -> FailureCase:
     """Stars whose centres are on and beyond the image's edges and corner."""
     errors, faults, last, on = [], [], IMAGE_PX[0] - 1.0, target(SIGMA_PX)
-    for x_px, y_px in ((-0.5, 256.0), (-0.6, 256.0), (last + 0.6, 256.0), (256.0, -2.0), (-0.6, last + 0.6)):
-        exact = float(np.prod([ndtr((at + 0.5) / SIGMA_PX) - ndtr((at - last - 0.5) / SIGMA_PX) for at in (x_px, y_px)]))
+    for x_px, y_px in (
+        (-0.5, 256.0),
+        (-0.6, 256.0),
+        (last + 0.6, 256.0),
+        (256.0, -2.0),
+        (-0.6, last + 0.6),
+    ):
+        exact = float(
+            np.prod(
+                [
+                    ndtr((at + 0.5) / SIGMA_PX) - ndtr((at - last - 0.5) / SIGMA_PX)
+                    for at in (x_px, y_px)
+                ]
+            )
+        )
         inside = 0 <= np.rint(x_px) <= last and 0 <= np.rint(y_px) <= last
         with by_renderer(on) as draw:
             errors.append(abs(float(draw(one_star(x_px, y_px, on)).sum()) - exact))
@@ -324,13 +358,16 @@ def many_stars() -> FailureCase:
     with by_renderer(on) as draw:
         image = draw(sprites)
     corner = linear_image(
-        pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, GaussianPsf((SIGMA_PX,) * 2)
+        pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px),
+        size,
+        GaussianPsf((SIGMA_PX,) * 2),
     )
     pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
     steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     columns, rows = (sprites.data["pixel"][:, axis, None] + steps for axis in (0, 1))
     share_x, share_y = (
-        pixel_shares(pixel - place[:, None], SIGMA_PX) for pixel, place in ((columns, sprites.x_px), (rows, sprites.y_px))
+        pixel_shares(pixel - place[:, None], SIGMA_PX)
+        for pixel, place in ((columns, sprites.x_px), (rows, sprites.y_px))
     )
     light, indexed = share_y * sprites.data["electrons_per_s"][:, None], np.zeros(CROWD_PX[::-1])
     indexed[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
@@ -348,12 +385,17 @@ def many_stars() -> FailureCase:
 def flux_range() -> FailureCase:
     """Twelve decades side by side."""
     flux, on = np.array([1e12, 1.0]), target(SIGMA_PX)
-    stars = [one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)]
+    stars = [
+        one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)
+    ]
     with by_renderer(on) as draw:
         image = draw(join_sprites(stars, stars[0].footprint_px))
     scaled = np.rint(image / image.max() * 65535) * image.max() / 65535
     errors, faults = (
-        [abs(float(shown[:, part].sum()) / light - 1) for part, light in zip((slice(110), slice(110, None)), flux, strict=True)]
+        [
+            abs(float(shown[:, part].sum()) / light - 1)
+            for part, light in zip((slice(110), slice(110, None)), flux, strict=True)
+        ]
         for shown in (image, scaled)
     )
     return FailureCase(
@@ -378,7 +420,9 @@ def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
     # A turn about x moves stars up the image, one about -y to the right.
     turn_rad = np.array([-PATH_PX[1], -PATH_PX[0], 0.0]) / camera.focal_length_px
     for share in np.linspace(0, 1, STEPS):
-        yield make_sprites(stars, to_matrix(propagate(start, share * turn_rad, 1.0)), camera, on.psf.footprint_px)
+        yield make_sprites(
+            stars, to_matrix(propagate(start, share * turn_rad, 1.0)), camera, on.psf.footprint_px
+        )
 
 
 def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
@@ -458,7 +502,14 @@ class CodeScene:
 def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
     """The codes (h, w) as hilstar draws them."""
     panel, sigma_px = scene.panel, (scene.sigma_px, scene.sigma_px)
-    on = Target((SIDE_PX, SIDE_PX), GaussianPsf(sigma_px), panel.response, WHITE, quantisation, panel.uniformity)
+    on = Target(
+        (SIDE_PX, SIDE_PX),
+        GaussianPsf(sigma_px),
+        panel.response,
+        WHITE,
+        quantisation,
+        panel.uniformity,
+    )
     with Renderer(on) as gl:
         gl.draw(scene.sprites)
         return gl.levels().copy()
@@ -479,11 +530,15 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
     return float(np.sqrt(np.mean(np.square(off))) / (scene.panel.response.light[1] * WHITE))
 
 
-def sprites_of(x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float) -> Sprites:
+def sprites_of(
+    x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float
+) -> Sprites:
     """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
     sigma = (sigma_px, sigma_px)
     light = WHITE * flux_ratio(under_white_mag) / GaussianPsf(sigma).peak_share
-    return pack_sprites(x_px, y_px, light, np.arange(len(x_px)), (SIDE_PX, SIDE_PX), GaussianPsf(sigma).footprint_px)
+    return pack_sprites(
+        x_px, y_px, light, np.arange(len(x_px)), (SIDE_PX, SIDE_PX), GaussianPsf(sigma).footprint_px
+    )
 
 
 def middles() -> tuple[FloatArray, FloatArray]:
@@ -494,25 +549,43 @@ def middles() -> tuple[FloatArray, FloatArray]:
 
 
 def lone_stars(
-    under_white_mag: float, response: Response, sigma_px: float = SIGMA_PX, uniformity: Float32Array | None = None
+    under_white_mag: float,
+    response: Response,
+    sigma_px: float = SIGMA_PX,
+    uniformity: Float32Array | None = None,
 ) -> CodeScene:
     """A star in each part of the image."""
     x_px, y_px = middles()
     mags = np.full(len(x_px), under_white_mag)
-    return CodeScene(sprites_of(x_px, y_px, mags, sigma_px), sigma_px, Panel(response, WHITE, uniformity))
+    return CodeScene(
+        sprites_of(x_px, y_px, mags, sigma_px), sigma_px, Panel(response, WHITE, uniformity)
+    )
 
 
 def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     """Two stars in each part, in all directions from each other."""
     x_px, y_px = middles()
     angle = np.linspace(0, 2 * np.pi, len(x_px), endpoint=False)
-    both = np.append(x_px, x_px + apart_px * np.cos(angle)), np.append(y_px, y_px + apart_px * np.sin(angle))
-    return CodeScene(sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
+    both = (
+        np.append(x_px, x_px + apart_px * np.cos(angle)),
+        np.append(y_px, y_px + apart_px * np.sin(angle)),
+    )
+    return CodeScene(
+        sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX),
+        SIGMA_PX,
+        Panel(srgb_response(8), WHITE),
+        2,
+    )
 
 
-def judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
+def judged(
+    case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR
+) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
-    fault, error = error_steps(codes_of(scene, "round"), scene), error_steps(exact_codes(scene), scene)
+    fault, error = (
+        error_steps(codes_of(scene, "round"), scene),
+        error_steps(exact_codes(scene), scene),
+    )
     return FailureCase(
         case,
         ROUNDING,
@@ -525,7 +598,9 @@ def judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float
 
 # Cases whose codes are rounded, or chosen by `exact`.
 CODES: tuple[Callable[[], FailureCase], ...] = (
-    lambda: judged(f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", half_off()),
+    lambda: judged(
+        f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", half_off()
+    ),
     lambda: judged(
         f"two stars 1 px apart, {FAINT_MAG:g} mag under white",
         neighbours((FAINT_MAG, FAINT_MAG), 1.0),
@@ -537,14 +612,22 @@ CODES: tuple[Callable[[], FailureCase], ...] = (
         steps_a_star=NARROW_STEPS,
     ),
     lambda: judged(
-        f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white", uneven_panel(), "each pixel's own steps are weighed"
+        f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white",
+        uneven_panel(),
+        "each pixel's own steps are weighed",
     ),
-    lambda: judged("a panel of 2 bits, stars whose peak is white", lone_stars(0.0, srgb_response(2))),
-    lambda: judged("a panel of 16 bits, stars 10 mag under white", lone_stars(10.0, srgb_response(16))),
+    lambda: judged(
+        "a panel of 2 bits, stars whose peak is white", lone_stars(0.0, srgb_response(2))
+    ),
+    lambda: judged(
+        "a panel of 16 bits, stars 10 mag under white", lone_stars(10.0, srgb_response(16))
+    ),
 )
 # Cases whose light over white goes to neighbours by error diffusion.
 SPILLED: tuple[Callable[[], FailureCase], ...] = (
-    lambda: spilled("a star 2.5 mag over white, 5 px from one 4 mag under it", neighbours((-2.5, 4.0), 5.0)),
+    lambda: spilled(
+        "a star 2.5 mag over white, 5 px from one 4 mag under it", neighbours((-2.5, 4.0), 5.0)
+    ),
     lambda: spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8))),
 )
 
@@ -562,7 +645,11 @@ def half_off() -> CodeScene:
 def uneven_panel() -> CodeScene:
     """Stars on pixels that differ by 5 %, with a fall to the corners."""
     y_px, x_px = np.mgrid[:SIDE_PX, :SIDE_PX] / SIDE_PX - 0.5
-    uneven = 1 - 0.3 * np.hypot(x_px, y_px) + np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
+    uneven = (
+        1
+        - 0.3 * np.hypot(x_px, y_px)
+        + np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
+    )
     return lone_stars(FAINT_MAG, srgb_response(8), uniformity=uneven.astype(np.float32))
 
 
@@ -573,7 +660,10 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
     diffused = diffused_light(scene.linear()[corner], scene.panel.response) - wanted[corner]
-    error, fault = float((shown_light(exact_codes(scene), scene.panel) - wanted).max()), float(diffused.max())
+    error, fault = (
+        float((shown_light(exact_codes(scene), scene.panel) - wanted).max()),
+        float(diffused.max()),
+    )
     return FailureCase(
         case,
         "error diffusion (Floyd and Steinberg 1976)",
@@ -595,7 +685,9 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
     for row in range(height):
         for column in range(1, width + 1):
             asked = left[row, column]
-            shown[row, column - 1] = response.light[np.searchsorted(response.threshold, asked, side="right")]
+            shown[row, column - 1] = response.light[
+                np.searchsorted(response.threshold, asked, side="right")
+            ]
             off = asked - shown[row, column - 1]
             left[row, column + 1] += off * 7 / 16
             left[row + 1, column - 1 : column + 2] += off * np.array([3, 5, 1]) / 16
@@ -605,7 +697,9 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
 def no_stars() -> FailureCase:
     """Nothing in view."""
     nothing = np.zeros(0)
-    none = CodeScene(sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE))
+    none = CodeScene(
+        sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE)
+    )
     with np.errstate(invalid="ignore"):
         scaled = none.wanted() / none.wanted().max()
     error = float((exact_codes(none) != 0).mean())

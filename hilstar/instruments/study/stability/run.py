@@ -10,7 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, chart, label_ends, plain_ticks, two_digits, write_csv
+from hilstar.basics.charts import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    chart,
+    label_ends,
+    plain_ticks,
+    two_digits,
+    write_csv,
+)
 from hilstar.basics.files import write_whole
 from hilstar.basics.units import magnitude
 from hilstar.instruments.study.stability import COLUMNS, FailureCase, image, recorded
@@ -18,7 +30,13 @@ from hilstar.instruments.study.stability import COLUMNS, FailureCase, image, rec
 # In the order of the light's way, between the recorded cases of catalogue and geometry and those of
 # detector and attitude.
 DRAWN: tuple[Callable[[], FailureCase], ...] = (
-    *(image.narrow_star, image.wide_star, image.negative_wings, image.floored_wings, image.absurd_sigmas),
+    *(
+        image.narrow_star,
+        image.wide_star,
+        image.negative_wings,
+        image.floored_wings,
+        image.absurd_sigmas,
+    ),
     *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
     *(image.popping, image.popping_codes),
     *(*image.CODES, *image.SPILLED, image.no_stars),
@@ -54,9 +72,7 @@ def narrow_sigmas(directory: Path) -> None:
     sampled_columns = ("sampled_flux_error", "sampled_centroid_error_px", "sampled_peak_error")
     rows = np.column_stack([sigmas_px, errors]).tolist()
     write_csv(directory / "narrow_stars.csv", (*columns, *sampled_columns), rows)
-    note = (
-        "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide sampled star's pixels"
-    )
+    note = "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide sampled star's pixels"
     note += " cancel in its sums, here in float64 and without an end; hilstar draws in float32, and its sprites end."
     finding = narrow_finding(sigmas_px, ours, sampled)
     with chart(directory / "narrow_stars", finding, panels=3, note=note) as panels:
@@ -111,7 +127,9 @@ def ripples(directory: Path) -> None:
     with image.by_renderer(on) as draw:
         linear = image.moving_fluxes(draw, on)
     curves = {
-        "point sampled, sigma 0.5 px": image.moving_fluxes(partial(image.point_sampled, narrow), narrow),
+        "point sampled, sigma 0.5 px": image.moving_fluxes(
+            partial(image.point_sampled, narrow), narrow
+        ),
         "codes, round": image.moving_code_fluxes("round"),
         "codes, exact": image.moving_code_fluxes("exact"),
         "linear image": linear,
@@ -119,7 +137,9 @@ def ripples(directory: Path) -> None:
     off_mag = {name: magnitude(light) for name, light in curves.items()}
     step_px = np.linspace(0, image.PATH_PX[0], image.STEPS)
     columns = "x_px", *(f"{name} [mag]" for name in off_mag)
-    write_csv(directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist())
+    write_csv(
+        directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist()
+    )
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
         f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with exact codes and by"
@@ -139,7 +159,9 @@ def ripples(directory: Path) -> None:
 def turns(directory: Path) -> None:
     """Interpolation against the turn from one sample to the next."""
     turn_deg, *errors = _recorded_curves(directory, "turns")
-    curves = dict(zip(("straight line", "SLERP (without rates)", "with rates"), errors, strict=True))
+    curves = dict(
+        zip(("straight line", "SLERP (without rates)", "with rates"), errors, strict=True)
+    )
     largest = curves["with rates"].max()
     finding = (
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady turn is followed"
@@ -148,7 +170,11 @@ def turns(directory: Path) -> None:
     with chart(directory / "turns", finding) as (axis,):
         for (name, error), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):
             axis.plot(turn_deg, np.maximum(error, 1e-12), color=colour, label=name)
-        axis.set(yscale="log", xlabel="turn between samples [deg]", ylabel="largest error between samples [arcsec]")
+        axis.set(
+            yscale="log",
+            xlabel="turn between samples [deg]",
+            ylabel="largest error between samples [arcsec]",
+        )
         plain_ticks(axis.xaxis, (0, 60, 120, 180, 240, 300, 360))
         axis.axvline(180, color=MUTED, ls="--", lw=1.0)
         label_ends(axis)

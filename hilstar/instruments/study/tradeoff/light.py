@@ -20,11 +20,26 @@ from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
-from hilstar.instruments.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, code_errors, response_of, star_field
+from hilstar.instruments.study.codes import (
+    AIMS,
+    FRAME_PX,
+    JUDGE,
+    STARS,
+    WAYS,
+    code_errors,
+    response_of,
+    star_field,
+)
 from hilstar.instruments.study.predictors import ORION
 from hilstar.instruments.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
 from hilstar.instruments.study.sweep import Figure, Trial, Trials
-from hilstar.instruments.study.tradeoff.places import NO_LIMIT_V_MAG, SPRITE_PSF, demo_config, stars_to, turn_to_image
+from hilstar.instruments.study.tradeoff.places import (
+    NO_LIMIT_V_MAG,
+    SPRITE_PSF,
+    demo_config,
+    stars_to,
+    turn_to_image,
+)
 from hilstar.optics.psf import MAX_CUT
 from hilstar.optics.sprites import Sprites, make_sprites, pack_sprites
 from hilstar.server.bench.build import bench_calibration, brightest_peak_e_per_s
@@ -32,7 +47,14 @@ from hilstar.server.bench.cameras import ideal_monitor
 from hilstar.server.bench.config import Monitor, RenderSettings, SkySettings
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.spectrum import GAUSS_ORDER, PLANCK_J_S, TEMPERATURE_SCALES, Curve, blackbody_exitance_w_m2_m, load_curve
+from hilstar.sky.spectrum import (
+    GAUSS_ORDER,
+    PLANCK_J_S,
+    TEMPERATURE_SCALES,
+    Curve,
+    blackbody_exitance_w_m2_m,
+    load_curve,
+)
 from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY
 
@@ -78,7 +100,11 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     del stack, quick
     # Equal shares of the catalogue, the bluest and the reddest star among them.
     bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
-    optics, photometry, temperature = study_optics(SENSOR), electrons.Photometry(), SkySettings().temperature
+    optics, photometry, temperature = (
+        study_optics(SENSOR),
+        electrons.Photometry(),
+        SkySettings().temperature,
+    )
     kelvin = electrons.star_temperatures_k(bv_mag, temperature)
 
     def by_rule(rule: Rule) -> FloatArray:
@@ -90,16 +116,22 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
 
     def by_table(degree: int) -> FloatArray:
         if degree == electrons.TABLE_DEGREE:
-            return electrons.tabulate("dgs", optics, photometry).electrons_per_s(np.zeros(COLOURS), kelvin)
+            return electrons.tabulate("dgs", optics, photometry).electrons_per_s(
+                np.zeros(COLOURS), kelvin
+            )
         domain = [1 / electrons.TABLE_RANGE_K[1], 1 / electrons.TABLE_RANGE_K[0]]
         log_rate = Chebyshev.interpolate(
-            lambda x: np.log(electrons.dgs_electrons_per_s(1 / x, optics, photometry)), degree, domain
+            lambda x: np.log(electrons.dgs_electrons_per_s(1 / x, optics, photometry)),
+            degree,
+            domain,
         )
         return electrons.RateTable(log_rate).electrons_per_s(np.zeros(COLOURS), kelvin)
 
     def by_colour(size: int) -> FloatArray:
         at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
-        rate = electrons.dgs_electrons_per_s(electrons.star_temperatures_k(at_mag, temperature), optics, photometry)
+        rate = electrons.dgs_electrons_per_s(
+            electrons.star_temperatures_k(at_mag, temperature), optics, photometry
+        )
         return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
 
     tables = {degree: f"table over 1/T, degree {degree}" for degree in DEGREES}
@@ -113,7 +145,9 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     for name, work in works.items():
         error = np.abs(magnitude(work() / exact))
         figures = float(error.max()), float(np.median(error))
-        trials.append(Trial(name, *figures, work, name == tables[electrons.TABLE_DEGREE], name == ADAPTIVE))
+        trials.append(
+            Trial(name, *figures, work, name == tables[electrons.TABLE_DEGREE], name == ADAPTIVE)
+        )
     return Trials(
         "brightness",
         f"{COLOURS} black bodies, tables included",
@@ -137,16 +171,24 @@ def adaptive_rates(kelvin: FloatArray, optics: electrons.Optics) -> FloatArray:
         def at(nm: float) -> FloatArray:
             return integrand(np.array([nm]))[:, 0]
 
-        return np.asarray(quad_vec(at, *ends, epsabs=0, epsrel=QUAD, norm="max", points=knots)[0]) * 1e-9
+        return (
+            np.asarray(quad_vec(at, *ends, epsabs=0, epsrel=QUAD, norm="max", points=knots)[0])
+            * 1e-9
+        )
 
     return _rates(kelvin, optics, integral)
 
 
-def _rates(kelvin: FloatArray, optics: electrons.Optics, integral: Callable[..., FloatArray]) -> FloatArray:
+def _rates(
+    kelvin: FloatArray, optics: electrons.Optics, integral: Callable[..., FloatArray]
+) -> FloatArray:
     """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one
     tolerance fits all stars.
     """
-    passband, curves = load_curve("johnson-v", "johnson-v"), (optics.quantum_efficiency, optics.transmission)
+    passband, curves = (
+        load_curve("johnson-v", "johnson-v"),
+        (optics.quantum_efficiency, optics.transmission),
+    )
     scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin[:, None])
 
     def spectrum(nm: FloatArray) -> FloatArray:
@@ -154,8 +196,14 @@ def _rates(kelvin: FloatArray, optics: electrons.Optics, integral: Callable[...,
 
     v_band = integral(lambda nm: spectrum(nm) * passband(nm), passband)
     width = integral(lambda nm: passband(nm)[None], passband)
-    detected = integral(lambda nm: spectrum(nm) * (curves[0](nm) * curves[1](nm) * nm * 1e-9), *curves)
-    per_spectrum = optics.area_m2 * electrons.reference_mean_w_m2_m(electrons.Photometry()) / (PLANCK_J_S * LIGHT_M_S)
+    detected = integral(
+        lambda nm: spectrum(nm) * (curves[0](nm) * curves[1](nm) * nm * 1e-9), *curves
+    )
+    per_spectrum = (
+        optics.area_m2
+        * electrons.reference_mean_w_m2_m(electrons.Photometry())
+        / (PLANCK_J_S * LIGHT_M_S)
+    )
     return np.asarray(per_spectrum * detected * width / v_band)
 
 
@@ -204,7 +252,9 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     )
     average = electrons.tabulate("ags", optics, electrons.Photometry())
 
-    def trial(name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]) -> Trial:
+    def trial(
+        name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]
+    ) -> Trial:
         error = np.abs(magnitude(rates / exact))[sure]
         default = (sky.brightness, sky.spectrum, sky.temperature)[: len(settings)]
         figures = float(np.percentile(error, 95)), float(np.median(error))
@@ -215,12 +265,19 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     held_out = exact * (1 + held_out_errors(exact))
     trials = [
         trial(OWN_SPECTRUM, by_own(), by_own, ("dgs", "own")),
-        trial("real spectra by V-I", held_out, partial(real.electrons_per_s, *colours), ("dgs", "pickles")),
+        trial(
+            "real spectra by V-I",
+            held_out,
+            partial(real.electrons_per_s, *colours),
+            ("dgs", "pickles"),
+        ),
     ]
     for scale in TEMPERATURE_SCALES:
 
         def body(scale: str = scale) -> FloatArray:
-            return bodies.electrons_per_s(zero, electrons.star_temperatures_k(library.bv_mag, scale))
+            return bodies.electrons_per_s(
+                zero, electrons.star_temperatures_k(library.bv_mag, scale)
+            )
 
         trials.append(trial(f"black body, {scale}", body(), body, ("dgs", "blackbody", scale)))
     ags = partial(average.electrons_per_s, zero, np.full(len(zero), 9602.0))
@@ -242,7 +299,9 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
     del quick  # every error is found in one draw
     side = PSF_PHASES * TILE_PX
     errors = _psf_errors(TILE_PX, lambda sprites: linear_image(sprites, (side, side), SPRITE_PSF))
-    work: Callable[[], object] = partial(linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF)
+    work: Callable[[], object] = partial(
+        linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF
+    )
     trials = [Trial("exact integral, erfc in float64", *errors, work, is_exact=True)]
     for name, variant in splat_variants().items():
         renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
@@ -252,11 +311,15 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
             return renderer.linear()[:side, :side].astype(np.float64)
 
         work = partial(renderer.draw_and_wait, star_field(FRAME_PX, renderer.footprint_px))
-        trials.append(Trial(name, *_psf_errors(renderer.footprint_px, image), work, variant == SplatVariant()))
+        trials.append(
+            Trial(name, *_psf_errors(renderer.footprint_px, image), work, variant == SplatVariant())
+        )
 
     def sampled_flux(phase_px: FloatArray) -> FloatArray:
         offset_px = (np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]) / SMALL_SIGMA_PX
-        return np.asarray((np.exp(-0.5 * offset_px**2) / (SMALL_SIGMA_PX * np.sqrt(2 * np.pi))).sum(axis=1))
+        return np.asarray(
+            (np.exp(-0.5 * offset_px**2) / (SMALL_SIGMA_PX * np.sqrt(2 * np.pi))).sum(axis=1)
+        )
 
     excess = 1 / (2 * np.pi * math.prod(SPRITE_PSF.width_px) * SPRITE_PSF.peak_share) - 1
     worst = np.abs(magnitude(sampled_flux(np.arange(PSF_PHASES) / PSF_PHASES) ** 2)).max()
@@ -277,11 +340,18 @@ def splat_variants() -> dict[str, SplatVariant]:
     """The GPU's ways, by name; the renderer's own is the `SplatVariant()` that changes nothing."""
     own = SPRITE_PSF.footprint_px
     variants = {f"GL polynomial, R32F, {own} px": SplatVariant()}
-    variants |= {f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size) for size in SIZES_PX if size != own}
+    variants |= {
+        f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size)
+        for size in SIZES_PX
+        if size != own
+    }
     variants |= {f"GL polynomial, R16F, {own} px": SplatVariant(half_float=True)}
     variants |= {f"GL erf, {own} px": SplatVariant("erf")}
     variants |= {f"GL erf by exp, {own} px": SplatVariant("exp erf")}
-    variants |= {f"GL table of {size}, {own} px": SplatVariant("table", table_size=size) for size in TABLE_SIZES}
+    variants |= {
+        f"GL table of {size}, {own} px": SplatVariant("table", table_size=size)
+        for size in TABLE_SIZES
+    }
     variants |= {f"GL pixel centre, {own} px": SplatVariant("centre")}
     return variants
 
@@ -291,12 +361,17 @@ def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[f
     them.
     """
     side = PSF_PHASES * TILE_PX
-    place = (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
+    place = (
+        (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
+    )
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
     flux, star = np.full(PSF_PHASES**2, WHITE / SPRITE_PSF.peak_share), np.arange(PSF_PHASES**2)
     sprites = pack_sprites(x_px, y_px, flux, star, (side, side), size_px)
     bright = linear_image(sprites, (side, side), SPRITE_PSF, TILE_PX)
-    errors = [measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX) for mag in (0.0, FAINTER_MAG)]
+    errors = [
+        measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX)
+        for mag in (0.0, FAINTER_MAG)
+    ]
     return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
 
 
@@ -314,13 +389,17 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
         work = partial(_codes, renderer, star_field(FRAME_PX, renderer.footprint_px), count())
         each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
         is_default = (way.method, way.stealing) == (TAKEN, stealing)
-        trials.append(Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each))
+        trials.append(
+            Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each)
+        )
     taken = next(trial for trial in trials if trial.is_default)
     by_each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
     return Trials(
         "quantisation",
         f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
-        Figure(f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG),
+        Figure(
+            f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG
+        ),
         Figure("centroid error by a PSF fit, worst", "px"),
         "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
         trials,
@@ -340,8 +419,13 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
     del quick
     config, camera = demo_config(), ideal_monitor(demo_config())
     every = stars_to(NO_LIMIT_V_MAG)
-    response, white = bench_calibration(config, Path()).response, brightest_peak_e_per_s(every, SPRITE_PSF)
-    renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SPRITE_PSF, response, white)))
+    response, white = (
+        bench_calibration(config, Path()).response,
+        brightest_peak_e_per_s(every, SPRITE_PSF),
+    )
+    renderer = stack.enter_context(
+        Renderer(Target(camera.resolution_px, SPRITE_PSF, response, white))
+    )
     default, turn, trials = SkySettings().faintest_v_mag, turn_to_image(ORION, camera), []
 
     def frame(stars: Stars) -> None:
@@ -350,10 +434,18 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
 
     for limit in sorted({*LIMITS_V_MAG, default, NO_LIMIT_V_MAG}):
         stars = stars_to(limit)
-        lost = 100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum()) if len(stars) < len(every) else 0.0
+        lost = (
+            100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum())
+            if len(stars) < len(every)
+            else 0.0
+        )
         drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
         name = "all of Hipparcos" if limit == NO_LIMIT_V_MAG else f"V to {limit:g}"
-        trials.append(Trial(name, lost, drawn, partial(frame, stars), limit == default, limit == NO_LIMIT_V_MAG))
+        trials.append(
+            Trial(
+                name, lost, drawn, partial(frame, stars), limit == default, limit == NO_LIMIT_V_MAG
+            )
+        )
     return Trials(
         "depth",
         f"a frame of Orion to codes, {camera.resolution_px[0]} x {camera.resolution_px[1]}",

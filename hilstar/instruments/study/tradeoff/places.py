@@ -95,13 +95,18 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
 
     def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
         radius_rad = camera.field_radius_rad(SPRITE_PSF.footprint_px / 2 + 1)
-        return _project(stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera), len(stars)
+        return _project(
+            stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera
+        ), len(stars)
 
     in_view = [set(stars.hip[_scan(stars, turn, camera)[0]].tolist()) for turn in turns]
     finders: dict[str, tuple[Stars, Finder]] = {
         "scan, every star projected": (stars, _scan),
         "scan of angles": (stars, by_angle),
-        **{f"cells of {deg:g} deg": (in_cells(stars, deg), _by_cells) for deg in sorted({*CELLS_DEG, CELL_DEG})},
+        **{
+            f"cells of {deg:g} deg": (in_cells(stars, deg), _by_cells)
+            for deg in sorted({*CELLS_DEG, CELL_DEG})
+        },
         "cells of 10 deg, by centres only": (in_cells(stars, 10.0, by_centres=True), _by_cells),
     }
     trials = []
@@ -133,14 +138,20 @@ def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
     grid = cell_grid(stars.vectors, cell_deg)
     columns = {name: getattr(stars, name)[grid.order] for name in STAR_COLUMNS}
     if by_centres:
-        grid = replace(grid, cos_radius=np.ones_like(grid.cos_radius), sin_radius=np.zeros_like(grid.sin_radius))
+        grid = replace(
+            grid,
+            cos_radius=np.ones_like(grid.cos_radius),
+            sin_radius=np.zeros_like(grid.sin_radius),
+        )
     return replace(stars, **columns, grid=grid)
 
 
 def _by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
     """As `make_sprites` finds them."""
     margin_px = SPRITE_PSF.footprint_px / 2 + 1
-    near = stars.grid.near(turn[2], camera.field_radius_rad(margin_px), camera.edges(margin_px) @ turn)
+    near = stars.grid.near(
+        turn[2], camera.field_radius_rad(margin_px), camera.edges(margin_px) @ turn
+    )
     return _project(stars, near, turn, camera), len(near)
 
 
@@ -150,7 +161,9 @@ def _scan(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int
 
 def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
     x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
-    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, SPRITE_PSF.footprint_px).star
+    return pack_sprites(
+        x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, SPRITE_PSF.footprint_px
+    ).star
 
 
 def projection(stack: ExitStack, quick: bool) -> Trials:
@@ -161,10 +174,14 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(6 if quick else ATTITUDES, camera)
     near = [stars.vectors[stars.grid.near(turn[2], camera.field_radius_rad(0.0))] for turn in turns]
-    truths = [_places(EXACT, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)]
+    truths = [
+        _places(EXACT, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)
+    ]
     trials = []
     for name, road in ROADS.items():
-        found = [_places(road, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)]
+        found = [
+            _places(road, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)
+        ]
         error = np.hypot(*(np.concatenate(found) - np.concatenate(truths)).T).astype(np.float64)
         error = error[np.isfinite(error)]
         work = partial(road.pack, near[0], turns[0], camera)
@@ -190,7 +207,9 @@ class Road:
     kind: type[np.floating[Any]]
     dtype: np.dtype[np.void]
 
-    def pack(self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera) -> tuple[npt.NDArray[np.void], IntArray]:
+    def pack(
+        self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
+    ) -> tuple[npt.NDArray[np.void], IntArray]:
         """Sprites of stars of one electron per second, in the layout, and which of `vectors`
         (n, 3) they are.
         """
@@ -199,7 +218,11 @@ class Road:
         scale = kind(camera.focal_length_px) / z
         cx, cy = (kind(c) for c in camera.principal_point_px)
         x, y = x * scale + cx, y * scale + cy
-        star, (width, height), side = np.arange(len(vectors)), camera.resolution_px, SPRITE_PSF.footprint_px
+        star, (width, height), side = (
+            np.arange(len(vectors)),
+            camera.resolution_px,
+            SPRITE_PSF.footprint_px,
+        )
         if self.dtype == SPRITE_DTYPE:
             sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side)
             return sprites.data, sprites.star
@@ -225,18 +248,24 @@ ROADS = {
 }
 
 
-def _places(road: Road, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera) -> npt.NDArray[np.longdouble]:
+def _places(
+    road: Road, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
+) -> npt.NDArray[np.longdouble]:
     """Places (n, 2), px; NaN for a star that is not seen."""
     data, star = road.pack(vectors, icrs_to_image, camera)
     places = np.full((len(vectors), 2), np.nan, dtype=np.longdouble)
     split = data.dtype == SPRITE_DTYPE
-    places[star] = data["pixel"] + data["fraction_px"].astype(np.longdouble) if split else data["place_px"]
+    places[star] = (
+        data["pixel"] + data["fraction_px"].astype(np.longdouble) if split else data["place_px"]
+    )
     return places
 
 
 TRACKER = demo_config().tracker
 TRACKER_PSF = tracker_psf(TRACKER, Path())
-CAMERA = monitor_camera(TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0]))
+CAMERA = monitor_camera(
+    TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0])
+)
 SIZE_PX = CAMERA.resolution_px[0]
 RATE_DEG_S = (0.7, -0.7, 5.0)
 EVENLY = (4, 8, 16, 32, 64)
@@ -261,7 +290,9 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
     motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
     few, many = grid_stars(across, motion), grid_stars(STARS_ACROSS, motion)
-    renderer = stack.enter_context(VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant()))
+    renderer = stack.enter_context(
+        VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant())
+    )
 
     def own(stars: Stars) -> Sprites:
         return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
@@ -271,7 +302,9 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         return _chain(stars, motion, nodes / 2, weights / 2)
 
     def evenly(count: int, stars: Stars) -> Sprites:
-        return _chain(stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count))
+        return _chain(
+            stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count)
+        )
 
     def image(sprites: Sprites) -> FloatArray:
         return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
@@ -280,14 +313,28 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         renderer.draw_and_wait(sprites_of(many))
 
     names = {count: f"Gauss-Legendre, {count}" for count in (*GAUSS, EXACT_NODES)}
-    methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {len(own(few)) / len(few):.0f} on average": own}
+    methods: dict[str, SpritesOf] = {
+        f"Gauss-Legendre by length, {len(own(few)) / len(few):.0f} on average": own
+    }
     methods |= {name: partial(gauss, count) for count, name in names.items()}
     methods |= {f"evenly in time, {count}": partial(evenly, count) for count in EVENLY}
     exact, trials = image(gauss(EXACT_NODES, few)), []
     for name, sprites_of in methods.items():
         drawn = image(sprites_of(few))
-        worst, off_px = float(np.abs(drawn - exact).max()), measure(exact, drawn, len(exact) // across).centroid_max_px
-        trials.append(Trial(name, worst, off_px, partial(draw, sprites_of), sprites_of is own, name == names[EXACT_NODES]))
+        worst, off_px = (
+            float(np.abs(drawn - exact).max()),
+            measure(exact, drawn, len(exact) // across).centroid_max_px,
+        )
+        trials.append(
+            Trial(
+                name,
+                worst,
+                off_px,
+                partial(draw, sprites_of),
+                sprites_of is own,
+                name == names[EXACT_NODES],
+            )
+        )
     x_px, y_px = _places_px(many, motion, np.array([-0.5, 0.5]))
     paths_px = np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))
     return Trials(
@@ -307,7 +354,11 @@ def grid_stars(across: int, motion: Motion) -> Stars:
     place = (np.arange(across) + 0.5) * SIZE_PX / across - 0.5
     x_px, y_px = (axis.ravel() - (SIZE_PX - 1) / 2 for axis in np.meshgrid(place, place))
     image = np.column_stack([x_px, y_px, np.full(across**2, CAMERA.focal_length_px)])
-    vectors = image / np.linalg.norm(image, axis=1, keepdims=True) @ motion.icrs_to_image(MIDDLE_S, CAMERA)[0]
+    vectors = (
+        image
+        / np.linalg.norm(image, axis=1, keepdims=True)
+        @ motion.icrs_to_image(MIDDLE_S, CAMERA)[0]
+    )
     zero = np.zeros(across**2)
     catalog = plain_catalog("star", across**2, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
     return make_stars(catalog, vectors, zero, zero + 1)
@@ -318,7 +369,9 @@ def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> S
     light = np.outer(share, stars.electrons_per_s)
     star = np.broadcast_to(np.arange(len(stars)), x_px.shape)
     side = TRACKER_PSF.footprint_px
-    return pack_sprites(x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), CAMERA.resolution_px, side)
+    return pack_sprites(
+        x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), CAMERA.resolution_px, side
+    )
 
 
 def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -333,22 +386,33 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
     on a shaken slew.
     """
     del stack
-    samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)]
-    frames_ns = (np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns).tolist()
+    samples = [
+        slew_sample(k * SAMPLE_MS * NS_PER_MS)
+        for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)
+    ]
+    frames_ns = (
+        np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns
+    ).tolist()
     frame_ns, trials = NS_PER_S / FRAME_HZ, []
     for predictor in predictors():
         errors = []
         for after in range(NEAR, len(samples)):
-            attitude_at = predictor.load(samples[after - NEAR : after + 1 if predictor.waits else after])
+            attitude_at = predictor.load(
+                samples[after - NEAR : after + 1 if predictor.waits else after]
+            )
             first, last = (math.ceil(samples[k].t_ns / frame_ns) for k in (after - 1, after))
             for t_ns in (round(k * frame_ns) for k in range(first, last)):
-                errors.append(angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns)) * math.degrees(3600))
+                errors.append(
+                    angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns)) * math.degrees(3600)
+                )
 
         def work(attitude_at: AttitudeAt) -> None:
             for t_ns in frames_ns:
                 attitude_at(t_ns)
 
-        timed = partial(work, predictor.load(samples[-1 - NEAR : len(samples) if predictor.waits else -1]))
+        timed = partial(
+            work, predictor.load(samples[-1 - NEAR : len(samples) if predictor.waits else -1])
+        )
         rms_arcsec = float(np.sqrt(np.mean(np.square(errors))))
         trials.append(Trial(predictor.name, max(errors), rms_arcsec, timed, predictor.is_default))
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)

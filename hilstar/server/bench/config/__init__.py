@@ -6,7 +6,12 @@ docs/bench-file.md is made from them.
 
 from hilstar.server.bench.config.answers import AnswersSettings
 from hilstar.server.bench.config.attitude import AttitudeSettings, FaultSettings
-from hilstar.server.bench.config.bench_config import BenchConfig, config_of, parse_config, read_config
+from hilstar.server.bench.config.bench_config import (
+    BenchConfig,
+    config_of,
+    parse_config,
+    read_config,
+)
 from hilstar.server.bench.config.certify import CertifySettings
 from hilstar.server.bench.config.hardware import (
     DEFAULT_PSF_SIGMA_PX,

@@ -27,7 +27,9 @@ Byte = Annotated[int, Meta(ge=-MAX_FRAME_BYTES, le=MAX_FRAME_BYTES)]
 class FrameField(Table, frozen=True):
     """A number in a frame: raw x scale + add."""
 
-    name: Literal["qw", "qx", "qy", "qz", "t_s", "t_sub", "t_ns", "valid", "mode", "stars", "wx", "wy", "wz"]
+    name: Literal[
+        "qw", "qx", "qy", "qz", "t_s", "t_sub", "t_ns", "valid", "mode", "stars", "wx", "wy", "wz"
+    ]
     at: Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)]
     type: str
     scale: Signed = 1.0
@@ -63,7 +65,9 @@ class AnswersSettings(Table, frozen=True):
     #: `"packet"`: hilstar's own (kind 5), as COBS frames over serial lines, TCP and files.
     #: `"json"`: an object a line or a message. `"frame"`: the tracker's own telemetry, declared by
     #: the keys below. `"python:MODULE:FUNCTION"`: bytes in, answers out.
-    format: Annotated[str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})] = "packet"
+    format: Annotated[
+        str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})
+    ] = "packet"
     #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's
     #: folder (see
     #: [what runs](what-runs.md)).
@@ -131,9 +135,14 @@ class AnswersSettings(Table, frozen=True):
     checksum_order: Literal["big", "little"] = "big"
     #: Bytes that frames with an attitude have; others are counted (`other`) and not decoded.
     #: Default: all frames
-    match: Annotated[tuple[FrameMatch, ...], Meta(extra={"form": '[{ at = N, hex = "21" }, ...]'})] = ()
+    match: Annotated[
+        tuple[FrameMatch, ...], Meta(extra={"form": '[{ at = N, hex = "21" }, ...]'})
+    ] = ()
     #: The numbers in a frame. Default: none; required for frame
-    fields: Annotated[tuple[FrameField, ...], Meta(extra={"form": '[{ name = "qw", at = N, type = "f32be" }, ...]'})] = ()
+    fields: Annotated[
+        tuple[FrameField, ...],
+        Meta(extra={"form": '[{ name = "qw", at = N, type = "f32be" }, ...]'}),
+    ] = ()
 
 
 def field_format(type_name: str) -> tuple[str, int, bool] | None:
@@ -149,10 +158,14 @@ def field_format(type_name: str) -> tuple[str, int, bool] | None:
 def answers_place(settings: AnswersSettings) -> tuple[UdpPlace, AllowedSenders]:
     """Where UDP or TCP listens, and who may send. Raises InputError."""
     bind = settings.listen if settings.source == "tcp" else settings.bind
-    place = bound_place(bind if bind is not None else "127.0.0.1:5562", settings.port, settings.endpoint)
+    place = bound_place(
+        bind if bind is not None else "127.0.0.1:5562", settings.port, settings.endpoint
+    )
     allowed = AllowedSenders(settings.allow)
     if not allowed and not place.loopback:
-        raise InputError(f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
+        raise InputError(
+            f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+        )
     return place, allowed
 
 
@@ -186,11 +199,17 @@ def check_answers(settings: AnswersSettings) -> None:
     of_frame = settings.format == "frame"
     of_python = settings.format.startswith("python:")
     if settings.trust and not of_python:
-        raise InputError(f'trust is for format = "python:MODULE:FUNCTION"; remove it (format = "{shortened(settings.format)}")')
+        raise InputError(
+            f'trust is for format = "python:MODULE:FUNCTION"; remove it (format = "{shortened(settings.format)}")'
+        )
     for package in settings.trust:
         if not package.isidentifier():
-            raise InputError(f'trust = ["{shortened(package)}"]: no name of a package; write what `import` takes')
-    for wrong, said in chain(_road_faults(settings), _frame_faults(settings) if of_frame else _format_faults(settings)):
+            raise InputError(
+                f'trust = ["{shortened(package)}"]: no name of a package; write what `import` takes'
+            )
+    for wrong, said in chain(
+        _road_faults(settings), _frame_faults(settings) if of_frame else _format_faults(settings)
+    ):
         if wrong:
             raise InputError(said)
     if settings.connect is not None:
@@ -204,17 +223,29 @@ def _road_faults(settings: AnswersSettings) -> Faults:
     for key, roads in ROADS.items():
         said = " or ".join(f'"{road}"' for road in roads)
         given = getattr(settings, key) not in {None, "", ()}
-        yield given and source not in roads, f'{key} is for source = {said}; remove it (source = "{source}")'
+        yield (
+            given and source not in roads,
+            f'{key} is for source = {said}; remove it (source = "{source}")',
+        )
     no_device = source == "serial" and (not settings.port or isinstance(settings.port, int))
     yield no_device, 'source = "serial" needs port; write port = "/dev/ttyUSB0" or the like'
-    yield source == "file" and not settings.path, 'source = "file" needs path; write path = "tracker.bin" or the like'
+    yield (
+        source == "file" and not settings.path,
+        'source = "file" needs path; write path = "tracker.bin" or the like',
+    )
     one = (settings.connect is None) != (settings.listen is None)
-    yield source == "tcp" and not one, f'source = "tcp" needs connect or listen, one of them; {PLACE_FORM}'
+    yield (
+        source == "tcp" and not one,
+        f'source = "tcp" needs connect or listen, one of them; {PLACE_FORM}',
+    )
     asked = settings.poll_hex is not None
     nobody = source == "udp" and asked and settings.connect is None
     yield nobody, f"poll_hex over UDP needs connect, the tracker's place; {PLACE_FORM}"
     address = isinstance(settings.bind, str) and source == "zmq"
-    yield address, f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint'
+    yield (
+        address,
+        f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint',
+    )
     too_long = asked and len(bytes.fromhex(settings.poll_hex or "")) > MAX_POLL_BYTES
     yield too_long, f"poll_hex has over {MAX_POLL_BYTES} bytes; write what one question is"
 
@@ -223,30 +254,51 @@ def _format_faults(settings: AnswersSettings) -> Faults:
     form = settings.format
     given = [key for key in OF_FRAMES if getattr(settings, key) not in {None, ()}]
     given += ["checksum"] if settings.checksum != "none" else []
-    yield bool(given), f'{"".join(given[:1])} is for format = "frame"; remove it (format = "{form}")'
+    yield (
+        bool(given),
+        f'{"".join(given[:1])} is for format = "frame"; remove it (format = "{form}")',
+    )
     known = form in {"packet", "json"} or re.fullmatch(r"python:[\w.]+:\w+", form)
-    yield not known, f'format = "{shortened(form)}"; "packet", "json", "frame" or "python:MODULE:FUNCTION" is wanted'
+    yield (
+        not known,
+        f'format = "{shortened(form)}"; "packet", "json", "frame" or "python:MODULE:FUNCTION" is wanted',
+    )
 
 
 def _frame_faults(settings: AnswersSettings) -> Faults:
     framing, length, form = settings.framing, settings.length, 'format = "frame"'
-    yield framing is None, f'{form} needs framing; write framing = "sync", "slip", "cobs", "fixed" or "ccsds"'
+    yield (
+        framing is None,
+        f'{form} needs framing; write framing = "sync", "slip", "cobs", "fixed" or "ccsds"',
+    )
     without = (settings.sync_hex is None) == (framing == "sync")
-    yield without, 'framing = "sync" needs sync_hex, and no other has it; write sync_hex = "1A CF" or the like'
+    yield (
+        without,
+        'framing = "sync" needs sync_hex, and no other has it; write sync_hex = "1A CF" or the like',
+    )
     loose = framing == "fixed" and not isinstance(length, int)
     yield loose, 'framing = "fixed" needs length, in bytes; write length = 32 or the like'
     endless = framing == "sync" and length is None
-    yield endless, 'framing = "sync" needs length; write length = 32, or length = { at = 2, type = "u8", add = 0 }'
+    yield (
+        endless,
+        'framing = "sync" needs length; write length = 32, or length = { at = 2, type = "u8", add = 0 }',
+    )
     if isinstance(length, FrameLength):
         odd = (field_format(length.type) or "f")[0] != "u"
-        yield odd, f'length = {{ type = "{length.type}" }}; u8, u16le, u16be, u32le or u32be is wanted'
+        yield (
+            odd,
+            f'length = {{ type = "{length.type}" }}; u8, u16le, u16be, u32le or u32be is wanted',
+        )
     names = [field.name for field in settings.fields]
     twice = [name for name in names if names.count(name) > 1]
     yield bool(twice), f'fields has name = "{"".join(twice[:1])}" twice; write each once'
     missing = [name for name in QUATERNION if name not in names]
     yield bool(missing), f"fields lacks {', '.join(missing)}; write each of qw, qx, qy, qz"
     ordered = settings.convention.scalar == "last"
-    yield ordered, 'convention = { scalar = "last" }: fields says by the name qw which number is the scalar; remove it'
+    yield (
+        ordered,
+        'convention = { scalar = "last" }: fields says by the name qw which number is the scalar; remove it',
+    )
     some = 0 < sum(name in names for name in RATE) < len(RATE)
     yield some, "fields has one or two of wx, wy, wz; write all of them, or none"
     both = "t_ns" in names and ("t_s" in names or "t_sub" in names)
@@ -254,8 +306,17 @@ def _frame_faults(settings: AnswersSettings) -> Faults:
     for field in settings.fields:
         kind, size, _ = field_format(field.type) or ("", 0, False)
         where = f"fields: {field.name}"
-        yield not kind, f'{where} has type = "{field.type}"; {TYPES} is wanted, with le or be at its end'
-        yield field.mask is not None and kind != "u", f"{where} has a mask, which is for u8 to u64; remove it"
+        yield (
+            not kind,
+            f'{where} has type = "{field.type}"; {TYPES} is wanted, with le or be at its end',
+        )
+        yield (
+            field.mask is not None and kind != "u",
+            f"{where} has a mask, which is for u8 to u64; remove it",
+        )
         beyond = isinstance(length, int) and field.at + size > length
-        yield beyond, f"{where} ends with byte {field.at + size - 1}, and length = {length}; mend one of them"
+        yield (
+            beyond,
+            f"{where} ends with byte {field.at + size - 1}, and length = {length}; mend one of them",
+        )
         yield field.scale == 0, f"{where} has scale = 0; write another number"

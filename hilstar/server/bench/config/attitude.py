@@ -6,7 +6,13 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, UdpPlace, bound_place, parse_endpoint
+from hilstar.attitude.wire.endpoint import (
+    ALLOW_FORM,
+    AllowedSenders,
+    UdpPlace,
+    bound_place,
+    parse_endpoint,
+)
 from hilstar.attitude.wire.source import HILSTARS, Convention
 from hilstar.basics.errors import InputError
 from hilstar.basics.toml_tables import Table
@@ -119,17 +125,27 @@ def check_road(settings: AttitudeSettings) -> None:
     """Refuse (InputError) keys of another road, and a road that lacks one."""
     source = settings.source
     if settings.lockstep and source not in {"zmq", "vizard", "42"}:
-        raise InputError('lockstep = true is for source = "zmq", "vizard" or "42"; leave one of them out')
+        raise InputError(
+            'lockstep = true is for source = "zmq", "vizard" or "42"; leave one of them out'
+        )
     if isinstance(settings.bind, str) and source != "udp":
-        raise InputError(f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint')
+        raise InputError(
+            f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint'
+        )
     if settings.allow and source != "udp" and not (source == "42" and settings.bind is True):
-        raise InputError(f'allow is for source = "udp", and for "42" with bind = true; remove it (source = "{source}")')
+        raise InputError(
+            f'allow is for source = "udp", and for "42" with bind = true; remove it (source = "{source}")'
+        )
     if source == "serial" and (not settings.port or isinstance(settings.port, int)):
         raise InputError('source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
     if settings.convention != HILSTARS and source not in PACKET_SOURCES:
-        raise InputError(f'convention = {settings.convention}: source = "{source}" has a convention of its own; remove it')
+        raise InputError(
+            f'convention = {settings.convention}: source = "{source}" has a convention of its own; remove it'
+        )
     if settings.spacecraft is not None and source not in {"vizard", "42"}:
-        raise InputError(f'spacecraft is for source = "vizard" or "42"; remove it (source = "{source}")')
+        raise InputError(
+            f'spacecraft is for source = "vizard" or "42"; remove it (source = "{source}")'
+        )
     if source in {"vizard", "42"}:
         _check_simulation(settings, "Basilisk" if source == "vizard" else "42")
     if source in {"udp", "scpi"}:
@@ -141,9 +157,13 @@ def check_road(settings: AttitudeSettings) -> None:
 def _check_simulation(settings: AttitudeSettings, name: str) -> None:
     for key in ("curve_secret_key", "curve_server_key", "allowed_clients"):
         if getattr(settings, key) is not None:
-            raise InputError(f'{key}: {name} knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"')
+            raise InputError(
+                f'{key}: {name} knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"'
+            )
     if settings.clock != "estimated":
-        raise InputError(f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock = "estimated"')
+        raise InputError(
+            f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock = "estimated"'
+        )
 
 
 def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
@@ -156,13 +176,22 @@ def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
     if settings.source == "scpi":
         for key in ("endpoint", "bind", "port"):
             if getattr(settings, key) not in {None, ""}:
-                raise InputError(f'{key}: source = "scpi" has none; remove it, and give the address in --scpi HOST:PORT')
+                raise InputError(
+                    f'{key}: source = "scpi" has none; remove it, and give the address in --scpi HOST:PORT'
+                )
         if settings.clock != "estimated":
-            raise InputError(f'clock = "{settings.clock}": SCPI\'s attitudes are stamped by this machine; remove it')
+            raise InputError(
+                f'clock = "{settings.clock}": SCPI\'s attitudes are stamped by this machine; remove it'
+            )
         return bound_place("127.0.0.1:0", "", None), AllowedSenders(())
-    place, allowed = bound_place(settings.bind, settings.port, settings.endpoint), AllowedSenders(settings.allow)
+    place, allowed = (
+        bound_place(settings.bind, settings.port, settings.endpoint),
+        AllowedSenders(settings.allow),
+    )
     if not allowed and not place.loopback:
-        raise InputError(f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
+        raise InputError(
+            f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+        )
     return place, allowed
 
 
@@ -170,7 +199,9 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
     """The number of 42's spacecraft, and who may connect. Raises InputError as `udp_road` does."""
     place, allowed = parse_endpoint(settings.address), AllowedSenders(settings.allow)
     if settings.bind is True and not allowed and not place.loopback:
-        raise InputError(f"{settings.address} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
+        raise InputError(
+            f"{settings.address} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+        )
     # links and packets take 12 ms, which no other source needs here
     from hilstar.attitude.wire.nasa42 import spacecraft_number
 

@@ -20,10 +20,27 @@ from hilstar.server.bench.config import hardware
 from hilstar.server.bench.config.answers import AnswersSettings, check_answers
 from hilstar.server.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
 from hilstar.server.bench.config.certify import CertifySettings
-from hilstar.server.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
-from hilstar.server.bench.config.sky import GEOCENTRE, SOURCE, Background, SiteSettings, SkySettings, SpacecraftSettings
+from hilstar.server.bench.config.render import (
+    DEFAULT_BRIGHTEST_V_MAG,
+    MAX_JUDGED_FRAMES,
+    RenderSettings,
+)
+from hilstar.server.bench.config.sky import (
+    GEOCENTRE,
+    SOURCE,
+    Background,
+    SiteSettings,
+    SkySettings,
+    SpacecraftSettings,
+)
 
-TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
+TYPE_WORDS = {
+    "float": "number",
+    "int": "whole number",
+    "str": "text",
+    "object": "table",
+    "bool": "true or false",
+}
 UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S
 J2000_JD, J2000_JYEAR, JYEAR_DAYS = 2_451_545.0, 2000.0, 365.25
 EPOCH_KEY = "[sky] epoch_utc ="
@@ -57,7 +74,9 @@ class BenchConfig(Table, frozen=True):
         """The frames of the tracker's exposure by which `temporal` is judged."""
         if self.render.cycle_frames is not None:
             return self.render.cycle_frames
-        return min(max(1, round(self.tracker.exposure_s * self.monitor.refresh_hz)), MAX_JUDGED_FRAMES)
+        return min(
+            max(1, round(self.tracker.exposure_s * self.monitor.refresh_hz)), MAX_JUDGED_FRAMES
+        )
 
 
 def epoch_utc_ns(config: BenchConfig) -> int | None:
@@ -93,7 +112,9 @@ def has_observer(config: BenchConfig) -> bool:
     centre.
     """
     bodies = config.sky.bodies
-    shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
+    shown = (
+        bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
+    )
     return shown or config.spacecraft.orbit is not None or config.site is not None
 
 
@@ -120,7 +141,9 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
     """
     if config.sky.epoch_utc == UNIX:
         if scale in SCALES and scale != "UTC":
-            raise InputError(f'{EPOCH_KEY} "{UNIX}": the times of this log are {scale}; write "{FROM_SOURCE}"')
+            raise InputError(
+                f'{EPOCH_KEY} "{UNIX}": the times of this log are {scale}; write "{FROM_SOURCE}"'
+            )
         return _on_day(config, UNIX, first_ns)
     if config.sky.epoch_utc != FROM_SOURCE:
         return config
@@ -147,7 +170,9 @@ def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
     day.
     """
     day = jyear(utc_ns // DAY_NS * DAY_NS)
-    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day))
+    return msgspec.structs.replace(
+        config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day)
+    )
 
 
 def jyear(utc_ns: int) -> float:
@@ -192,7 +217,9 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
     `parse_config` does.
     """
     if HEADS in tables:
-        raise InputError(f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files")
+        raise InputError(
+            f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files"
+        )
     try:
         _check_finite(tables)
         config = _converted(tables)
@@ -204,7 +231,10 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
             render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
         if render.colour == "depth":
             render = msgspec.structs.replace(render, bit_stealing=True)
-        if sky.epoch_utc not in {FROM_SOURCE, UNIX} and (utc_ns := epoch_utc_ns(config)) is not None:
+        if (
+            sky.epoch_utc not in {FROM_SOURCE, UNIX}
+            and (utc_ns := epoch_utc_ns(config)) is not None
+        ):
             sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
         return msgspec.structs.replace(config, render=render, sky=sky)
     except InputError as error:
@@ -240,8 +270,13 @@ def _check_meaning(config: BenchConfig) -> None:
         ("[tracker] q_body_to_cam", config.tracker.q_body_to_cam),
     ):
         if q is not None and abs(math.hypot(*q) - 1) > NORM_TOLERANCE:
-            raise InputError(f"{where}: its norm is {math.hypot(*q):.6g}; write a unit quaternion w, x, y, z")
-    for table, (width, height) in (("tracker", config.tracker.resolution_px), ("monitor", config.monitor.resolution_px)):
+            raise InputError(
+                f"{where}: its norm is {math.hypot(*q):.6g}; write a unit quaternion w, x, y, z"
+            )
+    for table, (width, height) in (
+        ("tracker", config.tracker.resolution_px),
+        ("monitor", config.monitor.resolution_px),
+    ):
         if width * height > MAX_AREA_PX:
             raise InputError(
                 f"[{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
@@ -249,13 +284,19 @@ def _check_meaning(config: BenchConfig) -> None:
             )
     render, faults = config.render, config.faults
     if render.flux_at_white_e_per_s is not None and render.brightest_v_mag is not None:
-        raise InputError("[render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
+        raise InputError(
+            "[render] has flux_at_white_e_per_s and brightest_v_mag; write one of them"
+        )
     ideal = ("true_focal_length_mm", "true_pixel_pitch_um", "true_q_cam_to_mon")
     beside = next((name for name in ideal if getattr(config.verify, name) is not None), None)
     if config.verify.true_geometry is not None and beside is not None:
-        raise InputError(f"[verify] true_geometry takes the place of {beside}; leave one of them out")
+        raise InputError(
+            f"[verify] true_geometry takes the place of {beside}; leave one of them out"
+        )
     if faults.endpoint is not None and faults.endpoint == config.attitude.address:
-        raise InputError(f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port")
+        raise InputError(
+            f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port"
+        )
     hardware.check_channels(config.tracker)
     hardware.check_primaries(config.monitor.primaries)
     _check_colour(config)
@@ -304,7 +345,9 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
     sky, background, attitude = config.sky, config.background, config.attitude
     room_km_s = MAX_SPEED_KM_S if attitude.source == "vizard" else 0.0
     if math.hypot(*sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
-        raise InputError("[sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
+        raise InputError(
+            "[sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z"
+        )
     levels = ("electrons_per_px", "zodiacal_v_mag_arcsec2", "zodiacal")
     given = [name for name in levels if getattr(background, name) is not None]
     if len(given) > 1:
@@ -312,7 +355,9 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
     if sky.epoch_utc is not None and "epoch_jyear" in tables.get("sky", {}):
         raise InputError("[sky] has epoch_utc and epoch_jyear; write one of them")
     if sky.bodies.satellite_magnitudes is not None and sky.bodies.satellites is None:
-        raise InputError('[sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
+        raise InputError(
+            '[sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too'
+        )
     for needs, what in (
         (background.zodiacal is not None, "[background] zodiacal needs"),
         (config.site is not None, "[site] needs"),
@@ -335,7 +380,9 @@ def _check_site(config: BenchConfig) -> None:
         return
     if config.spacecraft.orbit is not None or config.sky.bodies.earth:
         other = "[sky.bodies] earth" if config.spacecraft.orbit is None else "[spacecraft] orbit"
-        raise InputError(f"[site] is a place on the ground, and {other} is seen from above it; leave one of them out")
+        raise InputError(
+            f"[site] is a place on the ground, and {other} is seen from above it; leave one of them out"
+        )
     if config.attitude.source == "vizard" and config.attitude.use_velocity:
         raise InputError(
             '[site] is a place on the ground, and [attitude] source = "vizard" sends a spacecraft\'s velocity; write'
@@ -360,7 +407,11 @@ def _check_orbit(config: BenchConfig) -> None:
             f'[attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and velocity;'
             " leave use_velocity out"
         )
-    if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
+    if (
+        orbit not in {None, GEOCENTRE, SOURCE}
+        and attitude.source == "vizard"
+        and attitude.use_velocity
+    ):
         raise InputError(
             "[attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write use_velocity = false,"
             ' or orbit = "geocentre"'

@@ -12,7 +12,16 @@ from msgspec import Meta
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.toml_tables import Table
 from hilstar.server.bench.config.attitude import AttitudeSettings
-from hilstar.server.bench.config.values import MAX_NUMBER, Frequency, NotNegative, Point, Positive, Rotation, Sigma, Size
+from hilstar.server.bench.config.values import (
+    MAX_NUMBER,
+    Frequency,
+    NotNegative,
+    Point,
+    Positive,
+    Rotation,
+    Sigma,
+    Size,
+)
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
 MS_PER_S = 1000.0
@@ -32,13 +41,12 @@ LAYOUTS: dict[str, tuple[tuple[float, float], ...]] = {
     "vertical": ((0.0, -THIRD), (0.0, 0.0), (0.0, THIRD)),
 }
 WHITE_TOO = "its white has a subpixel of its own, so red, green and blue do not add up; take a panel of three primaries"
-SHARED = (
-    "its pixels share subpixels, so a pixel's light depends on its neighbours' codes; take a panel whose pixels have all three"
-)
+SHARED = "its pixels share subpixels, so a pixel's light depends on its neighbours' codes; take a panel whose pixels have all three"
 REFUSED_LAYOUTS = dict.fromkeys(("rgbw", "wrgb", "rgwb", "woled"), WHITE_TOO)
 REFUSED_LAYOUTS |= dict.fromkeys(("pentile", "rgbg", "diamond", "delta"), SHARED)
 Chromaticity = Annotated[
-    tuple[Annotated[float, Meta(ge=0, le=0.8)], Annotated[float, Meta(ge=1e-3, le=0.9)]], Meta(extra={"form": "[x, y]"})
+    tuple[Annotated[float, Meta(ge=0, le=0.8)], Annotated[float, Meta(ge=1e-3, le=0.9)]],
+    Meta(extra={"form": "[x, y]"}),
 ]
 Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1, le=1)]]
 
@@ -124,7 +132,10 @@ class Tracker(Table, frozen=True):
         """The quantum efficiency of each channel by its key: one, or those of red, green and
         blue.
         """
-        given = {key: getattr(self, key) for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb"))}
+        given = {
+            key: getattr(self, key)
+            for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb"))
+        }
         return {key: value for key, value in given.items() if value is not None}
 
 
@@ -133,7 +144,9 @@ def check_channels(tracker: Tracker) -> None:
     given = tracker.quantum_efficiencies
     missing = [key for key in (f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb") if key not in given]
     if QUANTUM_EFFICIENCY in given and len(given) > 1:
-        raise InputError(f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or _r, _g and _b")
+        raise InputError(
+            f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or _r, _g and _b"
+        )
     if tracker.detector.bayer is not None and QUANTUM_EFFICIENCY in given:
         three = ", ".join(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb")
         raise InputError(
@@ -167,7 +180,9 @@ class PrimariesSettings(Table, frozen=True):
     layout: str = "white"
     #: In place of `layout`: where the light of red, green and blue lies, in pixels from the middle,
     #: right and down on the screen. Default: by `layout`
-    offsets_px: Annotated[tuple[Offset, Offset, Offset] | None, Meta(extra={"form": "[[x, y], [x, y], [x, y]]"})] = None
+    offsets_px: Annotated[
+        tuple[Offset, Offset, Offset] | None, Meta(extra={"form": "[[x, y], [x, y], [x, y]]"})
+    ] = None
 
     @property
     def known(self) -> bool:
@@ -189,9 +204,13 @@ def check_primaries(primaries: PrimariesSettings) -> None:
         raise InputError(f"[monitor.primaries] has file and {given[0]}; write one of them")
     if given and len(given) < len(LAYOUTS["white"]):
         missing = next(key for key in ("xy_r", "xy_g", "xy_b") if key not in given)
-        raise InputError(f"[monitor.primaries] has {given[0]} and no {missing}; write xy_r, xy_g and xy_b")
+        raise InputError(
+            f"[monitor.primaries] has {given[0]} and no {missing}; write xy_r, xy_g and xy_b"
+        )
     if primaries.layout in REFUSED_LAYOUTS:
-        raise InputError(f'[monitor.primaries] layout = "{primaries.layout}": {REFUSED_LAYOUTS[primaries.layout]}')
+        raise InputError(
+            f'[monitor.primaries] layout = "{primaries.layout}": {REFUSED_LAYOUTS[primaries.layout]}'
+        )
     if primaries.layout not in LAYOUTS:
         names = ", ".join(f'"{name}"' for name in LAYOUTS)
         meant = did_you_mean(primaries.layout, tuple(LAYOUTS))
@@ -289,7 +308,9 @@ class SyncSettings(Table, frozen=True):
     turn_deg_s: Positive = 1.0
 
 
-def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude: AttitudeSettings) -> None:
+def check_sync(
+    sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude: AttitudeSettings
+) -> None:
     """Refuse (InputError) exposures that overlap, a pulse that lasts until the next, and a port
     that is the attitude's.
     """
@@ -301,16 +322,21 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
     if sync.port is None:
         return
     if not (sync.port.strip() and sync.port.isprintable()) or (
-        "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
+        "://" in sync.port
+        and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
     ):
         advice = f'write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"; leave it out for no pulse'
         raise InputError(f"[sync] port = {sync.port!r}: {advice}")
     between_ms = sync.every_frames * monitor.period_ms
     if sync.pulse_ms >= between_ms:
-        what = f"[sync] pulse_ms = {sync.pulse_ms:g}: the next pulse is due after {between_ms:.4g} ms"
+        what = (
+            f"[sync] pulse_ms = {sync.pulse_ms:g}: the next pulse is due after {between_ms:.4g} ms"
+        )
         raise InputError(f"{what}; write a shorter pulse, or a larger every_frames")
     if attitude.source == "serial" and sync.port == attitude.port:
-        raise InputError(f"[sync] port = {sync.port}: the attitude comes over it; write another port")
+        raise InputError(
+            f"[sync] port = {sync.port}: the attitude comes over it; write another port"
+        )
 
 
 class Verify(Table, frozen=True):

@@ -52,7 +52,9 @@ UNITS = {
     "_s": "s",
 }
 FILLED_IN = {
-    "QUANTISERS": "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items()),
+    "QUANTISERS": "".join(
+        f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items()
+    ),
     "MAX_JUDGED_FRAMES": f"{MAX_JUDGED_FRAMES}",
     "DEFAULT_BRIGHTEST_V_MAG": f"{DEFAULT_BRIGHTEST_V_MAG}",
 }
@@ -61,10 +63,18 @@ WORDS = Path(__file__).with_name("bench-file.md")  # what the page says beside t
 
 def page() -> str:
     """The whole page."""
-    head, *sections = re.split(r"^## `\[(.*)\]`$", WORDS.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    head, *sections = re.split(
+        r"^## `\[(.*)\]`$", WORDS.read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     notes = dict(zip(sections[::2], sections[1::2], strict=True))
     return "\n".join(
-        [f"{head.rstrip()}\n", *(section(name, table, notes.get(name, "")) for name, table in tables_of(BenchConfig, ""))]
+        [
+            f"{head.rstrip()}\n",
+            *(
+                section(name, table, notes.get(name, ""))
+                for name, table in tables_of(BenchConfig, "")
+            ),
+        ]
     )
 
 
@@ -82,7 +92,9 @@ def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 def table_in(hint: Any) -> type[msgspec.Struct] | None:
     """The table that a key is, or may be (`X | None`); None for any other key."""
     kind = plain(hint)
-    parts = [part for part in get_args(kind) if part is not type(None)] if is_optional(kind) else [kind]
+    parts = (
+        [part for part in get_args(kind) if part is not type(None)] if is_optional(kind) else [kind]
+    )
     only = parts[0] if len(parts) == 1 else None
     return only if isinstance(only, type) and issubclass(only, msgspec.Struct) else None
 
@@ -92,7 +104,14 @@ def section(name: str, table: Any, notes: str) -> str:
     hints, meanings = get_type_hints(table, include_extras=True), meanings_of(table)
     keys = [field for field in msgspec.structs.fields(table) if table_in(field.type) is None]
     rows = [row(field, hints[field.name], meanings[field.name]) for field in keys]
-    lines = [f"## `[{name}]`", "", inspect.getdoc(table) or "", "", "| key | value | default | meaning |", "|---|---|---|---|"]
+    lines = [
+        f"## `[{name}]`",
+        "",
+        inspect.getdoc(table) or "",
+        "",
+        "| key | value | default | meaning |",
+        "|---|---|---|---|",
+    ]
     return "\n".join([*lines, *rows, "", *([notes.strip(), ""] if notes else [])])
 
 
@@ -105,7 +124,11 @@ def meanings_of(table: type) -> dict[str, str]:
             first = key.lineno - 1
             while lines[first - 1].lstrip().startswith("#:"):
                 first -= 1
-            told = " ".join(line.partition("#:")[2].strip() for line in lines[first : key.end_lineno] if "#:" in line)
+            told = " ".join(
+                line.partition("#:")[2].strip()
+                for line in lines[first : key.end_lineno]
+                if "#:" in line
+            )
             for name, words in FILLED_IN.items():
                 told = told.replace(f"{{{name}}}", words)
             meanings[key.target.id] = told
@@ -125,7 +148,12 @@ def row(field: FieldInfo, hint: Any, told: str) -> str:
 def notes_of(hint: Any) -> list[Meta]:
     """The notes in the annotations of a type, inner ones first; those of `X | None` are X's too."""
     kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    inner = [note for choice in get_args(kind) if get_origin(choice) is Annotated for note in notes_of(choice)]
+    inner = [
+        note
+        for choice in get_args(kind)
+        if get_origin(choice) is Annotated
+        for note in notes_of(choice)
+    ]
     return (inner if is_optional(kind) else []) + [note for note in notes if isinstance(note, Meta)]
 
 
@@ -137,13 +165,23 @@ def is_optional(kind: Any) -> bool:
 def value_text(name: str, hint: Any) -> str:
     """The values of a key: its choices, or its form, limits and unit."""
     kind, notes = plain(hint), notes_of(hint)
-    choices = tuple(plain(choice) for choice in get_args(kind) if choice is not type(None)) if is_optional(kind) else ()
+    choices = (
+        tuple(plain(choice) for choice in get_args(kind) if choice is not type(None))
+        if is_optional(kind)
+        else ()
+    )
     if len(choices) == 1:
         (kind,) = choices
     if get_origin(kind) is Literal:
         return ", ".join(f"`{toml(choice)}`" for choice in get_args(kind))
     form = next((note.extra["form"] for note in notes if note.extra and "form" in note.extra), None)
-    words = f"`{form}`" if form else " or ".join(TYPE_WORDS[choice.__name__] for choice in choices or get_args(kind) or (kind,))
+    words = (
+        f"`{form}`"
+        if form
+        else " or ".join(
+            TYPE_WORDS[choice.__name__] for choice in choices or get_args(kind) or (kind,)
+        )
+    )
     unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
     return ", ".join(part for part in (words, limits_text(notes), unit) if part)
 

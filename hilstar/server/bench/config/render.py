@@ -36,7 +36,9 @@ class RenderSettings(Table, frozen=True):
     #: What a frame of an average field takes by `round` and by `exact`, for `auto` of every
     #: command: nothing is measured then. `--explain` of a run that measured prints the line to
     #: write. Default: measured, or tabulated
-    codes_ms: Annotated[tuple[Positive, Positive] | None, Meta(extra={"form": "[round, exact]"})] = None
+    codes_ms: Annotated[
+        tuple[Positive, Positive] | None, Meta(extra={"form": "[round, exact]"})
+    ] = None
     #: Lets the codes of r, g and b differ by one: seven times as many levels, weighted as the
     #: tracker sees the primaries: by `[weights]` of the calibration file. Formulas, such as sRGB,
     #: assume Rec. 709's, a photometer's, and `serve`, `replay` and `budget` say so.

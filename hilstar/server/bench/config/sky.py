@@ -8,7 +8,13 @@ import msgspec
 from msgspec import Meta
 
 from hilstar.basics.toml_tables import Table
-from hilstar.server.bench.config.values import EpochJyear, IcrsVector, Magnitude, NotNegative, Signed
+from hilstar.server.bench.config.values import (
+    EpochJyear,
+    IcrsVector,
+    Magnitude,
+    NotNegative,
+    Signed,
+)
 
 GEOCENTRE = "geocentre"
 SOURCE = "source"
@@ -163,4 +169,6 @@ class Background(Table, frozen=True):
     zodiacal: Literal["leinert1998"] | None = None
     #: By how many electrons per exposure the background grows from one edge of the detector to the
     #: other.
-    gradient_electrons_across: Annotated[tuple[Signed, Signed], Meta(extra={"form": "[right, down]"})] = (0.0, 0.0)
+    gradient_electrons_across: Annotated[
+        tuple[Signed, Signed], Meta(extra={"form": "[right, down]"})
+    ] = (0.0, 0.0)

@@ -27,7 +27,13 @@ from hilstar.server.console.messages import Order, OrderAnswer, PictureRequest, 
 from hilstar.server.console.overlay import OverlayScene
 from hilstar.server.console.protocol import PageText
 from hilstar.server.console.server.app import ORDERED_S, Page
-from hilstar.server.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
+from hilstar.server.console.server.connections import (
+    PING_S,
+    PONG_S,
+    BoundedHttp,
+    OpenPages,
+    ReadingWebSocket,
+)
 from hilstar.server.console.server.reader import TICK_S, PicturePacker, RunReader
 from hilstar.server.console.server.scpi import ScpiServer
 
@@ -68,10 +74,14 @@ class OrderChannel:
         self._waiting[order.id] = answer
         try:
             async with asyncio.timeout(ORDERED_S):
-                await asyncio.get_running_loop().sock_sendall(self._channel, msgspec.json.encode(order))
+                await asyncio.get_running_loop().sock_sendall(
+                    self._channel, msgspec.json.encode(order)
+                )
                 return await answer
         except TimeoutError:
-            return OrderAnswer(id=0, status=504, line=f"no answer of the run within {ORDERED_S:g} s")
+            return OrderAnswer(
+                id=0, status=504, line=f"no answer of the run within {ORDERED_S:g} s"
+            )
         finally:
             self._waiting.pop(order.id, None)
 
@@ -99,7 +109,11 @@ async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> Non
             pages.tell(PageText(event=event))
         pages.tell(PageText(state=reader.state(), point=reader.points[-1]))
         hz = pages.picture_hz
-        memory.want = PictureRequest(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S) if hz else PictureRequest()
+        memory.want = (
+            PictureRequest(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S)
+            if hz
+            else PictureRequest()
+        )
         due_s = max(due_s + TICK_S, loop.time())
         await asyncio.sleep(due_s - loop.time())
 
@@ -119,7 +133,9 @@ async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None
                 pages.show(packed)
 
 
-async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int) -> None:
+async def run(
+    setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int
+) -> None:
     """Serve until the run has ended."""
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
     reader, pages = RunReader(memory, setup), OpenPages()
@@ -143,9 +159,16 @@ async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd
     )
     works: list[Coroutine[Any, Any, None]] = [tick(reader, memory, pages)]
     if page_fd >= 0:
-        works += [Server(config).serve([socket.socket(fileno=page_fd)]), show(PicturePacker(memory, scene), reader, pages)]
+        works += [
+            Server(config).serve([socket.socket(fileno=page_fd)]),
+            show(PicturePacker(memory, scene), reader, pages),
+        ]
     if setup.scpi is not None:
-        works.append(ScpiServer(setup.scpi, reader, memory, channel.give).serve(socket.socket(fileno=scpi_fd)))
+        works.append(
+            ScpiServer(setup.scpi, reader, memory, channel.give).serve(
+                socket.socket(fileno=scpi_fd)
+            )
+        )
     tasks = [asyncio.create_task(work) for work in works]
     ended = asyncio.create_task(channel.listen())
     done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
@@ -168,9 +191,15 @@ def main() -> None:
     memory = SharedMemory(board_fd, setup.picture_bytes)
     code = 0
     try:
-        asyncio.run(run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd))
+        asyncio.run(
+            run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd)
+        )
     except Exception as error:  # whatever it is: the run starts the page again
-        print(one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"), file=sys.stderr, flush=True)
+        print(
+            one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"),
+            file=sys.stderr,
+            flush=True,
+        )
         code = 1
     os._exit(code)  # without waiting for threads
 

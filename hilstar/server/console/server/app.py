@@ -14,7 +14,12 @@ from typing import Any
 
 import msgspec
 from prometheus_client import CollectorRegistry
-from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.metrics_core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.registry import Collector
 from starlette.applications import Starlette
@@ -29,7 +34,14 @@ from hilstar.basics.palette import palette_css
 from hilstar.basics.wrong_sky import ENDS
 from hilstar.server.answers.judge import VERDICTS, TrackerFigures
 from hilstar.server.console.messages import Order, OrderAnswer, RunState, Setup
-from hilstar.server.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
+from hilstar.server.console.protocol import (
+    CONTROLS,
+    SUBPROTOCOL,
+    TOKEN_PROTOCOL,
+    OrderBody,
+    PageText,
+    SkyMap,
+)
 from hilstar.server.console.server.connections import OpenPage, OpenPages
 from hilstar.server.console.server.reader import RunReader
 
@@ -68,7 +80,10 @@ class Guard:
     def __init__(self, setup: Setup) -> None:
         self._hosts = set(setup.hosts)
         self._names = {name for name in setup.names if ":" in name} | {
-            f"{name}{port}" for name in setup.names if ":" not in name for port in ("", ":443", ":80", f":{setup.port}")
+            f"{name}{port}"
+            for name in setup.names
+            if ":" not in name
+            for port in ("", ":443", ":80", f":{setup.port}")
         }
         self._any_address, self._port, self._token = setup.any_address, setup.port, setup.token
 
@@ -76,7 +91,10 @@ class Guard:
         """Raises Refused (421) for a name that is not the page's."""
         host = host.lower()
         if host not in self._names and not self._is_own(host):
-            raise Refused(421, "this page is not served under that name; open it as hilstar printed it, or give --console-name")
+            raise Refused(
+                421,
+                "this page is not served under that name; open it as hilstar printed it, or give --console-name",
+            )
 
     def _is_own(self, host: str) -> bool:
         name, port = _split(host)
@@ -96,7 +114,10 @@ class Guard:
         origin, host = headers.get("origin"), headers.get("host", "").lower()
         if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
             raise Refused(403, "another site's page may not ask here")
-        if headers.get("sec-fetch-site", "none") in {"cross-site", "same-site"} and headers.get("sec-fetch-mode") != "navigate":
+        if (
+            headers.get("sec-fetch-site", "none") in {"cross-site", "same-site"}
+            and headers.get("sec-fetch-mode") != "navigate"
+        ):
             raise Refused(403, "another site's page may not ask here")
 
     def check_token(self, headers: Mapping[str, str], protocols: Iterable[str] = ()) -> None:
@@ -107,13 +128,18 @@ class Guard:
             return
         scheme, _, given = headers.get("authorization", "").partition(" ")
         tokens = [given.strip()] if scheme.lower() == "bearer" else []
-        tokens += [name.removeprefix(TOKEN_PROTOCOL) for name in protocols if name.startswith(TOKEN_PROTOCOL)]
+        tokens += [
+            name.removeprefix(TOKEN_PROTOCOL)
+            for name in protocols
+            if name.startswith(TOKEN_PROTOCOL)
+        ]
         wanted = self._token.encode()
         # each, whichever was right
         matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]
         if True not in matches:
             raise Refused(
-                401, "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer"
+                401,
+                "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer",
             )
 
 
@@ -140,8 +166,14 @@ class RunCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics with their current values."""
-        hello, seen, health = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0), self._reader.health
-        info = {key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")}
+        hello, seen, health = (
+            self._reader.setup.hello,
+            self._reader.seen or RunState(host_ns=0),
+            self._reader.health,
+        )
+        info = {
+            key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")
+        }
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
         counts, clock, ledger, pacing = seen.counts, seen.clock, seen.ledger, self._reader.pacing
         age_ms = None if seen.attitude is None else seen.attitude.age_ms
@@ -149,17 +181,29 @@ class RunCollector(Collector):
             ("frames", "Frames shown.", counts.frames),
             ("frames_missed", "Refresh periods without a frame of their own.", counts.missed),
             ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
-            ("frames_given_up", "Frames given up because their moment had passed.", counts.given_up),
+            (
+                "frames_given_up",
+                "Frames given up because their moment had passed.",
+                counts.given_up,
+            ),
             ("packets_received", "Attitude packets received.", counts.received),
-            ("packets_lost", "Attitude packets that never came, by gaps of their sequence.", counts.lost),
+            (
+                "packets_lost",
+                "Attitude packets that never came, by gaps of their sequence.",
+                counts.lost,
+            ),
             ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", seen.wrong_sky_s),
         ):
             yield CounterMetricFamily(f"hilstar_{name}", words, value=count)
-        refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
+        refused = CounterMetricFamily(
+            "hilstar_packets_refused", "Attitude packets refused.", labels=["reason"]
+        )
         for reason, count in counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
-        wrong = GaugeMetricFamily("hilstar_wrong_sky", "1 while the sky shown is wrong, by kind.", labels=["kind"])
+        wrong = GaugeMetricFamily(
+            "hilstar_wrong_sky", "1 while the sky shown is wrong, by kind.", labels=["kind"]
+        )
         lasting = {condition.kind for condition in seen.wrong_sky}
         for kind in ENDS:
             wrong.add_metric([kind], float(kind in lasting))
@@ -174,16 +218,51 @@ class RunCollector(Collector):
             ("attitude_missing", "1 until an attitude has come.", seen.frame.missing, 1),
             ("attitude_stale", "1 while the attitude is stale.", seen.frame.stale, 1),
             ("attitude_age_seconds", "Age of the attitude of the newest frame.", age_ms, 1e-3),
-            ("clock_offset_seconds", "Host time minus the sender's.", None if clock is None else clock.offset_ms, 1e-3),
-            ("clock_uncertainty_seconds", "Of the offset.", None if clock is None else clock.sigma_ms, 1e-3),
-            ("clock_drift_ratio", "How much faster the sender's clock runs.", None if clock is None else clock.drift_ppm, 1e-6),
+            (
+                "clock_offset_seconds",
+                "Host time minus the sender's.",
+                None if clock is None else clock.offset_ms,
+                1e-3,
+            ),
+            (
+                "clock_uncertainty_seconds",
+                "Of the offset.",
+                None if clock is None else clock.sigma_ms,
+                1e-3,
+            ),
+            (
+                "clock_drift_ratio",
+                "How much faster the sender's clock runs.",
+                None if clock is None else clock.drift_ppm,
+                1e-6,
+            ),
             ("stars", "Stars in the newest frame.", seen.frame.stars, 1),
-            ("stars_clipped", "Those brighter than the monitor's white.", len(seen.frame.clipped), 1),
+            (
+                "stars_clipped",
+                "Those brighter than the monitor's white.",
+                len(seen.frame.clipped),
+                1,
+            ),
             ("display_lost", "1 where the display has gone.", bool(seen.display_lost), 1),
-            ("operator_override", "1 while an operator changes the sky.", bool(seen.operator_text), 1),
+            (
+                "operator_override",
+                "1 while an operator changes the sky.",
+                bool(seen.operator_text),
+                1,
+            ),
             ("ledger_bytes", "Size of the ledger.", None if ledger is None else ledger.bytes, 1),
-            ("ledger_failing", "1 while it cannot be written.", None if ledger is None else bool(ledger.failing), 1),
-            ("frame_interval_sd_seconds", "Standard deviation of it.", None if pacing is None else pacing.sd_ms, 1e-3),
+            (
+                "ledger_failing",
+                "1 while it cannot be written.",
+                None if ledger is None else bool(ledger.failing),
+                1,
+            ),
+            (
+                "frame_interval_sd_seconds",
+                "Standard deviation of it.",
+                None if pacing is None else pacing.sd_ms,
+                1e-3,
+            ),
             ("console_clients", "Pages that are open.", self.clients, 1),
         ]
         for name, words, value, unit in gauges:
@@ -191,7 +270,9 @@ class RunCollector(Collector):
                 yield GaugeMetricFamily(f"hilstar_{name}", words, value=float(value * unit))
         if pacing is not None:
             words = "Between frames, over the last minute."
-            intervals = GaugeMetricFamily("hilstar_frame_interval_seconds", words, labels=["quantile"])
+            intervals = GaugeMetricFamily(
+                "hilstar_frame_interval_seconds", words, labels=["quantile"]
+            )
             for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
                 intervals.add_metric([quantile], interval_ms * 1e-3)
             yield intervals
@@ -199,11 +280,15 @@ class RunCollector(Collector):
 
 def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
     """The metrics of a tracker's answers; residuals over the last minute."""
-    answers = CounterMetricFamily("hilstar_tracker_answers", "Answers of the tracker, by verdict.", labels=["verdict"])
+    answers = CounterMetricFamily(
+        "hilstar_tracker_answers", "Answers of the tracker, by verdict.", labels=["verdict"]
+    )
     for verdict in VERDICTS:
         answers.add_metric([verdict], getattr(found, verdict))
     yield answers
-    refused = CounterMetricFamily("hilstar_tracker_refused", "What was no answer, by reason.", labels=["reason"])
+    refused = CounterMetricFamily(
+        "hilstar_tracker_refused", "What was no answer, by reason.", labels=["reason"]
+    )
     for reason, count in found.refused.items():
         refused.add_metric([reason], count)
     yield refused
@@ -220,7 +305,12 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
                 gauge.add_metric([axis], value)
             yield gauge
     for name, words, figure, unit in (
-        ("availability_ratio", "Right answers of the last minute over those due.", found.availability, 1),
+        (
+            "availability_ratio",
+            "Right answers of the last minute over those due.",
+            found.availability,
+            1,
+        ),
         ("latency_seconds", "From the exposure's middle to the answer.", found.latency_ms, 1e-3),
         ("answer_age_seconds", "Since the newest answer.", found.age_s, 1),
         ("silent", "1 while the tracker does not answer.", bool(found.silent), 1),
@@ -231,7 +321,12 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
-TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+}
 MAX_BODY_BYTES = 4_000
 # a body that is too long is read this far, so that its sender comes to read why
 MAX_DRAINED_BYTES = 64_000_000
@@ -245,11 +340,15 @@ Give = Callable[[Order], Awaitable[OrderAnswer]]
 class Page:
     """The application's handlers, one per address."""
 
-    def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give) -> None:
+    def __init__(
+        self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give
+    ) -> None:
         self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
         self.guard, self.metrics = Guard(setup), RunCollector(reader)
         self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
-        self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
+        self._files = {
+            path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES
+        }
         self._files["palette.css"] = palette_css().encode()
 
     def app(self) -> ASGIApp:
@@ -278,14 +377,19 @@ class Page:
 
     async def _health(self, _: Request) -> Response:
         found = self.reader.health_now()
-        return Response(msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json")
+        return Response(
+            msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json"
+        )
 
     async def _metrics(self, _: Request) -> Response:
         self.metrics.clients = len(self.pages)
         return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     async def _state(self, _: Request) -> Response:
-        return Response(PageText(hello=self.setup.hello, state=self.reader.state()).json(), media_type="application/json")
+        return Response(
+            PageText(hello=self.setup.hello, state=self.reader.state()).json(),
+            media_type="application/json",
+        )
 
     async def _sky_map(self, _: Request) -> Response:
         return Response(self._sky, media_type="application/json")
@@ -305,10 +409,16 @@ class Page:
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return _refusal(400, f"not the JSON of a control: {error}")
         # The operator's name as the page gives it, with the address unless that is this machine.
-        who = urllib.parse.unquote(request.headers.get("x-operator", "")[:400], errors="replace").strip()
+        who = urllib.parse.unquote(
+            request.headers.get("x-operator", "")[:400], errors="replace"
+        ).strip()
         address = request.client.host if request.client else ""
-        who = (who or "somebody at the page") + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
-        order = Order(id=0, name=name, who=who, on=body.on, level=body.level, text=body.text, fault=body.name)
+        who = (who or "somebody at the page") + (
+            "" if address in {"127.0.0.1", "::1", ""} else f" ({address})"
+        )
+        order = Order(
+            id=0, name=name, who=who, on=body.on, level=body.level, text=body.text, fault=body.name
+        )
         answer = await self.give(order)
         done_ns = time.monotonic_ns()
         with contextlib.suppress(TimeoutError):  # the next request is to see what the order changed
@@ -322,14 +432,21 @@ class Page:
         self.pages.make_room()
         await socket.accept(SUBPROTOCOL if SUBPROTOCOL in socket.scope["subprotocols"] else None)
         client = OpenPage(socket)
-        client.tell(PageText(hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)).json())
+        client.tell(
+            PageText(
+                hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)
+            ).json()
+        )
         for event in list(self.reader.events)[-90:]:
             client.tell(PageText(event=event).json())
         await self.pages.follow(client)
 
 
 async def _body(request: Request) -> bytes:
-    if int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES and "expect" in request.headers:
+    if (
+        int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES
+        and "expect" in request.headers
+    ):
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
     data, seen = b"", 0
     try:
@@ -341,7 +458,9 @@ async def _body(request: Request) -> bytes:
                 elif seen > MAX_DRAINED_BYTES:
                     break
     except TimeoutError:
-        raise Refused(408 if seen <= MAX_BODY_BYTES else 413, "the body did not come in time") from None
+        raise Refused(
+            408 if seen <= MAX_BODY_BYTES else 413, "the body did not come in time"
+        ) from None
     except ClientDisconnect:
         raise Refused(400, "the body did not come") from None
     if seen > MAX_BODY_BYTES:
@@ -354,7 +473,13 @@ def _refused(_: Request, error: Exception) -> Response:
 
 
 def _refusal(status: int, line: str) -> JSONResponse:
-    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {"Connection": "close"} if status in {408, 413} else None
+    headers = (
+        {"WWW-Authenticate": "Bearer"}
+        if status == 401
+        else {"Connection": "close"}
+        if status in {408, 413}
+        else None
+    )
     return JSONResponse({"error": line}, status, headers)
 
 
@@ -378,7 +503,9 @@ class Guarded:
             host = headers["host"]
             self._guard.check_origin(headers)
             # The page itself has no secret; it brings the token that its address has.
-            if scope["type"] == "websocket" or not (scope["path"] == "/" or scope["path"].startswith("/static/")):
+            if scope["type"] == "websocket" or not (
+                scope["path"] == "/" or scope["path"].startswith("/static/")
+            ):
                 self._guard.check_token(headers, scope.get("subprotocols", ()))
             await self._app(scope, receive, _with_headers(send, host))
         except Refused as refused:

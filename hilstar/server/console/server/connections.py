@@ -53,7 +53,11 @@ class BoundedHttp(H11Protocol):
         if self._limit is None:
             self._within(HEAD_S)
         super().data_received(data)
-        if self.cycle is not None and self.cycle is not self._timed_cycle and not self.cycle.response_complete:
+        if (
+            self.cycle is not None
+            and self.cycle is not self._timed_cycle
+            and not self.cycle.response_complete
+        ):
             self._timed_cycle = self.cycle
             self._within(WHOLE_S)
 
@@ -204,7 +208,11 @@ class OpenPage:
 
     async def _send(self, data: str | bytes) -> None:
         async with asyncio.timeout(SEND_S):
-            await (self.socket.send_text(data) if isinstance(data, str) else self.socket.send_bytes(data))
+            await (
+                self.socket.send_text(data)
+                if isinstance(data, str)
+                else self.socket.send_bytes(data)
+            )
 
     async def listen(self) -> None:
         """Read the page's messages until it goes; nonsense or too many messages close it."""
@@ -262,7 +270,9 @@ class OpenPages:
         if len(self._clients) < MAX_CLIENTS:
             return
         by_address = Counter(client.address for client in self._clients)
-        worth = {c: (c.line.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients}
+        worth = {
+            c: (c.line.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients
+        }
         least = min(worth, key=worth.__getitem__)  # the first of equals is the oldest
         self._clients.pop(least)
         least.close(GIVES_WAY)
@@ -279,12 +289,16 @@ class OpenPages:
                 task.cancel()
             results = await asyncio.gather(*tasks, return_exceptions=True)
             asyncio.get_running_loop().call_later(CLOSING_S, client.line.drop)
-            if client.closing is not None and not any(isinstance(r, WebSocketDisconnect | TimeoutError) for r in results):
+            if client.closing is not None and not any(
+                isinstance(r, WebSocketDisconnect | TimeoutError) for r in results
+            ):
                 await _close(client)
 
     async def close_all(self, code: int) -> None:
         """Close all pages at the end of the run."""
-        await asyncio.gather(*(_close(client, code) for client in list(self._clients)), return_exceptions=True)
+        await asyncio.gather(
+            *(_close(client, code) for client in list(self._clients)), return_exceptions=True
+        )
 
 
 async def _close(client: OpenPage, code: int | None = None) -> None:

@@ -46,7 +46,11 @@ class RecentFrames:
 
 
 def reasons(
-    seen: messages.RunState | None, now_ns: int, lately: RecentFrames, refresh_hz: float, pace: messages.Pace
+    seen: messages.RunState | None,
+    now_ns: int,
+    lately: RecentFrames,
+    refresh_hz: float,
+    pace: messages.Pace,
 ) -> list[str]:
     """The reasons why the sky is not right, [] where it is. See `Setup.pace`."""
     if seen is None:
@@ -64,13 +68,17 @@ def reasons(
     return [*found, *_of_attitude(seen, now_ns, lately, pace), *_of_rest(seen, lately)]
 
 
-def _of_attitude(seen: messages.RunState, now_ns: int, lately: RecentFrames, pace: messages.Pace) -> Iterator[str]:
+def _of_attitude(
+    seen: messages.RunState, now_ns: int, lately: RecentFrames, pace: messages.Pace
+) -> Iterator[str]:
     if not seen.alive_ns:
         return
     if seen.frame.missing:
         yield "no attitude has come yet"
     elif seen.frame.stale:
-        age = "" if seen.attitude is None else f": {_s(round(seen.attitude.age_ms * NS_PER_MS))} old"
+        age = (
+            "" if seen.attitude is None else f": {_s(round(seen.attitude.age_ms * NS_PER_MS))} old"
+        )
         yield f"the attitude is stale{age}"
     elif pace == "asked" and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
         yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
@@ -101,7 +109,11 @@ def _s(time_ns: int) -> str:
     s = time_ns / NS_PER_S
     if s < 60:
         return f"{s:.1f} s"
-    return f"{int(s // 60)} min {int(s % 60):02d} s" if s < 3600 else f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
+    return (
+        f"{int(s // 60)} min {int(s % 60):02d} s"
+        if s < 3600
+        else f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
+    )
 
 
 class Health:
@@ -157,7 +169,9 @@ class RunReader:
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
         lately = RecentFrames(0 if self._last is None else self._last.swap_ns, self._missed_share())
-        self.health.update(reasons(self.seen, now_ns, lately, self.setup.hello.refresh_hz, self.setup.pace), unix_s)
+        self.health.update(
+            reasons(self.seen, now_ns, lately, self.setup.hello.refresh_hz, self.setup.pace), unix_s
+        )
         self._memory.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
         new = []
         for number, data in self._memory.events.after(self._event_at):
@@ -196,7 +210,9 @@ class RunReader:
                 self._received.popleft()
             first_ns, first = self._received[0]
             if now_ns > first_ns:
-                point.packets_hz = round((self.seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2)
+                point.packets_hz = round(
+                    (self.seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2
+                )
         return point
 
     def _add(self, point: protocol.ChartPoint, frame: messages.FrameNumbers) -> None:
@@ -221,24 +237,36 @@ class RunReader:
         return lost / (shown + lost) if shown + lost else 0.0
 
     def _pacing_now(self, now_ns: int) -> protocol.Pacing | None:
-        while self._intervals_ms and now_ns - self._intervals_ms[0][0] > protocol.HISTORY_S * NS_PER_S:
+        while (
+            self._intervals_ms and now_ns - self._intervals_ms[0][0] > protocol.HISTORY_S * NS_PER_S
+        ):
             self._intervals_ms.popleft()
         if len(self._intervals_ms) < MIN_INTERVALS:
             return None
         intervals_ms = np.array([interval for _, interval in self._intervals_ms])
         p50, p99 = np.percentile(intervals_ms, [50, 99])
-        return protocol.Pacing(round(float(p50), 3), round(float(p99), 3), round(float(np.std(intervals_ms, ddof=1)), 4))
+        return protocol.Pacing(
+            round(float(p50), 3),
+            round(float(p99), 3),
+            round(float(np.std(intervals_ms, ddof=1)), 4),
+        )
 
     def health_now(self) -> protocol.SkyHealth:
         """The answer of `GET /health`."""
-        return protocol.SkyHealth(self.health.ok, utc_text(self.health.since_s), self.health.reasons)
+        return protocol.SkyHealth(
+            self.health.ok, utc_text(self.health.since_s), self.health.reasons
+        )
 
     def state(self) -> protocol.PageState:
         """The state of the run, as the page shows it."""
         seen = messages.RunState(host_ns=0) if self.seen is None else self.seen
-        same: dict[str, Any] = {name: getattr(seen, name) for name in protocol.SkyState.__struct_fields__}
+        same: dict[str, Any] = {
+            name: getattr(seen, name) for name in protocol.SkyState.__struct_fields__
+        }
         now, health = utc_text(time.time()), self.health_now()
-        return protocol.PageState(utc=now, health=health, source=self.setup.source, pacing=self.pacing, **same)
+        return protocol.PageState(
+            utc=now, health=health, source=self.setup.source, pacing=self.pacing, **same
+        )
 
 
 LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
@@ -270,14 +298,34 @@ class PicturePacker:
         number, data = found
         head = messages.PictureHead._make(messages.PICTURE.unpack_from(data))
         count, dtype = head.width * head.height, np.dtype(f"<u{head.item_bytes}")
-        levels = Levels(np.frombuffer(data, dtype, count, messages.PICTURE_HEAD_BYTES).reshape(head.height, head.width))
-        sprites = np.frombuffer(data, messages.SPRITE, head.sprites, messages.PICTURE_HEAD_BYTES + count * head.item_bytes)
-        if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
+        levels = Levels(
+            np.frombuffer(data, dtype, count, messages.PICTURE_HEAD_BYTES).reshape(
+                head.height, head.width
+            )
+        )
+        sprites = np.frombuffer(
+            data,
+            messages.SPRITE,
+            head.sprites,
+            messages.PICTURE_HEAD_BYTES + count * head.item_bytes,
+        )
+        if (
+            self._scene is not None
+            and seen is not None
+            and seen.overlay
+            and not self._scene.aids_in_levels
+        ):
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
         # The binary message: a length, a JSON head of that many bytes, and the deflated levels.
-        form = protocol.PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
+        form = protocol.PictureFormat(
+            w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}"
+        )
         text = msgspec.json.encode(form)
-        picture = struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
+        picture = (
+            struct.pack("<I", len(text))
+            + text
+            + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
+        )
         truth = protocol.Truth(frame=head.frame, stars=[])
         if self._scene is not None:
             q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
@@ -287,25 +335,40 @@ class PicturePacker:
             if answer is not None and answer.q_lit is not None and shown is not None:
                 residual, lit = answer.figures.residual_arcsec, np.array(answer.q_lit)
                 marks = self._scene.marks.answer(residual, lit, shown, answer.centroids)
-                truth = msgspec.structs.replace(truth, reported_px=marks.field_px, centroids_px=marks.centroids_px)
+                truth = msgspec.structs.replace(
+                    truth, reported_px=marks.field_px, centroids_px=marks.centroids_px
+                )
         without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
         return PackedPicture(
-            number, picture, protocol.PageText(truth=without_grid).json(), protocol.PageText(truth=truth).json()
+            number,
+            picture,
+            protocol.PageText(truth=without_grid).json(),
+            protocol.PageText(truth=truth).json(),
         )
 
 
-def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: messages.RunState | None) -> list[protocol.StarMark]:
+def stars_of(
+    scene: OverlayScene, sprites: np.ndarray, seen: messages.RunState | None
+) -> list[protocol.StarMark]:
     """Where the stars of a picture were drawn, the brightest first."""
     # A moving star has several sprites along its path: the mean place of each.
     stars, which = np.unique(sprites["star"], return_inverse=True)
     count = np.bincount(which, minlength=len(stars))
-    x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))
+    x_px, y_px = (
+        np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1)
+        for axis in ("x_px", "y_px")
+    )
     clipped = set() if seen is None else set(seen.frame.clipped)
     marks = []
     for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
         star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])
         hip, label = int(scene.hip[star]), scene.label(star)
         known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
-        place, over = (round(float(x_px[k]), 2), round(float(y_px[k]), 2)), int((hip or label) in clipped)
-        marks.append(protocol.StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, "")))
+        place, over = (
+            (round(float(x_px[k]), 2), round(float(y_px[k]), 2)),
+            int((hip or label) in clipped),
+        )
+        marks.append(
+            protocol.StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, ""))
+        )
     return marks

@@ -30,7 +30,16 @@ from hilstar.basics.rotation import propagate
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.version import __version__
 from hilstar.server.console import scpi
-from hilstar.server.console.messages import FRAME, HAS_AGE, FrameNumbers, Order, OrderAnswer, RunState, ScpiSetup, SharedMemory
+from hilstar.server.console.messages import (
+    FRAME,
+    HAS_AGE,
+    FrameNumbers,
+    Order,
+    OrderAnswer,
+    RunState,
+    ScpiSetup,
+    SharedMemory,
+)
 from hilstar.server.console.scpi import (
     NOT_A_NUMBER,
     OPERATION_COMPLETE,
@@ -61,7 +70,14 @@ MAX_WRONG_TOKENS = 5
 WRONG_TOKEN_S = 0.5
 # by an order's HTTP status; else -310
 ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}
-UNLOCKED = {"*IDN?", "*CLS", "SYSTem:AUTHenticate", "SYSTem:ERRor[:NEXT]?", "SYSTem:ERRor:COUNt?", "SYSTem:VERSion?"}
+UNLOCKED = {
+    "*IDN?",
+    "*CLS",
+    "SYSTem:AUTHenticate",
+    "SYSTem:ERRor[:NEXT]?",
+    "SYSTem:ERRor:COUNt?",
+    "SYSTem:VERSion?",
+}
 
 # Bits of the operation and the questionable status; SCPI-1999 leaves bits 8 to 12 and 9 to 12 to a
 # device.
@@ -97,7 +113,9 @@ class SkySource:
     def rate(self, rate_deg_s: tuple[float, ...]) -> None:
         """Turn at this rate from now on, deg/s, cam (3,). Raises ScpiError."""
         if math.hypot(*rate_deg_s) > self._max_rate_deg_s:
-            raise ScpiError(-222, f"faster than [attitude] max_rate_deg_s = {self._max_rate_deg_s:g}")
+            raise ScpiError(
+                -222, f"faster than [attitude] max_rate_deg_s = {self._max_rate_deg_s:g}"
+            )
         now_ns = time.monotonic_ns()
         if self._q is not None:
             self._q = self._at(self._q, now_ns)
@@ -112,7 +130,9 @@ class SkySource:
         if self._q is None:
             return
         t_ns = self.set_ns if jumps else time.monotonic_ns()
-        sample = checked_sample(t_ns, tuple(self._at(self._q, t_ns)), tuple(self._rate_rad_s), self._sequence, jumps)
+        sample = checked_sample(
+            t_ns, tuple(self._at(self._q, t_ns)), tuple(self._rate_rad_s), self._sequence, jumps
+        )
         assert not isinstance(sample, Refusal)
         self._sequence += 1
         with contextlib.suppress(OSError):  # the run is ending
@@ -196,7 +216,9 @@ class Peers:
 class ScpiServer:
     """What all connections share: the run, its orders, and the sky where SCPI steers it."""
 
-    def __init__(self, setup: ScpiSetup, reader: RunReader, memory: SharedMemory, give: Give) -> None:
+    def __init__(
+        self, setup: ScpiSetup, reader: RunReader, memory: SharedMemory, give: Give
+    ) -> None:
         self.setup, self.reader, self.give = setup, reader, give
         self.sky = SkySource(setup.steer_port, setup.max_rate_deg_s) if setup.steer_port else None
         self._memory = memory
@@ -228,7 +250,9 @@ class ScpiServer:
         operation = SKY_SHOWN * (not seen.frame.blank) | LEDGER_ON * (seen.ledger is not None)
         operation |= FAULT_ON * bool(seen.faults) | OPERATOR_ON * bool(seen.operator_text)
         failing = seen.ledger is not None and bool(seen.ledger.failing)
-        questionable = NO_ATTITUDE * (seen.frame.missing or seen.frame.stale) | LEDGER_FAILS * failing
+        questionable = (
+            NO_ATTITUDE * (seen.frame.missing or seen.frame.stale) | LEDGER_FAILS * failing
+        )
         questionable |= FRAMES_MISSED * (seen.counts.missed > self._missed)
         return operation, questionable | NOT_WELL * (not self.reader.health.ok)
 
@@ -348,7 +372,10 @@ class Connection:
     async def _do(self, unit: Unit) -> None:
         try:
             if not self.unlocked and unit.pattern not in UNLOCKED:
-                raise ScpiError(-203, 'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was given')
+                raise ScpiError(
+                    -203,
+                    'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was given',
+                )
             if unit.pattern not in UNLOCKED:
                 self._acts()
             if unit.pattern in BARE:
@@ -433,7 +460,10 @@ class Connection:
 
     def _steered(self) -> SkySource:
         if self._server.sky is None:
-            raise ScpiError(-221, f"the attitude comes by {self._server.setup.source}; write [attitude] source = 'scpi'")
+            raise ScpiError(
+                -221,
+                f"the attitude comes by {self._server.setup.source}; write [attitude] source = 'scpi'",
+            )
         return self._server.sky
 
     async def set_attitude(self, unit: Unit) -> None:
@@ -466,7 +496,10 @@ class Connection:
     def self_test(self) -> str:
         """`*TST?`: 0 while the run answers and its frame loop moves."""
         seen = self.seen
-        alive = time.monotonic_ns() - seen.host_ns < ALIVE_NS and seen.host_ns - seen.alive_ns < ALIVE_NS
+        alive = (
+            time.monotonic_ns() - seen.host_ns < ALIVE_NS
+            and seen.host_ns - seen.alive_ns < ALIVE_NS
+        )
         return str(int(not alive))
 
     def faults(self) -> str:
@@ -480,7 +513,9 @@ class Connection:
 
 
 def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str:
-    return ",".join([NOT_A_NUMBER] * places if values is None else [f"{value:.12E}" for value in values])
+    return ",".join(
+        [NOT_A_NUMBER] * places if values is None else [f"{value:.12E}" for value in values]
+    )
 
 
 def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Command":
@@ -528,11 +563,17 @@ COMMANDS: dict[str, Command] = {
     "*OPC?": Connection.complete,
     "*WAI": Connection.wait,
     "*ESE": _setting(lambda status, mask: setattr(status.standard, "enable", mask), 255),
-    "*SRE": _setting(lambda status, mask: setattr(status, "service_enable", mask & ~scpi.MASTER), 255),
+    "*SRE": _setting(
+        lambda status, mask: setattr(status, "service_enable", mask & ~scpi.MASTER), 255
+    ),
     "SYSTem:AUTHenticate": Connection.authenticate,
     "STATus:PRESet": _bare(InstrumentStatus.preset),
-    "STATus:OPERation:ENABle": _setting(lambda status, mask: setattr(status.operation, "enable", mask), 0x7FFF),
-    "STATus:QUEStionable:ENABle": _setting(lambda status, mask: setattr(status.questionable, "enable", mask), 0x7FFF),
+    "STATus:OPERation:ENABle": _setting(
+        lambda status, mask: setattr(status.operation, "enable", mask), 0x7FFF
+    ),
+    "STATus:QUEStionable:ENABle": _setting(
+        lambda status, mask: setattr(status.questionable, "enable", mask), 0x7FFF
+    ),
     "SKY:BLANk": Connection.switch,
     "SKY:ATTitude": Connection.set_attitude,
     "SKY:ATTitude?": Connection.attitude,
@@ -541,5 +582,15 @@ COMMANDS: dict[str, Command] = {
     "SKY:FAULt": Connection.fault,
     "LEDGer:STATe": Connection.switch,
 }
-BARE = {*QUERIES, "*CLS", "*RST", "*OPC", "*OPC?", "*WAI", "STATus:PRESet", "SKY:ATTitude?", "SKY:RATE?"}
+BARE = {
+    *QUERIES,
+    "*CLS",
+    "*RST",
+    "*OPC",
+    "*OPC?",
+    "*WAI",
+    "STATus:PRESet",
+    "SKY:ATTitude?",
+    "SKY:RATE?",
+}
 HEADERS = Headers([*QUERIES, *COMMANDS])

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.jumps import JumpFilter
-from hilstar.attitude.clock.sender_clock import EXCHANGE_LIFE_NS, MIN_EXCHANGES, SLEW, Exchange, SenderClock
+from hilstar.attitude.clock.sender_clock import (
+    EXCHANGE_LIFE_NS,
+    MIN_EXCHANGES,
+    SLEW,
+    Exchange,
+    SenderClock,
+)
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
@@ -30,7 +36,9 @@ class Run:
     of time shown.
     """
 
-    def __init__(self, sender_ns: Callable[[int, int], int], delay: Delay = usual, count: int = 6000) -> None:
+    def __init__(
+        self, sender_ns: Callable[[int, int], int], delay: Delay = usual, count: int = 6000
+    ) -> None:
         rng = np.random.default_rng(1)
         self.clock = SenderClock()
         self.jumps = JumpFilter(self.clock)
@@ -40,7 +48,9 @@ class Run:
         for k in range(count):
             host_ns = HOST0_NS + k * PERIOD_NS
             arrival_ns = host_ns + round(delay(rng, k))
-            for each in self.jumps.take(Arrival(arrival_ns, AttitudeSample(sender_ns(host_ns, k), Q, None, k))):
+            for each in self.jumps.take(
+                Arrival(arrival_ns, AttitudeSample(sender_ns(host_ns, k), Q, None, k))
+            ):
                 if each.refusal is not None or each.event.t_ns <= newest_ns:
                     self.refused += 1
                     continue
@@ -147,7 +157,11 @@ def test_a_fast_clock_is_known_to_be_one():
 
 
 def exchanged(
-    clock: SenderClock, rng: np.random.Generator, ppm: float = 0.0, wire_ns: tuple[int, int] = (0, 0), count: int = 40
+    clock: SenderClock,
+    rng: np.random.Generator,
+    ppm: float = 0.0,
+    wire_ns: tuple[int, int] = (0, 0),
+    count: int = 40,
 ) -> None:
     """Exchanges twice a second with a sender 7 s ahead; delays as a loopback's, and what the
     wire takes.
@@ -169,7 +183,9 @@ def test_exchanges_give_the_offset_itself_and_its_bound(rng, ppm):
     clock = SenderClock()
     exchanged(clock, rng, ppm)
     end_ns = HOST0_NS + 20 * NS_PER_S
-    error_ms = (clock.to_sender_ns(end_ns) - (end_ns + 7 * NS_PER_S + 20 * NS_PER_S * ppm * 1e-6)) / NS_PER_MS
+    error_ms = (
+        clock.to_sender_ns(end_ns) - (end_ns + 7 * NS_PER_S + 20 * NS_PER_S * ppm * 1e-6)
+    ) / NS_PER_MS
     summary = clock.summary()
     assert summary.mode == "exchange"
     assert abs(error_ms) < 0.05
@@ -225,4 +241,6 @@ def test_a_sender_on_unix_time_keeps_its_nanoseconds():
     for k in range(100):
         host_ns = HOST0_NS + k * PERIOD_NS
         clock.observe(1_700_000_000_000_000_001 + k * PERIOD_NS, host_ns)
-    assert clock.to_sender_ns(HOST0_NS + 99 * PERIOD_NS) == 1_700_000_000_000_000_001 + 99 * PERIOD_NS
+    assert (
+        clock.to_sender_ns(HOST0_NS + 99 * PERIOD_NS) == 1_700_000_000_000_000_001 + 99 * PERIOD_NS
+    )

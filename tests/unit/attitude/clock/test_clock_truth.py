@@ -76,9 +76,14 @@ class Truth:
 
     def _exchange(self, host_ns: int, rng: np.random.Generator) -> None:
         """One with a way there that is three times as long as the way back."""
-        there_ns, back_ns = 150_000 + round(rng.exponential(30_000)), 50_000 + round(rng.exponential(30_000))
+        there_ns, back_ns = (
+            150_000 + round(rng.exponential(30_000)),
+            50_000 + round(rng.exponential(30_000)),
+        )
         t2_ns = self.times(host_ns + there_ns) + self.jumps.correction_ns
-        self.clock.exchange(Exchange(host_ns, t2_ns, t2_ns + 20_000, host_ns + there_ns + 20_000 + back_ns))
+        self.clock.exchange(
+            Exchange(host_ns, t2_ns, t2_ns + 20_000, host_ns + there_ns + 20_000 + back_ns)
+        )
 
     def _compare(self, read_ns: int) -> None:
         shown_ns = self.clock.to_sender_ns(read_ns) - self.jumps.correction_ns
@@ -89,7 +94,9 @@ class Truth:
 
     def beyond_ms(self, *jumps_s: float) -> float:
         """The largest error beyond the stated uncertainty, except just after a jump."""
-        host_ns, error_ms, known_ms = (np.array(each) for each in (self.host_ns, self.error_ms, self.known_ms))
+        host_ns, error_ms, known_ms = (
+            np.array(each) for each in (self.host_ns, self.error_ms, self.known_ms)
+        )
         asked = np.isfinite(known_ms)
         for jump_s in jumps_s:
             after_ns = host_ns - HOST0_NS - jump_s * NS_PER_S
@@ -103,9 +110,15 @@ SIZES_MS = [2, 3, 4.9, 7, 20, 100, 300, 3000, 86_400_000, 3e11]
 
 @pytest.mark.parametrize("jump_ms", [sign * size for size in SIZES_MS for sign in (1, -1)])
 @pytest.mark.parametrize("exchanges", [False, True])
-def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncertainty(jump_ms, exchanges):
+def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncertainty(
+    jump_ms, exchanges
+):
     jump_ns = round(jump_ms * NS_PER_MS)
-    run = Truth(lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0), count=3200, exchanges=exchanges)
+    run = Truth(
+        lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0),
+        count=3200,
+        exchanges=exchanges,
+    )
     # With exchanges a jump too small for the stream is known at the next one, half a second later.
     assert run.beyond_ms(10.0, *((10.15, 10.3, 10.45) if exchanges else ())) < ALLOWED_MS
     assert run.refused == 0
@@ -186,7 +199,9 @@ def test_a_sender_that_restarts_is_followed_on_a_loaded_machine(timely, seed):
         late_ns += round(rng.exponential(2 * NS_PER_MS))
         return arrival_ns + late_ns, 0
 
-    run = Truth(lambda host: host + 10**15 if host < restart_ns else host - restart_ns, read, count=150)
+    run = Truth(
+        lambda host: host + 10**15 if host < restart_ns else host - restart_ns, read, count=150
+    )
     assert (run.refused, run.jumps.jumps) == (0, 1)
 
 

@@ -14,7 +14,13 @@ import pytest
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, from_rotation_vectors, multiply, propagate
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_radec_roll_deg,
+    from_rotation_vectors,
+    multiply,
+    propagate,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 from hilstar.instruments.study.prediction import shaken_error
 
@@ -23,10 +29,15 @@ TURN_RAD_S = np.radians([0.2, -1.0, 3.0])
 AGE_NS = 20 * NS_PER_MS
 # Rounding of quaternions, 1e-16, over a step of 10 ms and twice as far ahead; and of t_ns.
 EXACT_ARCSEC = 1e-8
-AUTO, RATE = Policy(250 * NS_PER_MS, 250 * NS_PER_MS, prediction="auto"), Policy(250 * NS_PER_MS, 250 * NS_PER_MS)
+AUTO, RATE = (
+    Policy(250 * NS_PER_MS, 250 * NS_PER_MS, prediction="auto"),
+    Policy(250 * NS_PER_MS, 250 * NS_PER_MS),
+)
 
 
-def errors_arcsec(policy: Policy, samples: list[AttitudeSample], turn: FloatArray = TURN_RAD_S) -> list[float]:
+def errors_arcsec(
+    policy: Policy, samples: list[AttitudeSample], turn: FloatArray = TURN_RAD_S
+) -> list[float]:
     """Of the attitude predicted just before each next sample is there, against a steady turn
     from START.
     """
@@ -36,14 +47,20 @@ def errors_arcsec(policy: Policy, samples: list[AttitudeSample], turn: FloatArra
         t_ns = sample.t_ns + AGE_NS
         attitude = timeline.at(t_ns)
         assert attitude is not None
-        errors.append(angle_between_rad(attitude.q_icrs_to_cam, propagate(START, turn, t_ns / NS_PER_S)) * ARCSEC_PER_RAD)
+        errors.append(
+            angle_between_rad(attitude.q_icrs_to_cam, propagate(START, turn, t_ns / NS_PER_S))
+            * ARCSEC_PER_RAD
+        )
     return errors
 
 
 def steady(hz: float = 100.0, seconds: float = 4.0, *, rates: bool = True) -> list[AttitudeSample]:
     times_ns = [round(k * NS_PER_S / hz) for k in range(round(seconds * hz))]
     return [
-        AttitudeSample(t_ns, propagate(START, TURN_RAD_S, t_ns / NS_PER_S), TURN_RAD_S if rates else None) for t_ns in times_ns
+        AttitudeSample(
+            t_ns, propagate(START, TURN_RAD_S, t_ns / NS_PER_S), TURN_RAD_S if rates else None
+        )
+        for t_ns in times_ns
     ]
 
 
@@ -61,10 +78,15 @@ def test_noise_leaves_no_bias_and_is_not_amplified(rates):
     rng = np.random.default_rng(1)
     samples = []
     for sample in steady(seconds=20.0, rates=rates):
-        q = multiply(from_rotation_vectors(rng.normal(0, 30 / ARCSEC_PER_RAD, (1, 3)))[0], sample.q_icrs_to_cam)
+        q = multiply(
+            from_rotation_vectors(rng.normal(0, 30 / ARCSEC_PER_RAD, (1, 3)))[0],
+            sample.q_icrs_to_cam,
+        )
         rate = None if not rates else sample.rate_cam_rad_s + rng.normal(0, math.radians(0.1), 3)
         samples.append(replace(sample, q_icrs_to_cam=q, rate_cam_rad_s=rate))
-    auto, by_rate = (float(np.sqrt(np.mean(np.square(errors_arcsec(p, samples)[100:])))) for p in (AUTO, RATE))
+    auto, by_rate = (
+        float(np.sqrt(np.mean(np.square(errors_arcsec(p, samples)[100:])))) for p in (AUTO, RATE)
+    )
     newest = 30 * math.sqrt(3)  # of the newest sample by itself
     assert auto < (1.1 if rates else 1.3) * newest
     assert auto < by_rate if rates else auto < by_rate / 3
@@ -75,7 +97,9 @@ def test_noise_leaves_no_bias_and_is_not_amplified(rates):
 def test_jitter_is_predicted_as_well_as_by_the_rate_or_by_the_newest_attitude(rates, hz, age_ms):
     """Below half the rate of packets: a vibration beyond it looks like a slow one."""
     for jitter_hz in (1.0, 7.0, 13.0, 37.0):
-        by_rate, auto, newest = (shaken_error(way, jitter_hz, hz, age_ms, rates)[0] for way in ("rate", "auto", "newest"))
+        by_rate, auto, newest = (
+            shaken_error(way, jitter_hz, hz, age_ms, rates)[0] for way in ("rate", "auto", "newest")
+        )
         assert auto < 1.05 * by_rate + 0.01, jitter_hz
         assert auto < 2.0 * newest, jitter_hz  # the worst of these is 1.9: 37 Hz at 50 ms
     assert age_ms < 20 or auto < by_rate / 2
@@ -94,12 +118,19 @@ def test_a_slew_that_begins_is_followed_though_jitter_was_damped_before_it():
     timelines = [Timeline(AUTO), Timeline(RATE)]
     worst = [0.0, 0.0]
     for k in range(len(times_s) - 2):
-        sample = AttitudeSample(round(times_s[k] * NS_PER_S), propagate(START, axis, shaken[k]), (rate + rate_jitter)[k] * axis)
+        sample = AttitudeSample(
+            round(times_s[k] * NS_PER_S),
+            propagate(START, axis, shaken[k]),
+            (rate + rate_jitter)[k] * axis,
+        )
         for which, timeline in enumerate(timelines):
             timeline.add(sample)
             attitude = timeline.at(sample.t_ns + AGE_NS)
             assert attitude is not None
-            error = angle_between_rad(attitude.q_icrs_to_cam, propagate(START, axis, shaken[k + 2])) * ARCSEC_PER_RAD
+            error = (
+                angle_between_rad(attitude.q_icrs_to_cam, propagate(START, axis, shaken[k + 2]))
+                * ARCSEC_PER_RAD
+            )
             if times_s[k] > 1.5:
                 worst[which] = max(worst[which], error)
     amplitude_arcsec_s = 2 * math.tau * 20

@@ -53,7 +53,12 @@ def test_many_lost_of_a_shuffled_stream_are_counted_exactly():
 
 @pytest.mark.parametrize(
     ("divisor", "words"),
-    [(10**9, "seconds"), (10**6, "milliseconds"), (10**3, "microseconds"), (100, "ticks of 100 ns")],
+    [
+        (10**9, "seconds"),
+        (10**6, "milliseconds"),
+        (10**3, "microseconds"),
+        (100, "ticks of 100 ns"),
+    ],
 )
 @pytest.mark.parametrize("hz", [10, 50, 200])
 def test_the_unit_of_t_ns_is_named(divisor, words, hz):

@@ -15,7 +15,13 @@ from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.notices import Notices
-from hilstar.basics.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply, rotate
+from hilstar.basics.rotation import (
+    conjugate,
+    from_radec_roll_deg,
+    from_rotation_vectors,
+    multiply,
+    rotate,
+)
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import CONVENTION
 
@@ -46,7 +52,12 @@ def samples(t_ns, q, rates, broken=()) -> list[AttitudeSample]:
     return [AttitudeSample(int(t), q[k], sent[k], k, k in broken) for k, t in enumerate(t_ns)]
 
 
-def steady(hz: float = 100.0, seconds: float = 3.0, turn: FloatArray = TURN, rng: np.random.Generator | None = None):
+def steady(
+    hz: float = 100.0,
+    seconds: float = 3.0,
+    turn: FloatArray = TURN,
+    rng: np.random.Generator | None = None,
+):
     """Times, attitudes and true rates of a constant turn, noisy where a generator is given."""
     count = round(seconds * hz)
     rates = np.tile(turn, (count, 1))
@@ -69,10 +80,19 @@ WRONGS: dict[str, tuple[Callable[[FloatArray, FloatArray], FloatArray], str]] = 
     "rad/ms": (lambda q, rates: rates / 1e3, "in rad/ms"),
     "rad twice": (lambda q, rates: np.radians(rates), "times pi/180"),
     "axes": (lambda q, rates: rates[:, [1, 2, 0]], "the camera's (y, z, x) is sent as (x, y, z)"),
-    "axes and signs": (lambda q, rates: rates[:, [1, 0, 2]] * [1, -1, 1], "the camera's (y, -x, z) is sent as (x, y, z)"),
+    "axes and signs": (
+        lambda q, rates: rates[:, [1, 0, 2]] * [1, -1, 1],
+        "the camera's (y, -x, z) is sent as (x, y, z)",
+    ),
     "signs": (lambda q, rates: rates * [1, -1, -1], "wrong sign: the camera's (x, -y, -z) is sent"),
-    "another frame": (lambda q, rates: rates @ OTHER_FRAME.T, "another frame than the camera's, such as the body's"),
-    "another frame, deg/s": (lambda q, rates: np.degrees(rates @ OTHER_FRAME.T), "such as the body's, and in deg/s"),
+    "another frame": (
+        lambda q, rates: rates @ OTHER_FRAME.T,
+        "another frame than the camera's, such as the body's",
+    ),
+    "another frame, deg/s": (
+        lambda q, rates: np.degrees(rates @ OTHER_FRAME.T),
+        "such as the body's, and in deg/s",
+    ),
     "ICRS": (in_icrs, "ICRS components"),
     "zeros": (lambda q, rates: np.zeros_like(rates), "zero; leave them out"),
 }
@@ -90,7 +110,9 @@ LINES = {
 AXES = {"axes", "axes and signs", "signs", "another frame", "another frame, deg/s"}
 
 
-def watched(stream: list[AttitudeSample], mode="use-quaternions") -> tuple[RateCheck, list[tuple[str, str]], float | None]:
+def watched(
+    stream: list[AttitudeSample], mode="use-quaternions"
+) -> tuple[RateCheck, list[tuple[str, str]], float | None]:
     """The check after a stream, what it told, and after how long first."""
     notices, told = Notices(), []
     notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
@@ -115,7 +137,9 @@ def test_what_is_wrong_is_named_once_within_a_second(wrong, noisy):
     assert first_s < (1.3 if noisy and wrong.startswith("another") else 1.0) * TOLD_WITHIN_S
 
 
-@pytest.mark.parametrize(("hz", "within_s"), [(10, 2.1), (20, 1.1), (50, 1.0), (200, 1.0), (1000, 1.0)])
+@pytest.mark.parametrize(
+    ("hz", "within_s"), [(10, 2.1), (20, 1.1), (50, 1.0), (200, 1.0), (1000, 1.0)]
+)
 def test_deg_s_about_one_axis_is_named_at_any_rate_of_packets(hz, within_s):
     """The issue's own stream: 0.5 deg/s, and "rate": [0, 0, 0.5]."""
     t_ns, q, rates = steady(hz, turn=np.radians([0, 0, 0.5]), rng=np.random.default_rng(2))
@@ -171,10 +195,20 @@ def honest(rng: np.random.Generator) -> list[AttitudeSample]:
         rates *= (fine_s // rng.uniform(0.3, 2) % 2)[:, None]
     if rng.random() < 0.3:  # it is shaken
         hz_shaken, arcsec = 10 ** rng.uniform(-0.5, 1.7), rng.uniform(0.1, 5)
-        rates = rates + 2 * np.pi * hz_shaken * arcsec * ARCSEC * np.cos(2 * np.pi * hz_shaken * fine_s)[:, None]
+        rates = (
+            rates
+            + 2
+            * np.pi
+            * hz_shaken
+            * arcsec
+            * ARCSEC
+            * np.cos(2 * np.pi * hz_shaken * fine_s)[:, None]
+        )
     at = np.round(t_s / FINE_S).astype(int)
     q, rates, t_ns = moved(rates, FINE_S)[at], rates[at], at * round(FINE_S * NS_PER_S)
-    q = multiply(from_rotation_vectors(rng.normal(0, rng.choice([0, Q_NOISE_RAD]), (len(at), 3))), q)
+    q = multiply(
+        from_rotation_vectors(rng.normal(0, rng.choice([0, Q_NOISE_RAD]), (len(at), 3))), q
+    )
     rates = rates + rng.normal(0, rng.choice([0, RATE_NOISE_RAD_S]), rates.shape)
     k = int(rng.integers(1, len(at)))
     broken: set[int] = set()
@@ -209,7 +243,9 @@ def test_rates_that_become_right_are_believed_again():
 def test_packets_that_leave_rates_out_end_it_too():
     t_ns, q, rates = steady()
     stream = samples(t_ns, q, -rates)
-    stream += [AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(30)]
+    stream += [
+        AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(30)
+    ]
     assert [kind for kind, _ in watched(stream)[1]] == [WRONG, RIGHT]
 
 
@@ -247,10 +283,14 @@ def test_a_constant_that_is_added_is_named():
     assert [kind for kind, _ in told] == [WRONG] and "a constant (0.2, " in told[0][1]
 
 
-def swing(late_s: float, hz: float = 100.0, seconds: float = 10.0, rng: np.random.Generator | None = None):
+def swing(
+    late_s: float, hz: float = 100.0, seconds: float = 10.0, rng: np.random.Generator | None = None
+):
     """A swing of SWING_HZ whose rates are those of `late_s` before."""
     fine_s = np.arange(-1, seconds + 1, FINE_S)
-    rates = math.radians(SWING_DEG_S) * np.cos(math.tau * SWING_HZ * fine_s)[:, None] * [0.0, 0.6, 0.8]
+    rates = (
+        math.radians(SWING_DEG_S) * np.cos(math.tau * SWING_HZ * fine_s)[:, None] * [0.0, 0.6, 0.8]
+    )
     t_s = np.arange(0, seconds, 1 / hz)
     now, then = (np.round((t_s + 1 - by_s) / FINE_S).astype(int) for by_s in (0.0, late_s))
     q, sent = moved(rates, FINE_S)[now], rates[then]
@@ -266,12 +306,17 @@ def test_late_rates_are_named_with_their_lag_and_stay_so(late_s, hz, noisy):
     check, told, _ = watched(swing(late_s, hz, rng=np.random.default_rng(7) if noisy else None))
     assert [kind for kind, _ in told] == [WRONG]
     assert abs(check.cause.lag_s - late_s) < LAG_WITHIN_S
-    assert f"{abs(check.cause.lag_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'}" in told[0][1]
+    assert (
+        f"{abs(check.cause.lag_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'}" in told[0][1]
+    )
 
 
 def test_rates_that_are_late_no_more_are_believed_again():
     late, right = swing(0.2), swing(0.0, seconds=15.0)
-    later = [AttitudeSample(s.t_ns + 10 * NS_PER_S, s.q_icrs_to_cam, s.rate_cam_rad_s, s.sequence + 1000) for s in right]
+    later = [
+        AttitudeSample(s.t_ns + 10 * NS_PER_S, s.q_icrs_to_cam, s.rate_cam_rad_s, s.sequence + 1000)
+        for s in right
+    ]
     assert [kind for kind, _ in watched(late + later)[1]] == [WRONG, RIGHT]
 
 
@@ -308,7 +353,10 @@ def test_a_turn_that_no_reading_changes_names_the_sign_and_the_line():
     rates = np.tile(np.radians([0, 0, 0.5]), (len(q), 1))
     _, told, _ = watched(samples(np.round(seconds * NS_PER_S).astype(int), q, rates))
     assert [kind for kind, _ in told] == [WRONG]
-    assert "wrong sign" in told[0][1] and '[attitude] convention = { direction = "cam_to_icrs" }' in told[0][1]
+    assert (
+        "wrong sign" in told[0][1]
+        and '[attitude] convention = { direction = "cam_to_icrs" }' in told[0][1]
+    )
 
 
 def test_a_condition_says_since_when_it_holds():

@@ -38,7 +38,9 @@ def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
 
 @pytest.mark.parametrize("step", [2.0**-15, 1 / 32767])
 def test_fixed_point_numbers_are_told(step):
-    assert f"steps of {step:.3g}:" in coarse_lines(turning(lambda q: np.round(q / step) * step))[0][1]
+    assert (
+        f"steps of {step:.3g}:" in coarse_lines(turning(lambda q: np.round(q / step) * step))[0][1]
+    )
 
 
 def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
@@ -49,12 +51,16 @@ def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
     assert told == [COARSE]
 
 
-@pytest.mark.parametrize("rounded", [lambda q: q, lambda q: q.astype(np.float32).astype(float), lambda q: np.round(q, 7)])
+@pytest.mark.parametrize(
+    "rounded", [lambda q: q, lambda q: q.astype(np.float32).astype(float), lambda q: np.round(q, 7)]
+)
 def test_fine_quaternions_are_not_told(rounded):
     assert coarse_lines(turning(rounded)) == []
 
 
-@pytest.mark.parametrize("q", [(1.0, 0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5), (0.6, 0.8, 0.0, 0.0), (0.1, 0.7, 0.5, 0.5)])
+@pytest.mark.parametrize(
+    "q", [(1.0, 0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5), (0.6, 0.8, 0.0, 0.0), (0.1, 0.7, 0.5, 0.5)]
+)
 def test_an_exact_attitude_is_not_rounded(q):
     sample = checked_sample(0, q, None)
     assert coarse_lines([sample] * 100) == []

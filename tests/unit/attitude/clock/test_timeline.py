@@ -9,7 +9,12 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate, rate_between_rad_s
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_radec_roll_deg,
+    propagate,
+    rate_between_rad_s,
+)
 
 MS = 1_000_000
 S = 1000 * MS
@@ -19,12 +24,16 @@ START = from_radec_roll_deg(10.0, 20.0, 30.0)
 EXACT_RAD = 1e-12
 
 
-def sample(t_ms: float, *, rate: bool = False, discontinuity: bool = False, sign: int = 1) -> AttitudeSample:
+def sample(
+    t_ms: float, *, rate: bool = False, discontinuity: bool = False, sign: int = 1
+) -> AttitudeSample:
     q = sign * propagate(START, RATE, t_ms / 1000)
     return AttitudeSample(round(t_ms * MS), q, RATE if rate else None, 0, discontinuity)
 
 
-def filled(*samples: AttitudeSample, max_extrapolation_ms: float = 100, stale_after_ms: float = 250) -> Timeline:
+def filled(
+    *samples: AttitudeSample, max_extrapolation_ms: float = 100, stale_after_ms: float = 250
+) -> Timeline:
     timeline = Timeline(Policy(round(max_extrapolation_ms * MS), round(stale_after_ms * MS)))
     for each in samples:
         assert timeline.add(each) is None
@@ -111,7 +120,9 @@ def swing(t_s: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def swing_rate(t_s: float) -> np.ndarray:
-    return np.radians(3.0) * np.array([np.sin(0.6 * t_s), 0.5 * np.cos(0.9 * t_s), 0.3 * np.sin(1.3 * t_s + 1)])
+    return np.radians(3.0) * np.array(
+        [np.sin(0.6 * t_s), 0.5 * np.cos(0.9 * t_s), 0.3 * np.sin(1.3 * t_s + 1)]
+    )
 
 
 def integrated(step_s: float = 1e-3, seconds: float = 4.0) -> list[np.ndarray]:
@@ -150,7 +161,10 @@ def test_rates_make_the_curve_between_samples_two_hundred_times_better():
     """At 10 Hz SLERP cuts the corners by a T^2/8 (a = 0.036 rad/s2: 9.4 arcsec); the blend is
     0.045 arcsec off.
     """
-    slerped, blended = worst_arcsec(swinging(100, rate=False)), worst_arcsec(swinging(100, rate=True))
+    slerped, blended = (
+        worst_arcsec(swinging(100, rate=False)),
+        worst_arcsec(swinging(100, rate=True)),
+    )
     assert 8.0 < slerped < 11.0
     assert blended < 0.06
 
@@ -204,7 +218,9 @@ def test_the_attitude_is_unit_everywhere():
 
 
 def test_constant_rate_motion_with_rates_is_reproduced():
-    timeline = filled(*(sample(t, rate=True, sign=(-1) ** k) for k, t in enumerate((0, 10, 37, 100, 180))))
+    timeline = filled(
+        *(sample(t, rate=True, sign=(-1) ** k) for k, t in enumerate((0, 10, 37, 100, 180)))
+    )
     for t in (0, 1, 10, 20, 36.9, 64.2, 100, 179):
         assert error_rad(timeline, t, t) < EXACT_RAD
 
@@ -214,7 +230,9 @@ def test_nothing_overshoots_across_a_gap():
     the way is the straight one.
     """
     fast = np.array([0.0, 0.0, 2.0])
-    timeline = filled(AttitudeSample(0, START, fast), AttitudeSample(S, START, fast), stale_after_ms=250)
+    timeline = filled(
+        AttitudeSample(0, START, fast), AttitudeSample(S, START, fast), stale_after_ms=250
+    )
     for t_ms in range(0, 1000, 10):
         attitude = timeline.at(t_ms * MS)
         assert attitude is not None
@@ -223,9 +241,21 @@ def test_nothing_overshoots_across_a_gap():
 
 def test_stale_has_hysteresis_and_is_counted():
     gate = StaleGate(250 * MS)
-    fresh = [Attitude(START, age * MS, age > 250) for age in (10, 249, 251, 200, 126, 124, 10, 300, 5)]
+    fresh = [
+        Attitude(START, age * MS, age > 250) for age in (10, 249, 251, 200, 126, 124, 10, 300, 5)
+    ]
     assert gate.update(None) is True
-    assert [gate.update(a) for a in fresh] == [False, False, True, True, True, False, False, True, False]
+    assert [gate.update(a) for a in fresh] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]
     assert gate.events == 2
 
 
@@ -263,9 +293,16 @@ def test_a_retarget_without_discontinuity_is_a_jump_and_no_turn(degrees, rate):
 
 def test_a_turn_just_under_the_limit_is_drawn_as_a_turn():
     rate = np.array([0.0, 0.99 * MAX_RATE_RAD_S, 0.0])
-    timeline = limited(*(AttitudeSample(k * 5 * MS, propagate(START, rate, k * 0.005)) for k in range(4)))
+    timeline = limited(
+        *(AttitudeSample(k * 5 * MS, propagate(START, rate, k * 0.005)) for k in range(4))
+    )
     for t_ms in (7.0, 22.0):
-        assert angle_between_rad(timeline.at(round(t_ms * MS)).q_icrs_to_cam, propagate(START, rate, t_ms / 1000)) < EXACT_RAD
+        assert (
+            angle_between_rad(
+                timeline.at(round(t_ms * MS)).q_icrs_to_cam, propagate(START, rate, t_ms / 1000)
+            )
+            < EXACT_RAD
+        )
 
 
 def test_a_rate_over_the_limit_is_refused_by_name_with_its_unit():
@@ -282,7 +319,10 @@ def test_a_rate_over_the_limit_is_refused_by_name_with_its_unit():
 def orbiting(t_ms: float, **more) -> AttitudeSample:
     """A circle of 7000 km, 7.5 km/s."""
     angle = 7.5 / 7000 * t_ms / 1e3
-    place, ahead = 7000 * np.array([np.cos(angle), np.sin(angle), 0]), 7.5 * np.array([-np.sin(angle), np.cos(angle), 0])
+    place, ahead = (
+        7000 * np.array([np.cos(angle), np.sin(angle), 0]),
+        7.5 * np.array([-np.sin(angle), np.cos(angle), 0]),
+    )
     return replace(sample(t_ms, **more), place_km=place, velocity_km_s=ahead)
 
 
@@ -297,7 +337,9 @@ def orbiting(t_ms: float, **more) -> AttitudeSample:
         (10_100.0, 5e-5),
     ],
 )
-def test_an_observer_s_place_is_on_its_orbit_between_samples_and_straight_on_for_as_long_as_predicted(t_ms, limit_km):
+def test_an_observer_s_place_is_on_its_orbit_between_samples_and_straight_on_for_as_long_as_predicted(
+    t_ms, limit_km
+):
     timeline = filled(orbiting(0), orbiting(10_000), max_extrapolation_ms=100)
     found = timeline.at(round(t_ms * 1e6))
     assert found is not None
@@ -308,7 +350,9 @@ def test_an_observer_s_place_is_on_its_orbit_between_samples_and_straight_on_for
 
 
 def test_an_observer_s_place_does_not_go_across_a_jump():
-    timeline = filled(orbiting(0), orbiting(1_000_000, discontinuity=True), max_extrapolation_ms=100)
+    timeline = filled(
+        orbiting(0), orbiting(1_000_000, discontinuity=True), max_extrapolation_ms=100
+    )
     before = timeline.at(900_000_000_000)
     assert before is not None
     assert np.linalg.norm(before.place_km - orbiting(100).place_km) < 5e-5

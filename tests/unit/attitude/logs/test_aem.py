@@ -93,7 +93,9 @@ def ccsds_quaternion(second_from_first):
 
 def camera(seconds=0.0):
     """The rotation of cam's components into ICRS components, turning at RATE_CAM_RAD_S."""
-    return Rotation.from_quat([0.1, -0.5, 0.7, 0.3]) * Rotation.from_rotvec(RATE_CAM_RAD_S * seconds)
+    return Rotation.from_quat([0.1, -0.5, 0.7, 0.3]) * Rotation.from_rotvec(
+        RATE_CAM_RAD_S * seconds
+    )
 
 
 def second_from_first(frame_a, direction, seconds=0.0):
@@ -114,12 +116,16 @@ def frames(frame_a):
 @pytest.mark.parametrize("order", ["FIRST", "LAST"])
 @pytest.mark.parametrize("direction", ["A2B", "B2A"])
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
-def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(tmp_path, frame_a, direction, order):
+def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(
+    tmp_path, frame_a, direction, order
+):
     q = ccsds_quaternion(second_from_first(frame_a, direction)[0])
     row = np.roll(q, 1) if order == "FIRST" else q
     text = kvn(rows_of(row), ATTITUDE_DIR=direction, QUATERNION_TYPE=order, **frames(frame_a))
     (sample,) = read(tmp_path, text)
-    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(camera().inv().as_matrix(), abs=MATRIX_TOLERANCE)
+    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
+        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+    )
     assert sample.rate_cam_rad_s is None
 
 
@@ -127,7 +133,9 @@ def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(tmp
 def test_version_2_is_scalar_last_and_from_a_to_b(tmp_path, frame_a):
     q = ccsds_quaternion(second_from_first(frame_a, "A2B")[0])
     (sample,) = read(tmp_path, kvn(rows_of(q), "2.0", **frames(frame_a)))
-    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(camera().inv().as_matrix(), abs=MATRIX_TOLERANCE)
+    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
+        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+    )
 
 
 @pytest.mark.parametrize("order", ["FIRST", "LAST"])
@@ -135,12 +143,17 @@ def test_version_2_is_scalar_last_and_from_a_to_b(tmp_path, frame_a):
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
 def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a, direction, order):
     before, q, after = (
-        ccsds_quaternion(second_from_first(frame_a, direction, s)[0]) for s in (-DIFFERENCE_S, 0.0, DIFFERENCE_S)
+        ccsds_quaternion(second_from_first(frame_a, direction, s)[0])
+        for s in (-DIFFERENCE_S, 0.0, DIFFERENCE_S)
     )
     before, after = (other * np.sign(other @ q) for other in (before, after))
     parts = [q, (after - before) / (2 * DIFFERENCE_S)]
     row = np.concatenate([np.roll(part, 1) if order == "FIRST" else part for part in parts])
-    keywords = {"ATTITUDE_TYPE": "QUATERNION/DERIVATIVE", "ATTITUDE_DIR": direction, "QUATERNION_TYPE": order}
+    keywords = {
+        "ATTITUDE_TYPE": "QUATERNION/DERIVATIVE",
+        "ATTITUDE_DIR": direction,
+        "QUATERNION_TYPE": order,
+    }
     (sample,) = read(tmp_path, kvn(rows_of(row), **keywords, **frames(frame_a)))
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=DERIVATIVE_TOLERANCE_RAD_S)
 
@@ -149,13 +162,19 @@ def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a
 @pytest.mark.parametrize("named", ["by name", "by keyword"])
 @pytest.mark.parametrize("resolved_in", ["ICRF", "SC_BODY_1"])
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
-def test_an_angular_velocity_gives_the_rate_of_the_camera(tmp_path, frame_a, direction, resolved_in, named, version):
+def test_an_angular_velocity_gives_the_rate_of_the_camera(
+    tmp_path, frame_a, direction, resolved_in, named, version
+):
     rotation, to_cam = second_from_first(frame_a, direction)
     rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
     if resolved_in == "ICRF":
         rate = camera().apply(rate)
     row = np.concatenate([ccsds_quaternion(rotation), np.degrees(rate)])
-    frame = resolved_in if named == "by name" else ("REF_FRAME_A" if resolved_in == frame_a else "REF_FRAME_B")
+    frame = (
+        resolved_in
+        if named == "by name"
+        else ("REF_FRAME_A" if resolved_in == frame_a else "REF_FRAME_B")
+    )
     keywords = {"ATTITUDE_TYPE": "QUATERNION/RATE", "RATE_FRAME": frame, "ATTITUDE_DIR": direction}
     if version == "2.0":
         keywords = {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": frame}
@@ -166,7 +185,9 @@ def test_an_angular_velocity_gives_the_rate_of_the_camera(tmp_path, frame_a, dir
 def test_the_rate_that_is_read_carries_the_attitude_on():
     seconds = 0.8
     start = from_radec_roll_deg(84.057, -1.2, 30.0)
-    moved = Rotation.from_matrix(to_matrix(start)).inv() * Rotation.from_rotvec(RATE_CAM_RAD_S * seconds)
+    moved = Rotation.from_matrix(to_matrix(start)).inv() * Rotation.from_rotvec(
+        RATE_CAM_RAD_S * seconds
+    )
     carried = to_matrix(propagate(start, RATE_CAM_RAD_S, seconds))
     assert carried == pytest.approx(moved.inv().as_matrix(), abs=MATRIX_TOLERANCE)
 
@@ -177,12 +198,16 @@ def test_the_rate_that_is_read_carries_the_attitude_on():
 def test_annex_f_turns_x_into_minus_y(tmp_path):
     # 504.0-B-2 F2.2: X_A = [1, 0, 0] has X_B = [0, -1, 0].
     (sample,) = read(tmp_path, kvn(rows_of([0, 0, 0.7071, 0.7071]), "2.0"))
-    assert to_matrix(sample.q_icrs_to_cam) @ [1, 0, 0] == pytest.approx([0, -1, 0], abs=ANNEX_F_TOLERANCE)
+    assert to_matrix(sample.q_icrs_to_cam) @ [1, 0, 0] == pytest.approx(
+        [0, -1, 0], abs=ANNEX_F_TOLERANCE
+    )
 
 
 def figure_in_version_1():
     meta = "ATTITUDE_DIR = A2B\nQUATERNION_TYPE = LAST\nATTITUDE_TYPE"
-    return FIGURE_G4.replace("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 1.0").replace("ATTITUDE_TYPE", meta)
+    return FIGURE_G4.replace("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 1.0").replace(
+        "ATTITUDE_TYPE", meta
+    )
 
 
 @pytest.mark.parametrize("text", [FIGURE_G4, figure_in_version_1()], ids=["2.0", "1.0"])
@@ -203,15 +228,25 @@ def test_xml_and_kvn_hold_the_same(tmp_path, version):
         "2.0": {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": "SC_BODY_1"},
     }[version]
     text = kvn(rows_of(row), version, **turning)
-    meta = "".join(f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :]))
+    meta = "".join(
+        f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :])
+    )
     q = "<QC>0.68427</QC><Q1>0.56748</Q1><Q2>0.03146</Q2><Q3>0.45689</Q3>"
     if version == "2.0":
         q = "<Q1>0.56748</Q1><Q2>0.03146</Q2><Q3>0.45689</Q3><QC>0.68427</QC>"
     axes = ("Z_RATE", 7), ("X_RATE", 0.4), ("Y_RATE", -0.2)
-    rates = "".join(f'<rotation{i} rate="{axis}">{value}</rotation{i}>' for i, (axis, value) in enumerate(axes, start=1))
+    rates = "".join(
+        f'<rotation{i} rate="{axis}">{value}</rotation{i}>'
+        for i, (axis, value) in enumerate(axes, start=1)
+    )
     if version == "2.0":
-        rates = '<ANGVEL_X units="deg/s">0.4</ANGVEL_X><ANGVEL_Y>-0.2</ANGVEL_Y><ANGVEL_Z>7</ANGVEL_Z>'
-    state, part = {"1.0": ("quaternionEulerRate", "rotationRates"), "2.0": ("quaternionAngVel", "angVel")}[version]
+        rates = (
+            '<ANGVEL_X units="deg/s">0.4</ANGVEL_X><ANGVEL_Y>-0.2</ANGVEL_Y><ANGVEL_Z>7</ANGVEL_Z>'
+        )
+    state, part = {
+        "1.0": ("quaternionEulerRate", "rotationRates"),
+        "2.0": ("quaternionAngVel", "angVel"),
+    }[version]
     data = f"<{state}><EPOCH>{EPOCHS[0]}</EPOCH><quaternion>{q}</quaternion><{part}>{rates}</{part}></{state}>"
     xml = f"""<?xml version="1.0" encoding="UTF-8"?>
 <aem xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" id="CCSDS_AEM_VERS" version="{version}">
@@ -232,27 +267,56 @@ def test_xml_and_kvn_hold_the_same(tmp_path, version):
 def test_eme2000_and_icrf_differ_by_the_frame_bias():
     j2000 = 2451545.0
     bias = Rotation.from_matrix(erfa.bp00(j2000, 0.0)[0]).magnitude()
-    assert np.degrees(bias) * 3_600_000 == pytest.approx(FRAME_BIAS_MAS, abs=FRAME_BIAS_TOLERANCE_MAS)
+    assert np.degrees(bias) * 3_600_000 == pytest.approx(
+        FRAME_BIAS_MAS, abs=FRAME_BIAS_TOLERANCE_MAS
+    )
 
 
 @pytest.mark.parametrize("inertial", ["ICRF", "icrf2", "EME2000", "J2000"])
-@pytest.mark.parametrize("body", ["SC_BODY_1", "sc body", "INSTRUMENT_A", "STARTRACKER_1", "AST_2", "ACC_0", "CAM", "CAMERA_1"])
+@pytest.mark.parametrize(
+    "body",
+    ["SC_BODY_1", "sc body", "INSTRUMENT_A", "STARTRACKER_1", "AST_2", "ACC_0", "CAM", "CAMERA_1"],
+)
 def test_the_icrf_or_eme2000_and_a_spacecraft_frame_are_taken(tmp_path, inertial, body):
-    assert len(read(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=inertial, REF_FRAME_B=body))) == 1
+    assert (
+        len(read(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=inertial, REF_FRAME_B=body))) == 1
+    )
 
 
 REFUSED_INERTIAL = ["ITRF-9", "ITRFX", "GRC", "GTOD", "TEMEOFEPOCH", "TDR", "B1950", "ICRF4", "EME"]
-REFUSED_BODY = ["RTN", "RSW", "TNW", "LVLH", "QSW", "NTW", "VNC", "ICRF", "EME2000", "GCRF", "SATELLITE", "ASTRO", "CAMEL", "X"]
+REFUSED_BODY = [
+    "RTN",
+    "RSW",
+    "TNW",
+    "LVLH",
+    "QSW",
+    "NTW",
+    "VNC",
+    "ICRF",
+    "EME2000",
+    "GCRF",
+    "SATELLITE",
+    "ASTRO",
+    "CAMEL",
+    "X",
+]
 
 
 @pytest.mark.parametrize(
     ("a", "b"),
-    [(frame, "SC_BODY_1") for frame in REFUSED_INERTIAL] + [("ICRF", frame) for frame in REFUSED_BODY] + [("SC_BODY_1", "RTN")],
+    [(frame, "SC_BODY_1") for frame in REFUSED_INERTIAL]
+    + [("ICRF", frame) for frame in REFUSED_BODY]
+    + [("SC_BODY_1", "RTN")],
 )
 def test_other_frames_are_refused_with_both_names(tmp_path, a, b):
     for frame_a, frame_b in ((a, b), (b, a)):
-        message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=frame_a, REF_FRAME_B=frame_b))
-        assert f"REF_FRAME_A = {frame_a}, REF_FRAME_B = {frame_b}; one must be ICRF, EME2000, MOD" in message
+        message = refusal(
+            tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=frame_a, REF_FRAME_B=frame_b)
+        )
+        assert (
+            f"REF_FRAME_A = {frame_a}, REF_FRAME_B = {frame_b}; one must be ICRF, EME2000, MOD"
+            in message
+        )
 
 
 # Writing
@@ -260,11 +324,19 @@ def test_other_frames_are_refused_with_both_names(tmp_path, a, b):
 
 def turning_samples():
     times = [0, 10, 20, 30]
-    return [AttitudeSample(t, from_radec_roll_deg(10.0 * t, 5.0, 0.0), RATE_CAM_RAD_S, 0, t == 20) for t in times]
+    return [
+        AttitudeSample(t, from_radec_roll_deg(10.0 * t, 5.0, 0.0), RATE_CAM_RAD_S, 0, t == 20)
+        for t in times
+    ]
 
 
 STATED = {
-    **{"REF_FRAME_A": "ICRF", "REF_FRAME_B": "STARTRACKER_1", "ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "LAST"},
+    **{
+        "REF_FRAME_A": "ICRF",
+        "REF_FRAME_B": "STARTRACKER_1",
+        "ATTITUDE_DIR": "A2B",
+        "QUATERNION_TYPE": "LAST",
+    },
     **{"TIME_SYSTEM": "TAI", "ATTITUDE_TYPE": "QUATERNION/DERIVATIVE"},
 }
 BLOCKS_NS = ((0, 10), (20, 30))
@@ -277,7 +349,9 @@ def written_epoch(t_ns):
 def expected_row(sample):
     """Q1 Q2 Q3 QC and their derivatives in time, by SciPy and differences."""
     q, ahead, behind = (
-        ccsds_quaternion(Rotation.from_matrix(to_matrix(propagate(sample.q_icrs_to_cam, RATE_CAM_RAD_S, s))))
+        ccsds_quaternion(
+            Rotation.from_matrix(to_matrix(propagate(sample.q_icrs_to_cam, RATE_CAM_RAD_S, s)))
+        )
         for s in (0.0, DIFFERENCE_S, -DIFFERENCE_S)
     )
     ahead, behind = ahead * np.sign(ahead @ q), behind * np.sign(behind @ q)
@@ -305,7 +379,11 @@ def test_kvn_that_is_written_states_all_that_it_means_and_holds_the_numbers(tmp_
         meta = dict(re.findall(r"^(\w+) += (.*)$", block, re.MULTILINE))
         epochs = {"START_TIME": written_epoch(times[0]), "STOP_TIME": written_epoch(times[1])}
         assert meta == STATED | epochs | {"OBJECT_NAME": "UNKNOWN", "OBJECT_ID": "UNKNOWN"}
-        rows = [line.split() for line in block.split("DATA_START")[1].split("DATA_STOP")[0].splitlines() if line]
+        rows = [
+            line.split()
+            for line in block.split("DATA_START")[1].split("DATA_STOP")[0].splitlines()
+            if line
+        ]
         assert [row[0] for row in rows] == list(map(written_epoch, times))
         for epoch, *numbers in rows:
             assert_row(numbers, samples[epoch])
@@ -325,13 +403,18 @@ def test_xml_that_is_written_states_all_that_it_means_and_holds_the_numbers(tmp_
         order = "OBJECT_NAME OBJECT_ID REF_FRAME_A REF_FRAME_B ATTITUDE_DIR TIME_SYSTEM START_TIME STOP_TIME ATTITUDE_TYPE"
         assert list(meta) == [*order.split(), "QUATERNION_TYPE"]
         assert {key: meta[key] for key in STATED} == STATED
-        assert [state.findtext("quaternionDerivative/EPOCH") for state in data] == list(map(written_epoch, times))
+        assert [state.findtext("quaternionDerivative/EPOCH") for state in data] == list(
+            map(written_epoch, times)
+        )
         for state in data:
             epoch, quaternion, rate = state[0]
             assert [child.tag for child in quaternion] == ["QC", "Q1", "Q2", "Q3"]
             assert [child.tag for child in rate] == ["QC_DOT", "Q1_DOT", "Q2_DOT", "Q3_DOT"]
             numbers = [[float(child.text) for child in part] for part in (quaternion, rate)]
-            assert_row([*numbers[0][1:], numbers[0][0], *numbers[1][1:], numbers[1][0]], samples[epoch.text])
+            assert_row(
+                [*numbers[0][1:], numbers[0][0], *numbers[1][1:], numbers[1][0]],
+                samples[epoch.text],
+            )
 
 
 @pytest.mark.parametrize("form", ["aem", "xml"])
@@ -350,7 +433,9 @@ def test_quaternions_without_rates_are_written_as_such(tmp_path):
     write_log(tmp_path / "a.xml", [AttitudeSample(7, from_radec_roll_deg(10.0, 5.0, 0.0))])
     root = ElementTree.parse(tmp_path / "a.xml").getroot()
     assert root.findtext("body/segment/metadata/ATTITUDE_TYPE") == "QUATERNION"
-    assert root.findtext("body/segment/data/attitudeState/quaternionState/EPOCH") == written_epoch(7)
+    assert root.findtext("body/segment/data/attitudeState/quaternionState/EPOCH") == written_epoch(
+        7
+    )
 
 
 @pytest.mark.parametrize(
@@ -365,8 +450,12 @@ def test_quaternions_without_rates_are_written_as_such(tmp_path):
     ],
 )
 @pytest.mark.parametrize("ending", ["aem", "xml"])
-def test_a_log_without_dates_is_not_written_as_utc_of_1970(tmp_path, begin_s, scale, system, ending):
-    samples = [AttitudeSample((begin_s + k) * 10**9, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(2)]
+def test_a_log_without_dates_is_not_written_as_utc_of_1970(
+    tmp_path, begin_s, scale, system, ending
+):
+    samples = [
+        AttitudeSample((begin_s + k) * 10**9, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(2)
+    ]
     path = tmp_path / f"a.{ending}"
     write_log(path, samples, scale)
     assert re.search(r"TIME_SYSTEM\W+(\w+)", path.read_text())[1] == system

@@ -29,7 +29,9 @@ SEQUENCES = [a + b + c for a in AXES for b in AXES for c in AXES if a != b != c]
 
 def camera(seconds=0.0, first=None):
     """Of cam's components into ICRS components."""
-    return (first or Rotation.from_quat([0.1, -0.5, 0.7, 0.3])) * Rotation.from_rotvec(RATE_CAM_RAD_S * seconds)
+    return (first or Rotation.from_quat([0.1, -0.5, 0.7, 0.3])) * Rotation.from_rotvec(
+        RATE_CAM_RAD_S * seconds
+    )
 
 
 def placed(frame_a, direction, rotation):
@@ -42,7 +44,12 @@ def placed(frame_a, direction, rotation):
 
 def keywords(version, frame_a, direction, names, **more):
     other = "SC_BODY_1" if frame_a == "ICRF" else "ICRF"
-    meta = {"REF_FRAME_A": frame_a, "REF_FRAME_B": other, "QUATERNION_TYPE": None, "EULER_ROT_SEQ": names} | more
+    meta = {
+        "REF_FRAME_A": frame_a,
+        "REF_FRAME_B": other,
+        "QUATERNION_TYPE": None,
+        "EULER_ROT_SEQ": names,
+    } | more
     return meta | ({"ATTITUDE_DIR": direction} if version == "1.0" else {})
 
 
@@ -66,38 +73,52 @@ def test_each_sequence_of_euler_angles_is_scipys(tmp_path, frame_a, version, dir
         written = "".join(AXES[name] for name in names) if version == "1.0" else names
         meta = keywords(version, frame_a, direction, written, ATTITUDE_TYPE="EULER_ANGLE")
         (sample,) = read(tmp_path, kvn(rows_of(angles_deg(rotation, names)), version, **meta))
-        assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(first.inv().as_matrix(), abs=MATRIX_TOLERANCE)
+        assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
+            first.inv().as_matrix(), abs=MATRIX_TOLERANCE
+        )
         assert sample.rate_cam_rad_s is None
 
 
 @pytest.mark.parametrize("names", SEQUENCES)
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
 def test_the_angles_derivatives_give_the_rate_of_the_camera(tmp_path, frame_a, names):
-    before, angles, after = (angles_deg(placed(frame_a, "A2B", camera(s))[0], names) for s in (-H_S, 0.0, H_S))
+    before, angles, after = (
+        angles_deg(placed(frame_a, "A2B", camera(s))[0], names) for s in (-H_S, 0.0, H_S)
+    )
     turned = (after - before + 180.0) % 360.0 - 180.0
     row = np.concatenate([angles, turned / (2 * H_S)])
     meta = keywords("2.0", frame_a, "A2B", names, ATTITUDE_TYPE="EULER_ANGLE/DERIVATIVE")
     (sample,) = read(tmp_path, kvn(rows_of(row), "2.0", **meta))
-    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(camera().inv().as_matrix(), abs=MATRIX_TOLERANCE)
+    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
+        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+    )
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=RATE_TOLERANCE_RAD_S)
 
 
 @pytest.mark.parametrize("resolved_in", ["ICRF", "SC_BODY_1"])
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
-def test_an_angular_velocity_beside_euler_angles_gives_the_rate_of_the_camera(tmp_path, frame_a, resolved_in):
+def test_an_angular_velocity_beside_euler_angles_gives_the_rate_of_the_camera(
+    tmp_path, frame_a, resolved_in
+):
     rotation, to_cam = placed(frame_a, "A2B", camera())
     rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
     if resolved_in == "ICRF":
         rate = camera().apply(rate)
     row = np.concatenate([angles_deg(rotation, "ZYX"), np.degrees(rate)])
-    meta = keywords("2.0", frame_a, "A2B", "ZYX", ATTITUDE_TYPE="EULER_ANGLE/ANGVEL", ANGVEL_FRAME=resolved_in)
+    meta = keywords(
+        "2.0", frame_a, "A2B", "ZYX", ATTITUDE_TYPE="EULER_ANGLE/ANGVEL", ANGVEL_FRAME=resolved_in
+    )
     (sample,) = read(tmp_path, kvn(rows_of(row), "2.0", **meta))
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=MATRIX_TOLERANCE)
 
 
 def test_rates_whose_meaning_the_file_does_not_state_are_not_used_and_a_notice_says_so(tmp_path):
-    meta = keywords("1.0", "ICRF", "A2B", "312", ATTITUDE_TYPE="EULER_ANGLE/RATE", RATE_FRAME="REF_FRAME_A")
-    (tmp_path / "log").write_text(kvn(rows_of([-26.78, 46.26, 144.10, 0.1045, 0.03214, 0.02156]), **meta))
+    meta = keywords(
+        "1.0", "ICRF", "A2B", "312", ATTITUDE_TYPE="EULER_ANGLE/RATE", RATE_FRAME="REF_FRAME_A"
+    )
+    (tmp_path / "log").write_text(
+        kvn(rows_of([-26.78, 46.26, 144.10, 0.1045, 0.03214, 0.02156]), **meta)
+    )
     log = open_log(tmp_path / "log")
     assert log.samples[0].rate_cam_rad_s is None
     assert "aem-rates" in [kind for kind, _ in log.told]
@@ -131,7 +152,9 @@ class SpinningBody:
         node, tilt, angle = self.turn(0.0).as_euler("ZXZ", degrees=True)
         axis = self.turn(0.0).apply([0.0, 0.0, 1.0])
         alpha, delta = np.degrees([np.arctan2(axis[1], axis[0]), np.arcsin(axis[2])])
-        assert (alpha + 90 - node) % 360 == pytest.approx(0, abs=1e-9) or (alpha + 90 - node) % 360 == pytest.approx(360)
+        assert (alpha + 90 - node) % 360 == pytest.approx(0, abs=1e-9) or (
+            alpha + 90 - node
+        ) % 360 == pytest.approx(360)
         assert 90 - delta == pytest.approx(tilt)
         return alpha, delta, angle
 
@@ -157,21 +180,31 @@ def test_a_spin_is_that_of_a_nutating_body(tmp_path, frame_a, kind):
         body = SpinningBody(np.random.default_rng(seed))
         if kind == "SPIN":
             body.precession_rad_s = 0.0
-        version, direction = ("2.0", "A2B") if kind.endswith("MOM") else ("1.0", "A2B" if frame_a == "ICRF" else "B2A")
+        version, direction = (
+            ("2.0", "A2B")
+            if kind.endswith("MOM")
+            else ("1.0", "A2B" if frame_a == "ICRF" else "B2A")
+        )
         if version == "2.0" and frame_a != "ICRF":
             continue  # the second frame is then not the one that spins
         meta = keywords(version, frame_a, direction, None, ATTITUDE_TYPE=kind)
         rows = rows_of(spin_row(body, kind), spin_row(body, kind))  # 1.75 s, so 150 degrees, apart
         sample, _ = read(tmp_path, kvn(rows, version, **meta))
-        assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(body.turn(0.0).inv().as_matrix(), abs=MATRIX_TOLERANCE)
+        assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
+            body.turn(0.0).inv().as_matrix(), abs=MATRIX_TOLERANCE
+        )
         assert sample.rate_cam_rad_s == pytest.approx(body.rate(), abs=RATE_TOLERANCE_RAD_S)
 
 
 def test_a_spin_that_its_attitudes_tell_has_no_rate_of_its_own(tmp_path):
     # ST5's example of 504.0-B-1: -109.97 deg/s stated, while the spin angle turns by -89.94 deg/s.
     rows = rows_of([268.62511, 68.448486, 159.69509, -109.96528])
-    rows += [rows[0].replace(EPOCHS[0], "2024-02-29T23:59:59.375").replace("159.69509", "148.45264")]
-    first, second = read(tmp_path, kvn(rows, **keywords("1.0", "ICRF", "A2B", None, ATTITUDE_TYPE="SPIN")))
+    rows += [
+        rows[0].replace(EPOCHS[0], "2024-02-29T23:59:59.375").replace("159.69509", "148.45264")
+    ]
+    first, second = read(
+        tmp_path, kvn(rows, **keywords("1.0", "ICRF", "A2B", None, ATTITUDE_TYPE="SPIN"))
+    )
     assert first.rate_cam_rad_s is None
     assert second.rate_cam_rad_s is None
 
@@ -180,7 +213,9 @@ def test_a_spin_that_its_attitudes_tell_has_no_rate_of_its_own(tmp_path):
 
 
 def xml_of(version, text, state):
-    meta = "".join(f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :]))
+    meta = "".join(
+        f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :])
+    )
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <aem xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" id="CCSDS_AEM_VERS" version="{version}">
 <header><CREATION_DATE>2024-01-01T00:00:00</CREATION_DATE><ORIGINATOR>X</ORIGINATOR></header>
@@ -190,18 +225,30 @@ def xml_of(version, text, state):
 
 def turns(what, names):
     values = zip(names, (10.0, 20.0, -30.0), strict=True)
-    return "".join(f'<rotation{k} {what}="{n}_{what.upper()}">{v}</rotation{k}>' for k, (n, v) in enumerate(values, start=1))
+    return "".join(
+        f'<rotation{k} {what}="{n}_{what.upper()}">{v}</rotation{k}>'
+        for k, (n, v) in enumerate(values, start=1)
+    )
 
 
 def flat(names, values):
-    return "".join(f"<{name}>{value}</{name}>" for name, value in zip(names.split(), values, strict=True))
+    return "".join(
+        f"<{name}>{value}</{name}>" for name, value in zip(names.split(), values, strict=True)
+    )
 
 
 SPIN_NAMES = "SPIN_ALPHA SPIN_DELTA SPIN_ANGLE SPIN_ANGLE_VEL"
 ANGLES = (10.0, 20.0, -30.0)
 SPIN_VALUES = (10.0, 20.0, -30.0, 4.0)
 XML_CASES = [
-    ("1.0", "EULER_ANGLE", "313", "eulerAngle", ANGLES, f"<rotationAngles>{turns('angle', 'ZXZ')}</rotationAngles>"),
+    (
+        "1.0",
+        "EULER_ANGLE",
+        "313",
+        "eulerAngle",
+        ANGLES,
+        f"<rotationAngles>{turns('angle', 'ZXZ')}</rotationAngles>",
+    ),
     (
         "1.0",
         "EULER_ANGLE/RATE",
@@ -226,7 +273,9 @@ XML_CASES = [
         "XYZ",
         "eulerAngleDerivative",
         (*ANGLES, 1.0, 2.0, 3.0),
-        flat("ANGLE_1 ANGLE_2 ANGLE_3 ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT", (*ANGLES, 1.0, 2.0, 3.0)),
+        flat(
+            "ANGLE_1 ANGLE_2 ANGLE_3 ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT", (*ANGLES, 1.0, 2.0, 3.0)
+        ),
     ),
     (
         "2.0",
@@ -234,34 +283,54 @@ XML_CASES = [
         None,
         "spinNutationMom",
         (*SPIN_VALUES, 5.0, 6.0, 7.0),
-        flat(f"{SPIN_NAMES} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL", (*SPIN_VALUES, 5.0, 6.0, 7.0)),
+        flat(
+            f"{SPIN_NAMES} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL",
+            (*SPIN_VALUES, 5.0, 6.0, 7.0),
+        ),
     ),
 ]
 
 
 @pytest.mark.parametrize(("version", "kind", "names", "element", "values", "inside"), XML_CASES)
-def test_xml_and_kvn_of_angles_hold_the_same(tmp_path, version, kind, names, element, values, inside):
+def test_xml_and_kvn_of_angles_hold_the_same(
+    tmp_path, version, kind, names, element, values, inside
+):
     more = {"RATE_FRAME": "REF_FRAME_B"} if kind.endswith("/RATE") else {}
-    text = kvn(rows_of(values), version, **keywords(version, "ICRF", "A2B", names, ATTITUDE_TYPE=kind, **more))
+    text = kvn(
+        rows_of(values),
+        version,
+        **keywords(version, "ICRF", "A2B", names, ATTITUDE_TYPE=kind, **more),
+    )
     state = f"<{element}><EPOCH>{EPOCHS[0]}</EPOCH>{inside}</{element}>"
     (from_kvn,), (from_xml,) = read(tmp_path, text), read(tmp_path, xml_of(version, text, state))
     assert from_xml.t_ns == from_kvn.t_ns
     assert from_xml.q_icrs_to_cam.tolist() == from_kvn.q_icrs_to_cam.tolist()
-    rates = [None if s.rate_cam_rad_s is None else s.rate_cam_rad_s.tolist() for s in (from_kvn, from_xml)]
+    rates = [
+        None if s.rate_cam_rad_s is None else s.rate_cam_rad_s.tolist()
+        for s in (from_kvn, from_xml)
+    ]
     assert rates[0] == rates[1]
 
 
 def test_xml_whose_angles_are_not_those_of_the_sequence_is_refused(tmp_path):
-    text = kvn(rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", "321", ATTITUDE_TYPE="EULER_ANGLE"))
+    text = kvn(
+        rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", "321", ATTITUDE_TYPE="EULER_ANGLE")
+    )
     angles = f"<rotationAngles>{turns('angle', 'XYZ')}</rotationAngles>"
     state = f"<eulerAngle><EPOCH>{EPOCHS[0]}</EPOCH>{angles}</eulerAngle>"
-    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in refusal(tmp_path, xml_of("1.0", text, state))
+    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in refusal(
+        tmp_path, xml_of("1.0", text, state)
+    )
 
 
 @pytest.mark.parametrize("names", [None, "7051995", "ZZX", "12", "ABC", "3211"])
 def test_a_sequence_that_is_none_is_refused(tmp_path, names):
-    text = kvn(rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", names, ATTITUDE_TYPE="EULER_ANGLE"))
-    assert f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX" in refusal(tmp_path, text)
+    text = kvn(
+        rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", names, ATTITUDE_TYPE="EULER_ANGLE")
+    )
+    assert f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX" in refusal(
+        tmp_path, text
+    )
 
 
 # Whose attitude it is, and whose time
@@ -269,13 +338,21 @@ def test_a_sequence_that_is_none_is_refused(tmp_path, names):
 
 @pytest.mark.parametrize(
     ("frame", "mounted"),
-    [("SC_BODY_1", True), ("GYRO_1", True), ("STARTRACKER_1", False), ("INSTRUMENT_A", False), ("CAM", False)],
+    [
+        ("SC_BODY_1", True),
+        ("GYRO_1", True),
+        ("STARTRACKER_1", False),
+        ("INSTRUMENT_A", False),
+        ("CAM", False),
+    ],
 )
 def test_the_mounting_is_of_a_body_and_not_of_a_camera(tmp_path, frame, mounted):
     (tmp_path / "log").write_text(kvn(rows_of([0, 0, 0, 1]), REF_FRAME_B=frame, TIME_SYSTEM="TAI"))
     log = open_log(tmp_path / "log", Stated(Mounting((0.6, 0.8, 0.0, 0.0))))
     assert log.conventions.of_body == mounted
-    assert log.samples[0].q_icrs_to_cam.tolist() == ([0.6, 0.8, 0.0, 0.0] if mounted else [1.0, 0.0, 0.0, 0.0])
+    assert log.samples[0].q_icrs_to_cam.tolist() == (
+        [0.6, 0.8, 0.0, 0.0] if mounted else [1.0, 0.0, 0.0, 0.0]
+    )
     lines = log.conventions.lines(Mounting())
     assert f"turns components of ICRF into those of {frame}" in lines[0]
     assert lines[2] == "time: TAI, from 1970-01-01T00:00:00 TAI"
@@ -288,10 +365,14 @@ def test_what_is_written_of_a_log_keeps_its_scale_and_is_the_cameras(tmp_path):
         write_log(tmp_path / name, log.samples, log.conventions.scale)
         again = open_log(tmp_path / name, Stated(Mounting((0.6, 0.8, 0.0, 0.0))))
         assert again.conventions.scale == "TDB"
-        assert [s.q_icrs_to_cam.tolist() for s in again.samples] == [s.q_icrs_to_cam.tolist() for s in log.samples]
+        assert [s.q_icrs_to_cam.tolist() for s in again.samples] == [
+            s.q_icrs_to_cam.tolist() for s in log.samples
+        ]
 
 
 def test_blocks_of_two_frames_of_the_spacecraft_are_refused(tmp_path):
-    one, two = (kvn(rows_of([0, 0, 0, 1]), REF_FRAME_B=frame) for frame in ("SC_BODY_1", "STARTRACKER_1"))
+    one, two = (
+        kvn(rows_of([0, 0, 0, 1]), REF_FRAME_B=frame) for frame in ("SC_BODY_1", "STARTRACKER_1")
+    )
     text = one + two[two.index("META_START") :].replace("2024-02-29", "2024-02-28")
     assert "the spacecraft's frame changes from block to block" in refusal(tmp_path, text)

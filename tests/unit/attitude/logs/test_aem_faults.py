@@ -74,7 +74,10 @@ def two_blocks(first, second, **keywords):
 
 
 def test_blocks_are_put_in_order_of_time(tmp_path):
-    text = two_blocks(["2024-01-02T00:00:00", "2024-01-02T00:00:01"], ["2024-01-01T00:00:00", "2024-01-01T00:00:01"])
+    text = two_blocks(
+        ["2024-01-02T00:00:00", "2024-01-02T00:00:01"],
+        ["2024-01-01T00:00:00", "2024-01-01T00:00:01"],
+    )
     samples = read(tmp_path, text)
     assert [s.t_ns for s in samples] == sorted(s.t_ns for s in samples)
     assert [s.discontinuity for s in samples] == [False, False, True, False]
@@ -82,7 +85,10 @@ def test_blocks_are_put_in_order_of_time(tmp_path):
 
 def test_blocks_may_share_an_epoch_and_the_earlier_then_ends_a_nanosecond_before(tmp_path):
     # 504.0-B-1 4.2.5.4.1 allows it; the attitude before the break is then known up to the break.
-    text = two_blocks(["2024-01-01T00:00:00", "2024-01-01T00:00:01"], ["2024-01-01T00:00:01", "2024-01-01T00:00:02"])
+    text = two_blocks(
+        ["2024-01-01T00:00:00", "2024-01-01T00:00:01"],
+        ["2024-01-01T00:00:01", "2024-01-01T00:00:02"],
+    )
     samples = read(tmp_path, text)
     assert [s.t_ns - samples[0].t_ns for s in samples] == [0, NS_PER_S - 1, NS_PER_S, 2 * NS_PER_S]
     assert [s.discontinuity for s in samples] == [False, False, True, False]
@@ -117,7 +123,10 @@ def which_at(samples, second):
 
 
 def useable(start, stop):
-    return {f"USEABLE_{key}_TIME": f"2024-01-01T00:00:{second:02d}" for key, second in (("START", start), ("STOP", stop))}
+    return {
+        f"USEABLE_{key}_TIME": f"2024-01-01T00:00:{second:02d}"
+        for key, second in (("START", start), ("STOP", stop))
+    }
 
 
 @pytest.mark.parametrize(
@@ -128,7 +137,10 @@ def useable(start, stop):
         ([([0, 20, 40], {}), ([25, 45], {})], {24: 0, 25: 1, 26: 1, 44: 1}),
         ([([0, 20, 40], {}), ([25, 30], {})], {24: 0, 26: 1, 29: 1, 30.5: 0, 39: 0}),
         # By USEABLE times, between attitudes too: the earlier one goes on to its end there.
-        ([([0, 20, 40], useable(0, 33)), ([30, 50], useable(33, 50))], {29: 0, 32: 0, 32.9: 0, 33.1: 1, 49: 1}),
+        (
+            [([0, 20, 40], useable(0, 33)), ([30, 50], useable(33, 50))],
+            {29: 0, 32: 0, 32.9: 0, 33.1: 1, 49: 1},
+        ),
         # Where only one segment has a time, it is taken whether it is useable there or not.
         ([([0, 20, 40], useable(5, 28)), ([30, 50], useable(35, 45))], {1: 0, 29: 0, 31: 1, 49: 1}),
         # In the file's order they need not be; of two that begin together the later in the file is
@@ -140,7 +152,9 @@ def useable(start, stop):
     ],
 )
 @pytest.mark.parametrize("form", ["kvn", "xml"])
-def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_one(tmp_path, segments, wanted, form):
+def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_one(
+    tmp_path, segments, wanted, form
+):
     text = overlapping(*segments)
     (tmp_path / "log").write_text(text if form == "kvn" else in_xml(text))
     log = open_log(tmp_path / "log")
@@ -159,11 +173,16 @@ def in_xml(text):
     body = ""
     for block in text.split("META_START")[1:]:
         meta, data = block.split("META_STOP")
-        keywords = "".join(f"<{key}>{value}</{key}>" for key, value in re.findall(r"(\w+) = (.*)", meta))
+        keywords = "".join(
+            f"<{key}>{value}</{key}>" for key, value in re.findall(r"(\w+) = (.*)", meta)
+        )
         states = ""
         for row in data.replace("DATA_START", "").replace("DATA_STOP", "").strip().splitlines():
             epoch, *q = row.split()
-            values = "".join(f"<{key}>{value}</{key}>" for key, value in zip(("Q1", "Q2", "Q3", "QC"), q, strict=True))
+            values = "".join(
+                f"<{key}>{value}</{key}>"
+                for key, value in zip(("Q1", "Q2", "Q3", "QC"), q, strict=True)
+            )
             state = f"<EPOCH>{epoch}</EPOCH><quaternion>{values}</quaternion>"
             states += f"<attitudeState><quaternionState>{state}</quaternionState></attitudeState>"
         body += f"<segment><metadata>{keywords}</metadata><data>{states}</data></segment>"
@@ -171,14 +190,18 @@ def in_xml(text):
 
 
 def test_useable_times_of_segments_that_do_not_overlap_change_nothing(tmp_path):
-    (tmp_path / "log").write_text(overlapping(([0, 10, 20], useable(5, 15)), ([30, 40], useable(35, 36))))
+    (tmp_path / "log").write_text(
+        overlapping(([0, 10, 20], useable(5, 15)), ([30, 40], useable(35, 36)))
+    )
     log = open_log(tmp_path / "log")
     assert len(log.samples) == 5
     assert "aem-overlap" not in dict(log.told)
 
 
 def test_rows_that_go_back_in_time_are_refused_as_ever(tmp_path):
-    assert "time does not increase" in refusal(tmp_path, overlapping(([0, 20, 10], {}), ([15, 30], {})))
+    assert "time does not increase" in refusal(
+        tmp_path, overlapping(([0, 20, 10], {}), ([15, 30], {}))
+    )
 
 
 @pytest.mark.parametrize(
@@ -211,7 +234,11 @@ def test_blocks_of_two_time_systems_are_refused(tmp_path):
 def test_other_types_are_refused_with_those_that_work(tmp_path, kind, version):
     message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), version, ATTITUDE_TYPE=kind))
     assert f"ATTITUDE_TYPE = {kind}" in message
-    assert "QUATERNION, QUATERNION/DERIVATIVE, QUATERNION/" + ("RATE" if version == "1.0" else "ANGVEL") in message
+    assert (
+        "QUATERNION, QUATERNION/DERIVATIVE, QUATERNION/"
+        + ("RATE" if version == "1.0" else "ANGVEL")
+        in message
+    )
 
 
 @pytest.mark.parametrize(
@@ -235,7 +262,10 @@ def test_a_keyword_that_is_missing_or_wrong_is_named(tmp_path, keywords, word):
     [
         ({}, "RATE_FRAME is missing; write ICRF or SC_BODY_1"),
         ({"RATE_FRAME": "INSTRUMENT_A"}, "RATE_FRAME is INSTRUMENT_A"),
-        ({"RATE_FRAME": "REF_FRAME_B", "EULER_ROT_SEQ": "321"}, "rates of Euler angles are not read"),
+        (
+            {"RATE_FRAME": "REF_FRAME_B", "EULER_ROT_SEQ": "321"},
+            "rates of Euler angles are not read",
+        ),
     ],
 )
 def test_a_rate_without_one_meaning_is_refused(tmp_path, keywords, word):
@@ -268,7 +298,11 @@ GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
         ("<aem/>", "", "not an AEM in XML"),
         ("<html><body/></html>", "", "not an AEM in XML"),
         ('<aem id="CCSDS_AEM_VERS" version="1.0"/>', "", "not an AEM in XML"),
-        ('<!DOCTYPE aem [<!ENTITY x "y">]><aem id="CCSDS_AEM_VERS" version="1.0">&x;</aem>', "", "DOCTYPE"),
+        (
+            '<!DOCTYPE aem [<!ENTITY x "y">]><aem id="CCSDS_AEM_VERS" version="1.0">&x;</aem>',
+            "",
+            "DOCTYPE",
+        ),
     ],
 )
 def test_a_message_that_is_wrong_is_refused_with_its_place(tmp_path, text, place, word):
@@ -284,12 +318,16 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
     assert "not well-formed" in refusal(tmp_path, text[: len(text) // 2])
     assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
     assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
-    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1))
+    assert "not an AEM in XML" in refusal(
+        tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1)
+    )
     assert not caplog.records
     assert ", 1970-01-01T00:00:00.000000002: the quaternion's norm" in refusal(
         tmp_path, "<QC>2.0</QC>".join(text.rsplit("<QC>1.0</QC>", 1))
     )
-    assert "is not the QUATERNION/DERIVATIVE" in refusal(tmp_path, text.replace("QUATERNION<", "QUATERNION/DERIVATIVE<"))
+    assert "is not the QUATERNION/DERIVATIVE" in refusal(
+        tmp_path, text.replace("QUATERNION<", "QUATERNION/DERIVATIVE<")
+    )
 
 
 @pytest.mark.parametrize(
@@ -307,19 +345,41 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
             ":9:",
             "ATTITUDE_DIRECTION is not a keyword .*; did you mean ATTITUDE_DIR",
         ),
-        ("OBJECT_NAME = X", "object_name = X", ":5:", "object_name is not a keyword .*; did you mean OBJECT_NAME"),
-        ("OBJECT_NAME = X", "WINDSPEED = 3", ":5:", "WINDSPEED is not a keyword .*; the keywords are OBJECT_NAME, "),
+        (
+            "OBJECT_NAME = X",
+            "object_name = X",
+            ":5:",
+            "object_name is not a keyword .*; did you mean OBJECT_NAME",
+        ),
+        (
+            "OBJECT_NAME = X",
+            "WINDSPEED = 3",
+            ":5:",
+            "WINDSPEED is not a keyword .*; the keywords are OBJECT_NAME, ",
+        ),
         (
             "ORIGINATOR = X",
             "ORIGINATOR = X\nATTITUDE_DIR = B2A",
             ":4:",
             "ATTITUDE_DIR is in the header; it belongs in the metadata",
         ),
-        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":9:", "ATTITUDE_DIR appears twice"),
-        ("META_START", "META_START\nORIGINATOR = Y", ":5:", "ORIGINATOR is in the metadata; it belongs in the header"),
+        (
+            "ATTITUDE_DIR = A2B",
+            "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A",
+            ":9:",
+            "ATTITUDE_DIR appears twice",
+        ),
+        (
+            "META_START",
+            "META_START\nORIGINATOR = Y",
+            ":5:",
+            "ORIGINATOR is in the metadata; it belongs in the header",
+        ),
     ],
 )
-def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(tmp_path, old, new, place, words):
+def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(
+    tmp_path, old, new, place, words
+):
     assert old in GOOD
     message = refusal(tmp_path, GOOD.replace(old, new, 1))
     line = int(place.strip(":")) + (1 if "appears twice" in words else 0)
@@ -328,7 +388,10 @@ def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(tmp_path, 
 
 
 def test_comments_may_stand_anywhere(tmp_path):
-    assert len(read(tmp_path, GOOD.replace("OBJECT_ID", "COMMENT QUATERNION_TYP = FIRST\nOBJECT_ID"))) == 2
+    assert (
+        len(read(tmp_path, GOOD.replace("OBJECT_ID", "COMMENT QUATERNION_TYP = FIRST\nOBJECT_ID")))
+        == 2
+    )
 
 
 def test_gcrf_has_the_axes_of_icrf(tmp_path):
@@ -338,7 +401,9 @@ def test_gcrf_has_the_axes_of_icrf(tmp_path):
 
 @pytest.fixture
 def xml(tmp_path):
-    write_log(tmp_path / "a.xml", [AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(3)])
+    write_log(
+        tmp_path / "a.xml", [AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(3)]
+    )
     return (tmp_path / "a.xml").read_text()
 
 
@@ -357,12 +422,27 @@ def _n(text, count):
         (f"{HEAD}<header>{_n('<COMMENT/>', 100_001)}", "too many"),
         (f"<ndm><oem>{_n('<a/>', 100_001)}", "too many"),
         (f"{HEAD}<header {_n('a=_', 300_000)}/></aem>", "a million characters"),
-        (f"{HEAD}<header><COMMENT>{_n('x', 500_001)}</COMMENT></header></aem>", "a million characters"),
+        (
+            f"{HEAD}<header><COMMENT>{_n('x', 500_001)}</COMMENT></header></aem>",
+            "a million characters",
+        ),
         ('<!DOCTYPE aem SYSTEM "file:///etc/passwd"><aem/>', "has a DOCTYPE"),
-        ('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><aem>&b;</aem>', "has a DOCTYPE"),
+        (
+            '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><aem>&b;</aem>',
+            "has a DOCTYPE",
+        ),
         (f"{HEAD}&b;</aem>", "not well-formed XML (undefined entity)"),
     ],
-    ids=["deep", "wide", "a wide neighbour", "attributes", "text", "external", "entities", "no entity"],
+    ids=[
+        "deep",
+        "wide",
+        "a wide neighbour",
+        "attributes",
+        "text",
+        "external",
+        "entities",
+        "no entity",
+    ],
 )
 def test_xml_made_to_fill_the_memory_or_to_read_other_files_is_refused(tmp_path, text, word):
     assert word in refusal(tmp_path, text)
@@ -376,8 +456,16 @@ def test_xml_made_to_fill_the_memory_or_to_read_other_files_is_refused(tmp_path,
         ("<quaternion>", "<quaternion>1", "'1' stands in <quaternion>"),
         ("<Q1>", '<Q1 units="deg">', "<Q1> in 'deg'; write no units"),
         ("<Q1>", '<Q1 scale="2">', "<Q1> has no scale"),
-        ("<QUATERNION_TYPE>LAST", "<QUATERNION_TYPE>LEAST", "QUATERNION_TYPE is LEAST; write FIRST or LAST"),
-        ("<TIME_SYSTEM>", "<TIME_SYSTEM>TAI</TIME_SYSTEM><TIME_SYSTEM>", "TIME_SYSTEM appears twice in the metadata"),
+        (
+            "<QUATERNION_TYPE>LAST",
+            "<QUATERNION_TYPE>LEAST",
+            "QUATERNION_TYPE is LEAST; write FIRST or LAST",
+        ),
+        (
+            "<TIME_SYSTEM>",
+            "<TIME_SYSTEM>TAI</TIME_SYSTEM><TIME_SYSTEM>",
+            "TIME_SYSTEM appears twice in the metadata",
+        ),
         ("<quaternion>", "<quaternion/><quaternion>", "has no place in a <quaternionState>"),
         ("<EPOCH>", "<EPOCH>1970-01-01T00:00:00</EPOCH><EPOCH>", "has one EPOCH"),
         ("<attitudeState>", "<state/><attitudeState>", "<state> where <COMMENT> belongs"),
@@ -395,9 +483,13 @@ def test_what_xml_would_hide_is_refused(tmp_path, xml, old, new, word):
 
 def test_names_with_a_namespace_and_another_message_beside_the_aem_are_read(tmp_path, xml):
     body = xml[xml.index("<aem") :]
-    named = re.sub(r"<(/?)(\w)", r"<\1ndm:\2", body).replace("<ndm:aem", '<ndm:aem xmlns:ndm="urn:ccsds:schema:ndmxml"', 1)
+    named = re.sub(r"<(/?)(\w)", r"<\1ndm:\2", body).replace(
+        "<ndm:aem", '<ndm:aem xmlns:ndm="urn:ccsds:schema:ndmxml"', 1
+    )
     assert [sample.t_ns for sample in read(tmp_path, named)] == [0, 1, 2]
-    assert [sample.t_ns for sample in read(tmp_path, f"<ndm><oem><body>9</body></oem>{body}</ndm>")] == [0, 1, 2]
+    assert [
+        sample.t_ns for sample in read(tmp_path, f"<ndm><oem><body>9</body></oem>{body}</ndm>")
+    ] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -409,14 +501,18 @@ def test_names_with_a_namespace_and_another_message_beside_the_aem_are_read(tmp_
         ("1.0", "ANGVEL_FRAME", "SC_BODY_1", "1.0 has RATE_FRAME"),
     ],
 )
-def test_a_keyword_of_the_other_version_is_refused_with_both_named(tmp_path, version, key, value, other):
+def test_a_keyword_of_the_other_version_is_refused_with_both_named(
+    tmp_path, version, key, value, other
+):
     """504.0-B-2 annex J."""
     own = {"1.0": "2.0", "2.0": "1.0"}[version]
     words = f"{key} is of AEM {own}, and CCSDS_AEM_VERS is {version}; {other}"
     text = kvn(rows_of([0, 0, 0, 1]), version, **{key: value})
     line = text[: text.index(key)].count("\n") + 1
     assert f"log:{line}: {words}" in refusal(tmp_path, text)
-    meta = "".join(f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :]))
+    meta = "".join(
+        f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :])
+    )
     document = f'<aem id="CCSDS_AEM_VERS" version="{version}"><body><segment><metadata>{meta}</metadata></segment></body></aem>'
     assert words in refusal(tmp_path, document)
 
@@ -435,13 +531,18 @@ def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
     samples = read(tmp_path, f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{body}</ndm>")
     assert [s.t_ns for s in samples] == [0, 1, 2]
     for count, inside in ((0, ""), (2, body + body)):
-        assert f"the <ndm> contains {count} <aem>; write one" in refusal(tmp_path, f"<ndm>{inside}</ndm>")
+        assert f"the <ndm> contains {count} <aem>; write one" in refusal(
+            tmp_path, f"<ndm>{inside}</ndm>"
+        )
 
 
 @pytest.mark.parametrize("part", ["segment", "metadata", "data", "body", "header"])
 def test_an_empty_part_is_one_line_that_names_no_python(tmp_path, xml, part):
     start, end = xml.index(f"<{part}>"), xml.index(f"</{part}>")
-    for text in (xml[: start + len(part) + 2] + xml[end:], xml[:start] + xml[end + len(part) + 3 :]):
+    for text in (
+        xml[: start + len(part) + 2] + xml[end:],
+        xml[:start] + xml[end + len(part) + 3 :],
+    ):
         try:
             samples = read(tmp_path, text)
         except InputError as error:

@@ -36,7 +36,13 @@ FAR_KM = 1e13  # so far that neither the observer's place nor its velocity count
 
 def aem(frame, epochs, scale="UTC", rates="", **keywords):
     q = " ".join(map(repr, Q_FRAME_TO_BODY.inv().as_quat().tolist()))  # annex F: the conjugate
-    return kvn([f"{epoch} {q}{rates}" for epoch in epochs], "2.0", REF_FRAME_A=frame, TIME_SYSTEM=scale, **keywords)
+    return kvn(
+        [f"{epoch} {q}{rates}" for epoch in epochs],
+        "2.0",
+        REF_FRAME_A=frame,
+        TIME_SYSTEM=scale,
+        **keywords,
+    )
 
 
 def samples_of(tmp_path, text):
@@ -54,7 +60,10 @@ def frame_from_gcrs(frame):
 
 
 def off_rad(sample, frame_from_icrs):
-    return (Rotation.from_matrix(to_matrix(sample.q_icrs_to_cam)) * (Q_FRAME_TO_BODY * frame_from_icrs).inv()).magnitude()
+    return (
+        Rotation.from_matrix(to_matrix(sample.q_icrs_to_cam))
+        * (Q_FRAME_TO_BODY * frame_from_icrs).inv()
+    ).magnitude()
 
 
 @pytest.mark.parametrize("date", DATES)
@@ -78,17 +87,26 @@ def test_the_mean_equator_of_date_is_that_of_the_published_precession(tmp_path, 
     # Capitaine, Wallace & Chapront 2003, A&A 412, 567, eq. 40; the frame bias of the IERS
     # Conventions (2010), 5.3.2.
     t = (Time(date, scale="utc").tt.jd - 2451545.0) / 36525.0
-    zeta = np.polyval([-0.0000003173, -0.000005971, 0.01801828, 0.2988499, 2306.083227, 2.650545], t)
+    zeta = np.polyval(
+        [-0.0000003173, -0.000005971, 0.01801828, 0.2988499, 2306.083227, 2.650545], t
+    )
     z = np.polyval([-0.0000002904, -0.000028596, 0.01826837, 1.0927348, 2306.077181, -2.650545], t)
     theta = np.polyval([-0.0000001274, -0.000007089, -0.04182264, -0.4294934, 2004.191903, 0.0], t)
     # Turns of the frame, so by opposite angles: R3(-z) R2(theta) R3(-zeta).
-    turns = [Rotation.from_euler(axis, angle * ARCSEC) for axis, angle in (("z", z), ("y", -theta), ("z", zeta))]
+    turns = [
+        Rotation.from_euler(axis, angle * ARCSEC)
+        for axis, angle in (("z", z), ("y", -theta), ("z", zeta))
+    ]
     precession = turns[0] * turns[1] * turns[2]
     alpha, xi, eta = np.array([-0.01460, -0.0166170, -0.0068192]) * ARCSEC
     turned = Rotation.from_euler("z", -zeta * ARCSEC).inv()
-    precession = Rotation.from_euler("z", z * ARCSEC) * Rotation.from_euler("y", -theta * ARCSEC) * turned
+    precession = (
+        Rotation.from_euler("z", z * ARCSEC) * Rotation.from_euler("y", -theta * ARCSEC) * turned
+    )
     bias = (
-        Rotation.from_euler("x", eta) * Rotation.from_euler("y", -xi) * Rotation.from_euler("z", -alpha)
+        Rotation.from_euler("x", eta)
+        * Rotation.from_euler("y", -xi)
+        * Rotation.from_euler("z", -alpha)
     )  # R1(-eta) R2(xi) R3
     (sample,) = samples_of(tmp_path, aem("MOD", [date])).samples
     assert off_rad(sample, precession * bias) < MOD_TOLERANCE_RAD
@@ -98,24 +116,38 @@ def test_a_body_at_rest_on_the_earth_turns_with_it(tmp_path):
     epochs = ["2024-02-29T12:00:00", "2024-02-29T12:00:10"]
     keywords = {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": "ITRF"}
     first, second = samples_of(tmp_path, aem("ITRF", epochs, rates=" 0 0 0", **keywords)).samples
-    turned = Rotation.from_matrix(to_matrix(first.q_icrs_to_cam)) * Rotation.from_matrix(to_matrix(second.q_icrs_to_cam)).inv()
-    assert first.rate_cam_rad_s == pytest.approx(turned.as_rotvec() / 10.0, abs=RATE_TOLERANCE_RAD_S)
+    turned = (
+        Rotation.from_matrix(to_matrix(first.q_icrs_to_cam))
+        * Rotation.from_matrix(to_matrix(second.q_icrs_to_cam)).inv()
+    )
+    assert first.rate_cam_rad_s == pytest.approx(
+        turned.as_rotvec() / 10.0, abs=RATE_TOLERANCE_RAD_S
+    )
     assert np.linalg.norm(first.rate_cam_rad_s) == pytest.approx(2 * np.pi / 86164.1, rel=1e-6)
 
 
-@pytest.mark.parametrize(("scale", "ahead_s"), [("TAI", 37.0), ("TT", 69.184), ("GPS", 18.0), ("TDB", 69.184)])
+@pytest.mark.parametrize(
+    ("scale", "ahead_s"), [("TAI", 37.0), ("TT", 69.184), ("GPS", 18.0), ("TDB", 69.184)]
+)
 def test_the_earth_turns_by_utc_whatever_the_scale(tmp_path, scale, ahead_s):
     date = np.datetime64("2024-02-29T12:00:00.000000000")
     (utc,) = samples_of(tmp_path, aem("ITRF", [str(date)])).samples
-    (other,) = samples_of(tmp_path, aem("ITRF", [str(date + np.timedelta64(round(ahead_s * 1e9), "ns"))], scale)).samples
+    (other,) = samples_of(
+        tmp_path, aem("ITRF", [str(date + np.timedelta64(round(ahead_s * 1e9), "ns"))], scale)
+    ).samples
     assert other.q_icrs_to_cam == pytest.approx(utc.q_icrs_to_cam, abs=1e-14)
 
 
 def test_what_tells_no_utc_or_lies_beyond_the_table_is_said(tmp_path):
-    assert "TIME_SYSTEM = UT1 does not tell UTC" in refusal(tmp_path, aem("ITRF", [DATES[0]], "UT1"))
+    assert "TIME_SYSTEM = UT1 does not tell UTC" in refusal(
+        tmp_path, aem("ITRF", [DATES[0]], "UT1")
+    )
     assert "do not fit 64 bits" in refusal(tmp_path, aem("TEME", ["9999-01-01T00:00:00"]))
     log = samples_of(tmp_path, aem("ITRF", ["2050-01-01T00:00:00"]))
     assert "earth-orientation" in [kind for kind, _ in log.told]
     lines = log.conventions.lines(Mounting())
-    assert "turns components of ITRF into those of SC_BODY_1 (ITRF by hilstar: the ICRF, at each epoch)" in lines[0]
+    assert (
+        "turns components of ITRF into those of SC_BODY_1 (ITRF by hilstar: the ICRF, at each epoch)"
+        in lines[0]
+    )
     assert " at 2050-01-01T00:00:00 Alnilam" in lines[-1]

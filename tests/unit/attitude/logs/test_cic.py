@@ -34,7 +34,9 @@ def log(tmp_path):
 def test_the_real_part_comes_first_and_times_are_days_and_seconds(log):
     found = log(WHOLE)
     assert [sample.t_ns for sample in found.samples] == [DAY_NS, DAY_NS + 10_250_000_000]
-    assert to_radec_roll_deg(found.samples[0].q_icrs_to_cam)[:2] == pytest.approx((84.057, -1.2), abs=1e-5)
+    assert to_radec_roll_deg(found.samples[0].q_icrs_to_cam)[:2] == pytest.approx(
+        (84.057, -1.2), abs=1e-5
+    )
     assert found.conventions.of_body and found.conventions.scale == "UTC"
     assert "scalar first (q0, q1, q2, q3)" in found.conventions.scalar
 
@@ -47,7 +49,11 @@ def test_attitudes_are_those_of_an_aem_of_the_same_numbers(tmp_path, log, direct
     meta = {"ATTITUDE_DIR": direction, "REF_FRAME_A": frame, "TIME_SYSTEM": scale}
     found = log(cic_text([f"60310 {s} {w} {x} {y} {z}" for s in (0, 1)], **meta))
     (tmp_path / "b.aem").write_text(
-        kvn([f"2024-01-01T00:00:0{s} {x} {y} {z} {w}" for s in (0, 1)], QUATERNION_TYPE="LAST", **meta)
+        kvn(
+            [f"2024-01-01T00:00:0{s} {x} {y} {z} {w}" for s in (0, 1)],
+            QUATERNION_TYPE="LAST",
+            **meta,
+        )
     )
     wanted = open_log(tmp_path / "b.aem")
     for one, other in zip(found.samples, wanted.samples, strict=True):
@@ -57,19 +63,26 @@ def test_attitudes_are_those_of_an_aem_of_the_same_numbers(tmp_path, log, direct
 
 
 def test_what_writers_have_besides_is_read(log):
-    text = cic_text(ROWS, QUATERNION_TYPE="FIRST", CENTER_NAME="EARTH", START_TIME="2024-01-01T00:00:00")
+    text = cic_text(
+        ROWS, QUATERNION_TYPE="FIRST", CENTER_NAME="EARTH", START_TIME="2024-01-01T00:00:00"
+    )
     others = [
         text,
         text.replace("CIC_AEM_VERS = 1.0", "CIC_AEM_VERS = 2.0"),
         text.replace("META_STOP", "USER_DEFINED_CONTENT = STAR TRACKER\nMETA_STOP"),
         text.replace("60310 0.0", "2024-01-01T00:00:00"),
         text.replace("\n", "\r\n"),
-        cic_text(ROWS, comment="days (MJD), sec (UTC), q0: real part, q1, q2, q3", QUATERNION_TYPE="LAST"),
+        cic_text(
+            ROWS, comment="days (MJD), sec (UTC), q0: real part, q1, q2, q3", QUATERNION_TYPE="LAST"
+        ),
     ]
     for other in others:
         assert [sample.t_ns for sample in log(other).samples] == [DAY_NS, DAY_NS + 10_250_000_000]
     unnamed = log(cic_text(ROWS, REF_FRAME_B="UNDEFINED"))
-    assert dict(unnamed.told)["log-frame"] == "REF_FRAME_B = UNDEFINED is taken as the spacecraft's body"
+    assert (
+        dict(unnamed.told)["log-frame"]
+        == "REF_FRAME_B = UNDEFINED is taken as the spacecraft's body"
+    )
 
 
 def test_several_segments_follow_each_other(log):
@@ -82,27 +95,55 @@ def test_several_segments_follow_each_other(log):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", ":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not"),
+        (
+            "ATTITUDE_TYPE = QUATERNION",
+            "ATTITUDE_TYPE = EULER_ANGLE",
+            ":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not",
+        ),
         (
             "ATTITUDE_TYPE = QUATERNION",
             "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = LAST",
             ":14: QUATERNION_TYPE = LAST, where CIC has the real part first and writers differ",
         ),
-        ("REF_FRAME_A = EME2000", "REF_FRAME_A = LVLH", "REF_FRAME_A = LVLH, REF_FRAME_B = SC_BODY_1; one must be"),
+        (
+            "REF_FRAME_A = EME2000",
+            "REF_FRAME_A = LVLH",
+            "REF_FRAME_A = LVLH, REF_FRAME_B = SC_BODY_1; one must be",
+        ),
         ("ATTITUDE_DIR = A2B", "", "ATTITUDE_DIR is missing in the metadata"),
         ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2C", "ATTITUDE_DIR is A2C; write A2B or B2A"),
-        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":12: ATTITUDE_DIR appears twice"),
-        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIRECTION = A2B", ":11: ATTITUDE_DIRECTION is no keyword that is read here"),
+        (
+            "ATTITUDE_DIR = A2B",
+            "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A",
+            ":12: ATTITUDE_DIR appears twice",
+        ),
+        (
+            "ATTITUDE_DIR = A2B",
+            "ATTITUDE_DIRECTION = A2B",
+            ":11: ATTITUDE_DIRECTION is no keyword that is read here",
+        ),
         ("CIC_AEM_VERS = 1.0", "CIC_AEM_VERS = 3.0", "CIC_AEM_VERS is 3.0; write 1.0 or 2.0"),
-        ("60310 0.0", "27028 0.0", ":17: the day 27028 is no modified Julian day from 36115 (1957)"),
+        (
+            "60310 0.0",
+            "27028 0.0",
+            ":17: the day 27028 is no modified Julian day from 36115 (1957)",
+        ),
         ("60310 0.0", "60310.5 0.0", ":17: the day 60310.5 is no whole number"),
         ("60310 0.0", "60310 86401", ":17: 86401 are no seconds of a day"),
         ("60310 0.0", "60310 -1", ":17: -1 are no seconds of a day"),
         ("60310 0.0", "60310", "has 5 numbers; write the modified Julian day"),
-        ("60310 0.0", "60310 zero", "write the modified Julian day, its seconds and the quaternion"),
+        (
+            "60310 0.0",
+            "60310 zero",
+            "write the modified Julian day, its seconds and the quaternion",
+        ),
         ("60310 0.0", "60310 20", ":18: time does not increase"),
         ("META_STOP", "", ":17: "),
-        ("META_STOP", "META_START", ":15: META_START in the metadata; META_START and META_STOP take turns"),
+        (
+            "META_STOP",
+            "META_START",
+            ":15: META_START in the metadata; META_START and META_STOP take turns",
+        ),
         (ALNILAM, "0.5 0.5 0.5 0.6", ":17: the quaternion's norm is 1.05357"),
     ],
 )

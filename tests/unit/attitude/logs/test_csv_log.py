@@ -47,10 +47,18 @@ CUTS = {
     "in the last number": (slew(), 6, 59),
     "one figure": (slew(), 2, 59),
     "the line end alone": (slew(), 1, 60),
-    "in the rates": (slew("t_s,qw,qx,qy,qz,rx,ry,rz", lambda k: ",0.0001000,0.0017453,0.0002000"), 5, 59),
+    "in the rates": (
+        slew("t_s,qw,qx,qy,qz,rx,ry,rz", lambda k: ",0.0001000,0.0017453,0.0002000"),
+        5,
+        59,
+    ),
     "in the sequence": (slew("t_s,qw,qx,qy,qz,sequence", lambda k: f",{100 + k}"), 2, 59),
     "within a row": (slew(), 20, 59),
-    "within t_s as the last column": ("qw,qx,qy,qz,t_s\n" + "".join(f"{Q},{k}.25\n" for k in range(4)), 2, 3),
+    "within t_s as the last column": (
+        "qw,qx,qy,qz,t_s\n" + "".join(f"{Q},{k}.25\n" for k in range(4)),
+        2,
+        3,
+    ),
     "within the exponent": (HEAD + f"0,{Q}\n1,1,0,0,1.5e-05\n2,1,0,0,1.5e-05\n", 2, 2),
 }
 
@@ -76,7 +84,10 @@ def test_the_attitude_at_the_end_of_a_cut_log_is_the_last_whole_one(log):
 
 
 def telemetry_text(header, good, bad, lost=LOST):
-    rows = [f"{k * 0.1:.1f},{lost if k in (4, 5) else Q},{bad if k in (4, 5) else good}\n" for k in range(10)]
+    rows = [
+        f"{k * 0.1:.1f},{lost if k in (4, 5) else Q},{bad if k in (4, 5) else good}\n"
+        for k in range(10)
+    ]
     return f"t_s,qw,qx,qy,qz,{header}\n" + "".join(rows)
 
 
@@ -95,17 +106,24 @@ def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(log, header,
     path = log(telemetry_text(header, good, bad, lost))
     found = open_log(path)
     assert [round(sample.t_ns / 1e8) for sample in found.samples] == [0, 1, 2, 3, 6, 7, 8, 9]
-    assert dict(found.told)["log-valid"] == "2 rows are marked as not valid by the log itself, and left out"
+    assert (
+        dict(found.told)["log-valid"]
+        == "2 rows are marked as not valid by the log itself, and left out"
+    )
     assert read_telemetry(path).valid.tolist() == [k not in (4, 5) for k in range(10)]
 
 
 def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
     text = "".join(
-        f'{{"t_ns": {k}, "q": [{LOST if k == 1 else Q}], "valid": {"false" if k == 1 else "true"}}}\n' for k in range(3)
+        f'{{"t_ns": {k}, "q": [{LOST if k == 1 else Q}], "valid": {"false" if k == 1 else "true"}}}\n'
+        for k in range(3)
     )
     found = open_log(log(text))
     assert [sample.t_ns for sample in found.samples] == [0, 2]
-    assert dict(found.told)["log-valid"] == "1 line is marked as not valid by the log itself, and left out"
+    assert (
+        dict(found.told)["log-valid"]
+        == "1 line is marked as not valid by the log itself, and left out"
+    )
 
 
 def test_a_column_of_marks_that_is_not_used_is_named(log):
@@ -130,13 +148,19 @@ def test_dialects_of_a_log_are_read(log):
     for text in texts:
         samples = open_log(log(text)).samples
         assert [sample.t_ns for sample in samples] == [0, 10**9], text
-        assert all(np.array_equal(a.q_icrs_to_cam, b.q_icrs_to_cam) for a, b in zip(samples, plain, strict=True)), text
+        assert all(
+            np.array_equal(a.q_icrs_to_cam, b.q_icrs_to_cam)
+            for a, b in zip(samples, plain, strict=True)
+        ), text
 
 
 def test_rates_are_in_the_unit_of_their_columns_and_that_is_said(log):
     found = open_log(log(f"t_s,qw,qx,qy,qz,rx [deg/s],ry_deg_s,rz (°/s)\n0,{Q},1,2,3\n"))
     assert found.samples[0].rate_cam_rad_s == pytest.approx(np.radians([1, 2, 3]), rel=1e-12)
-    assert sum("deg/s" in line or "°/s" in line for kind, line in found.told if kind == "log-table") == 3
+    assert (
+        sum("deg/s" in line or "°/s" in line for kind, line in found.told if kind == "log-table")
+        == 3
+    )
 
 
 REFUSED = {
@@ -149,13 +173,15 @@ REFUSED = {
     f'[{{"t_ns": 1, "q": [{Q}]}},{{"t_ns": 2, "q": [{Q}]}}]': "is a JSON array, or an object over several lines; write",
     f'[\n {{"t_ns": 1,\n "q": [{Q}]}}\n]\n': "is a JSON array, or an object over several lines",
     f'{{\n "t_ns": 1,\n "q": [{Q}]\n}}\n': ":1: a JSON object over several lines; write each on one line",
-    HEAD + f"1763800000000,{Q}\n": ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds; name",
+    HEAD
+    + f"1763800000000,{Q}\n": ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds; name",
     HEAD
     + f"100.01,{Q}\n100.01,{Q}\n": ":3: time does not increase (t_ns 100010000000 after 100010000000): two attitudes have one",
     HEAD + f"2,{Q}\n1,{Q}\n": "; sort the log by time",
     f"t,qw,qx,qy,qz\n0,{Q}\n": ":1: column t has no unit; write t_s, or its unit as t [s]",
     f"0,{Q}\n1,{Q}\n": ":1: column t_s is missing, as no line names the columns; the header must have t_s,qw,qx,qy,qz",
-    HEAD + "0,0,7,0,7,0,0\n": ":2: 7 cells and 5 columns (a decimal comma, or commas between thousands?",
+    HEAD
+    + "0,0,7,0,7,0,0\n": ":2: 7 cells and 5 columns (a decimal comma, or commas between thousands?",
     HEAD + f"0,{Q},5\n": ":2: 6 cells and 5 columns",
     f"t_s,qw,qx,qy,qz,valid\n0,{Q},maybe\n": ":2: valid = 'maybe'; write 1 or 0",
     "t_s;qw;qx;qy;qz\n0;1;0;0;0\n"

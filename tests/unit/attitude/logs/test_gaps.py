@@ -33,7 +33,10 @@ def coning(spin_rad_s: float, nutation_rad_s: float, t_s: float) -> tuple[np.nda
 
 def log(times_s, spin=0.02, nutation=0.03, *, rate=True):
     moments = [(t, *coning(spin, nutation, t)) for t in times_s]
-    return [AttitudeSample(round(t * S), q, omega if rate else None, k) for k, (t, q, omega) in enumerate(moments)]
+    return [
+        AttitudeSample(round(t * S), q, omega if rate else None, k)
+        for k, (t, q, omega) in enumerate(moments)
+    ]
 
 
 def worst_arcsec(samples, spin=0.02, nutation=0.03, policy=STREAM) -> float:
@@ -42,16 +45,21 @@ def worst_arcsec(samples, spin=0.02, nutation=0.03, policy=STREAM) -> float:
     for t_ns in np.linspace(samples[1].t_ns, samples[-2].t_ns, 401):
         attitude = timeline.at(round(t_ns))
         assert attitude is not None
-        errors.append(angle_between_rad(attitude.q_icrs_to_cam, coning(spin, nutation, round(t_ns) / S)[0]))
+        errors.append(
+            angle_between_rad(attitude.q_icrs_to_cam, coning(spin, nutation, round(t_ns) / S)[0])
+        )
     return float(np.degrees(max(errors)) * 3600)
 
 
 # The error of SLERP is a T^2 / 8, with a = spin x nutation; the blend's is of the next order, and
 # measured here.
 @pytest.mark.parametrize(
-    ("step_s", "spin", "nutation", "limit_arcsec"), [(0.5, 0.02, 0.03, 0.002), (4.0, 2e-3, 1e-3, 0.01), (4.0, 0.02, 0.03, 8.0)]
+    ("step_s", "spin", "nutation", "limit_arcsec"),
+    [(0.5, 0.02, 0.03, 0.002), (4.0, 2e-3, 1e-3, 0.01), (4.0, 0.02, 0.03, 8.0)],
 )
-def test_a_slow_log_with_rates_is_blended_and_not_cut_at_the_corners(step_s, spin, nutation, limit_arcsec):
+def test_a_slow_log_with_rates_is_blended_and_not_cut_at_the_corners(
+    step_s, spin, nutation, limit_arcsec
+):
     times = np.arange(0, 200, step_s)
     blended = worst_arcsec(log(times, spin, nutation), spin, nutation)
     slerped = worst_arcsec(log(times, spin, nutation, rate=False), spin, nutation)
@@ -63,7 +71,9 @@ def test_a_slow_log_with_rates_is_blended_and_not_cut_at_the_corners(step_s, spi
 def test_the_display_and_the_twin_and_the_sender_take_a_log_alike():
     samples = log(np.arange(0, 60, 4.0))
     display = log_timeline(samples, STREAM)
-    for motion, t_ns in zip(log_views(samples, 57, 0.1), np.linspace(0, samples[-1].t_ns, 57), strict=True):
+    for motion, t_ns in zip(
+        log_views(samples, 57, 0.1), np.linspace(0, samples[-1].t_ns, 57), strict=True
+    ):
         attitude = display.at(round(t_ns))
         assert attitude is not None
         assert angle_between_rad(attitude.q_icrs_to_cam, motion.q_icrs_to_cam) < 1e-12
@@ -83,7 +93,10 @@ def test_a_gap_of_a_log_without_rates_is_held_and_told():
     samples = log(times, rate=False)
     joins = log_joins(samples)
     assert joins.told == [
-        ("log-gap", "the log has 1 gap, the longest 20.5 s (over 5 times its usual 0.5 s); the attitude is held there"),
+        (
+            "log-gap",
+            "the log has 1 gap, the longest 20.5 s (over 5 times its usual 0.5 s); the attitude is held there",
+        ),
     ]
     timeline = log_timeline(samples, STREAM)
     before = samples[19].q_icrs_to_cam
@@ -113,7 +126,10 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
     samples = log(times, spin=0.008, nutation=0.0)
     assert log_joins(samples).told == []
     assert worst_arcsec(samples, 0.008, 0.0) < 0.1
-    other = [*samples[:20], *(AttitudeSample(s.t_ns, START, s.rate_cam_rad_s) for s in samples[20:])]
+    other = [
+        *samples[:20],
+        *(AttitudeSample(s.t_ns, START, s.rate_cam_rad_s) for s in samples[20:]),
+    ]
     assert [kind for kind, _ in log_joins(other).told] == ["log-gap", "log-rates"]
 
 
@@ -121,7 +137,10 @@ def test_rates_that_do_not_fit_the_attitudes_are_not_used_and_told():
     """Two samples at rest but for a rate that each claims: the way between is the straight one."""
     samples = [AttitudeSample(k * S // 2, START, np.array([0.0, 0.0, 2.0])) for k in range(4)]
     assert log_joins(samples).told == [
-        ("log-rates", "in 3 intervals the log's rates do not fit its attitudes, and are ignored there")
+        (
+            "log-rates",
+            "in 3 intervals the log's rates do not fit its attitudes, and are ignored there",
+        )
     ]
     attitude = log_timeline(samples, STREAM).at(S // 4)
     assert attitude is not None
@@ -130,7 +149,9 @@ def test_rates_that_do_not_fit_the_attitudes_are_not_used_and_told():
 
 def test_a_discontinuity_holds_whatever_the_interval_and_the_rates():
     samples = log(np.arange(0, 10, 0.5))
-    samples[7] = AttitudeSample(samples[7].t_ns, samples[7].q_icrs_to_cam, samples[7].rate_cam_rad_s, 7, True)
+    samples[7] = AttitudeSample(
+        samples[7].t_ns, samples[7].q_icrs_to_cam, samples[7].rate_cam_rad_s, 7, True
+    )
     attitude = log_timeline(samples, STREAM).at(round(3.4 * S))
     assert attitude is not None
     assert angle_between_rad(attitude.q_icrs_to_cam, samples[6].q_icrs_to_cam) < 1e-12
@@ -144,6 +165,11 @@ def test_times_beyond_64_bits_of_difference_do_no_harm():
 
 
 def test_a_log_s_rates_in_deg_s_are_named():
-    samples = [replace(each, rate_cam_rad_s=np.degrees(each.rate_cam_rad_s)) for each in log(np.arange(0, 60, 0.5))]
+    samples = [
+        replace(each, rate_cam_rad_s=np.degrees(each.rate_cam_rad_s))
+        for each in log(np.arange(0, 60, 0.5))
+    ]
     told = dict(log_joins(samples).told)["log-rates"]
-    assert told.startswith("in 119 intervals") and told.endswith("probably they are in deg/s; send rad/s")
+    assert told.startswith("in 119 intervals") and told.endswith(
+        "probably they are in deg/s; send rad/s"
+    )

@@ -110,8 +110,12 @@ def test_a_format_of_another_package_is_read_written_and_named(tmp_path, package
         write_log(tmp_path / "c.txt", samples)
 
 
-@pytest.mark.parametrize("value", ["planetarium_log:read", "planetarium_log:MISSING", "no_such_module:FORMAT"])
-def test_what_another_package_registers_and_is_no_format_is_left_out_with_a_warning(tmp_path, package, value, caplog):
+@pytest.mark.parametrize(
+    "value", ["planetarium_log:read", "planetarium_log:MISSING", "no_such_module:FORMAT"]
+)
+def test_what_another_package_registers_and_is_no_format_is_left_out_with_a_warning(
+    tmp_path, package, value, caplog
+):
     package(value)
     (tmp_path / "a.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
     with caplog.at_level(logging.WARNING):
@@ -153,7 +157,9 @@ def test_reading_names_no_format_of_a_log_itself():
 def test_a_log_in_the_place_of_a_bench_file_is_named(tmp_path):
     for magic, kind in formats.kinds().items():
         (tmp_path / "bench.toml").write_bytes(magic + bytes(20))
-        result = run_hilstar_here("frame", tmp_path / "bench.toml", "--radec", "0,0,0", "-o", tmp_path / "a.png")
+        result = run_hilstar_here(
+            "frame", tmp_path / "bench.toml", "--radec", "0,0,0", "-o", tmp_path / "a.png"
+        )
         assert result.returncode == 2
         assert f"it is {kind}" in result.stderr
 
@@ -166,20 +172,36 @@ def test_a_ulog_of_px4_is_refused_with_the_way_to_bring_one(tmp_path):
         assert result.stderr.count("\n") == 1
         for words in ("a ULog of PX4, which is not read", "pyulog", "t_s", "qw,qx,qy,qz", "q[0]"):
             assert words in result.stderr
-        for words in ("--convention frame=body,direction=cam_to_icrs", "--reference ned", "--place", "--epoch-utc"):
+        for words in (
+            "--convention frame=body,direction=cam_to_icrs",
+            "--reference ned",
+            "--place",
+            "--epoch-utc",
+        ):
             assert words in result.stderr
 
 
 def test_the_way_to_bring_a_log_of_px4_gives_the_place_of_astropy(tmp_path):
     """A body 34.38 deg from north, level at 47 N 8 E: Astropy (ITRS to GCRS) and SciPy."""
     path = tmp_path / "flight.csv"
-    path.write_text("t_s,qw,qx,qy,qz\n0.998,0.9553365,0.0,0.0,0.29552022\n1.098,0.9553365,0.0,0.0,0.29552022\n")
-    stated = ("--convention", "frame=body,direction=cam_to_icrs", "--reference", "ned", "--place", "47,8,0")
+    path.write_text(
+        "t_s,qw,qx,qy,qz\n0.998,0.9553365,0.0,0.0,0.29552022\n1.098,0.9553365,0.0,0.0,0.29552022\n"
+    )
+    stated = (
+        "--convention",
+        "frame=body,direction=cam_to_icrs",
+        "--reference",
+        "ned",
+        "--place",
+        "47,8,0",
+    )
     result = run_hilstar_here("attitude", path, *stated, "--epoch-utc", "2024-06-01T22:00:00")
     assert "RA 48.6736, Dec -47.0910, roll 304.52" in result.stdout, result.stderr
 
 
 def test_a_log_says_what_formats_there_are_where_it_is_none(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    with pytest.raises(InputError, match=r"it is a PNG picture.*hilstar reads .*STK attitude files"):
+    with pytest.raises(
+        InputError, match=r"it is a PNG picture.*hilstar reads .*STK attitude files"
+    ):
         open_log(tmp_path / "a.png")

@@ -19,8 +19,14 @@ COUNT = 50
 
 def rows(step_s: float, rates: bool, scale: float = 1.0):
     for k in range(COUNT):
-        turn = Rotation.from_rotvec(-RATE * step_s * k) * Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
-        yield k * step_s, turn.as_quat(scalar_first=True).tolist(), (RATE * scale).tolist() if rates else None
+        turn = Rotation.from_rotvec(-RATE * step_s * k) * Rotation.from_euler(
+            "xyz", [10, 20, 30], degrees=True
+        )
+        yield (
+            k * step_s,
+            turn.as_quat(scalar_first=True).tolist(),
+            (RATE * scale).tolist() if rates else None,
+        )
 
 
 def written(tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scale: float = 1.0):
@@ -34,7 +40,9 @@ def written(tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scal
     else:
         lines = []
         for t_s, q, rate in rows(step_s, rates, scale):
-            lines.append(json.dumps({"t_ns": round(t_s / unit_s), "q": q} | ({"rate": rate} if rate else {})))
+            lines.append(
+                json.dumps({"t_ns": round(t_s / unit_s), "q": q} | ({"rate": rate} if rate else {}))
+            )
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -45,7 +53,10 @@ def notices(path) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("step_s", [0.005, 0.02, 0.1])
-@pytest.mark.parametrize(("unit", "unit_s"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86400.0)])
+@pytest.mark.parametrize(
+    ("unit", "unit_s"),
+    [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86400.0)],
+)
 def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, step_s):
     said, rates = notices(written(tmp_path, "csv", unit_s, step_s, rates=True))
     assert said.startswith(f"the rates do not fit the times: probably the times are in {unit}")
@@ -76,7 +87,8 @@ def test_nothing_is_said_of_times_that_are_right(tmp_path, kind, unit_s, rates):
 
 
 @pytest.mark.parametrize(
-    ("kind", "unit_s", "limit"), [("csv", 1e-3, "over 10 s"), ("csv", 1e3, "under 0.1 ms"), ("jsonl", 1e-6, "under 0.1 ms")]
+    ("kind", "unit_s", "limit"),
+    [("csv", 1e-3, "over 10 s"), ("csv", 1e3, "under 0.1 ms"), ("jsonl", 1e-6, "under 0.1 ms")],
 )
 def test_without_rates_an_odd_step_is_told(tmp_path, kind, unit_s, limit):
     said, _ = notices(written(tmp_path, kind, unit_s, 0.02 if unit_s != 1e3 else 0.05, rates=False))
@@ -104,7 +116,10 @@ def test_every_command_that_reads_a_log_tells_of_an_odd_step(tmp_path, command):
     }
     result = run_hilstar_here(command, *words[command])
     assert result.returncode == 0, result.stderr
-    assert "the log is 980 s long: 50 attitudes, a step of 20 s (median), which is over 10 s" in result.stderr
+    assert (
+        "the log is 980 s long: 50 attitudes, a step of 20 s (median), which is over 10 s"
+        in result.stderr
+    )
 
 
 def test_a_replay_says_how_long_its_log_is(tmp_path):

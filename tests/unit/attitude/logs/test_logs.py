@@ -38,8 +38,16 @@ def random_samples(rng, count, every_rate=True):
         if math.hypot(*q) != 1.0:  # what is not exactly unit is scaled once more by every reader
             continue
         i = len(samples)
-        rate = rng.normal(size=3) * 10.0 ** rng.integers(-9, 3) if every_rate or rng.random() < 0.7 else None
-        samples.append(AttitudeSample(int(times[i]), q, rate, int(rng.integers(0, 2**32)), bool(i and rng.random() < 0.2)))
+        rate = (
+            rng.normal(size=3) * 10.0 ** rng.integers(-9, 3)
+            if every_rate or rng.random() < 0.7
+            else None
+        )
+        samples.append(
+            AttitudeSample(
+                int(times[i]), q, rate, int(rng.integers(0, 2**32)), bool(i and rng.random() < 0.2)
+            )
+        )
     return samples
 
 
@@ -47,12 +55,17 @@ def as_aem_holds(samples):
     """What is left of samples in an AEM: no sequence, and no rates in a block where one is
     missing.
     """
-    starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity] + [len(samples)]
+    starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity] + [
+        len(samples)
+    ]
     kept = []
     for begin, end in pairwise(starts):
         block = samples[begin:end]
         whole = all(sample.rate_cam_rad_s is not None for sample in block)
-        kept += [replace(s, sequence=0, rate_cam_rad_s=s.rate_cam_rad_s if whole else None) for s in block]
+        kept += [
+            replace(s, sequence=0, rate_cam_rad_s=s.rate_cam_rad_s if whole else None)
+            for s in block
+        ]
     return kept
 
 
@@ -83,7 +96,9 @@ def refusal(path):
 @pytest.mark.parametrize("every_rate", [True, False])
 @pytest.mark.parametrize("second", FORMATS)
 @pytest.mark.parametrize("first", FORMATS)
-def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(tmp_path, first, second, every_rate):
+def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(
+    tmp_path, first, second, every_rate
+):
     samples = random_samples(np.random.default_rng(7), 30, every_rate)
     write_log(tmp_path / f"a.{first}", samples)
     write_log(tmp_path / f"b.{second}", read_log(tmp_path / f"a.{first}"))
@@ -94,8 +109,20 @@ def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(tmp_
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_ends_of_64_bit_time_and_the_nanoseconds_between_survive(tmp_path, form):
-    times = [INT64_MIN, -1_000_000_001, -1_000_000_000, -1, 0, 1, 1_700_000_000_123_456_789, INT64_MAX]
-    write_log(tmp_path / f"a.{form}", [AttitudeSample(t_ns, np.array([0.5, 0.5, 0.5, 0.5])) for t_ns in times])
+    times = [
+        INT64_MIN,
+        -1_000_000_001,
+        -1_000_000_000,
+        -1,
+        0,
+        1,
+        1_700_000_000_123_456_789,
+        INT64_MAX,
+    ]
+    write_log(
+        tmp_path / f"a.{form}",
+        [AttitudeSample(t_ns, np.array([0.5, 0.5, 0.5, 0.5])) for t_ns in times],
+    )
     assert [s.t_ns for s in read_log(tmp_path / f"a.{form}")] == times
 
 
@@ -104,7 +131,9 @@ def test_two_endings_of_one_format_hold_the_same(tmp_path, one, other):
     samples = random_samples(np.random.default_rng(7), 30, every_rate=False)
     for form in (one, other):
         write_log(tmp_path / f"a.{form}", samples)
-    texts = [re.sub("CREATION_DATE.*", "", (tmp_path / f"a.{form}").read_text()) for form in (one, other)]
+    texts = [
+        re.sub("CREATION_DATE.*", "", (tmp_path / f"a.{form}").read_text()) for form in (one, other)
+    ]
     assert texts[0] == texts[1]
 
 
@@ -117,7 +146,9 @@ def test_what_a_log_holds_and_not_its_name_says_how_it_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "aem", "xml"])
-def test_a_text_log_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_does(tmp_path, form):
+def test_a_text_log_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_does(
+    tmp_path, form
+):
     samples = random_samples(np.random.default_rng(3), 5)
     write_log(tmp_path / f"a.{form}", samples)
     text = (tmp_path / f"a.{form}").read_bytes().replace(b"\n", b"\r\n")
@@ -130,7 +161,9 @@ def test_a_text_log_may_begin_with_a_byte_order_mark_and_end_its_lines_as_window
 
 def test_csv_and_json_lines_give_the_same_samples(tmp_path):
     (tmp_path / "a.csv").write_text("# a comment\n" + HEAD + "0.5,1,0,0,0\n\n1.25,0,1,0,0\n")
-    (tmp_path / "a.jsonl").write_text('{"t_ns":500000000,"q":[1,0,0,0]}\n\n{"t_ns":1250000000,"q":[0,1,0,0],"rate":[1,2,3]}\n')
+    (tmp_path / "a.jsonl").write_text(
+        '{"t_ns":500000000,"q":[1,0,0,0]}\n\n{"t_ns":1250000000,"q":[0,1,0,0],"rate":[1,2,3]}\n'
+    )
     csv, json = read_log(tmp_path / "a.csv"), read_log(tmp_path / "a.jsonl")
     assert [s.t_ns for s in csv] == [s.t_ns for s in json] == [500_000_000, 1_250_000_000]
     assert csv[1].q_icrs_to_cam.tolist() == json[1].q_icrs_to_cam.tolist() == [0, 1, 0, 0]
@@ -150,7 +183,11 @@ def test_csv_cells_that_are_empty_are_not_known(tmp_path):
     first, second = read_log(tmp_path / "a.csv")
     assert (first.rate_cam_rad_s, first.sequence, first.discontinuity) == (None, 0, False)
     assert second.rate_cam_rad_s is not None
-    assert (second.rate_cam_rad_s.tolist(), second.sequence, second.discontinuity) == ([1, 2, 3], 4, True)
+    assert (second.rate_cam_rad_s.tolist(), second.sequence, second.discontinuity) == (
+        [1, 2, 3],
+        4,
+        True,
+    )
 
 
 @pytest.mark.parametrize(
@@ -229,7 +266,9 @@ def test_a_damaged_log_is_read_or_refused_in_one_line_and_never_ends_in_a_traceb
         data = whole.copy()
         if trial % 3:
             places = rng.integers(0, len(data), size=rng.integers(1, 4))
-            data[places] = rng.integers(0, 256, size=len(places)) if trial % 3 == 1 else data[places] ^ 1
+            data[places] = (
+                rng.integers(0, 256, size=len(places)) if trial % 3 == 1 else data[places] ^ 1
+            )
         else:
             data = data[: rng.integers(0, len(data))]
         path.write_bytes(data.tobytes())
@@ -240,10 +279,14 @@ def test_a_damaged_log_is_read_or_refused_in_one_line_and_never_ends_in_a_traceb
             assert "\n" not in str(error)
 
 
-@pytest.mark.parametrize("head", [b"", b"\x89MCAP0\r\n", b"<aem", b"CCSDS_AEM_VERS = 2.0\n", b"{", b"t_s,qw,qx,qy,qz\n"])
+@pytest.mark.parametrize(
+    "head", [b"", b"\x89MCAP0\r\n", b"<aem", b"CCSDS_AEM_VERS = 2.0\n", b"{", b"t_s,qw,qx,qy,qz\n"]
+)
 def test_binary_rubbish_is_refused_in_one_line(tmp_path, head):
     for seed in range(20):
-        rubbish = np.random.default_rng(seed).integers(0, 256 if seed % 2 else 128, size=300, dtype=np.uint8)
+        rubbish = np.random.default_rng(seed).integers(
+            0, 256 if seed % 2 else 128, size=300, dtype=np.uint8
+        )
         (tmp_path / "log").write_bytes(head + rubbish.tobytes())
         refusal(tmp_path / "log")
 
@@ -292,5 +335,7 @@ def test_a_log_has_no_more_attitudes_than_memory_can_hold(tmp_path, monkeypatch)
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows[:3]]) + "\n")
     assert len(read_log(path)) == 3
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
-    with pytest.raises(InputError, match=r"log.csv:5: more than 3 attitudes; split the log into several"):
+    with pytest.raises(
+        InputError, match=r"log.csv:5: more than 3 attitudes; split the log into several"
+    ):
         read_log(path)

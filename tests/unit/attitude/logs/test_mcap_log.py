@@ -76,14 +76,27 @@ def test_the_schema_names_every_field_with_one_plain_type():
     # packages/mcap-support/src/parseJsonSchema.ts).
     properties = json.loads(ATTITUDE_SCHEMA)["properties"]
     assert list(properties) == list(json.loads(attitude_message(sample(0))))
-    assert {p["type"] for p in properties.values()} <= {"integer", "number", "boolean", "string", "array"}
+    assert {p["type"] for p in properties.values()} <= {
+        "integer",
+        "number",
+        "boolean",
+        "string",
+        "array",
+    }
 
 
 def test_a_message_keeps_the_packet_as_it_came():
     packet = encode(sample(7))
-    assert bytes.fromhex(json.loads(attitude_message(sample(7), receive_ns=9, raw=packet))["raw"]) == packet
+    assert (
+        bytes.fromhex(json.loads(attitude_message(sample(7), receive_ns=9, raw=packet))["raw"])
+        == packet
+    )
     refused = json.loads(refused_message("crc", "the CRC-32 does not fit", 9, b"\x00\xff"))
-    assert (refused["accepted"], refused["reason"], refused["raw"]) == (False, "crc: the CRC-32 does not fit", "00ff")
+    assert (refused["accepted"], refused["reason"], refused["raw"]) == (
+        False,
+        "crc: the CRC-32 does not fit",
+        "00ff",
+    )
     assert (refused["t_ns"], refused["receive_ns"]) == (None, 9)
 
 
@@ -95,13 +108,17 @@ def test_log_time_is_the_receivers_clock_where_known_and_never_below_zero():
 
 def test_other_channels_and_refused_packets_are_passed_over(tmp_path):
     refused = refused_message("norm", "2", 1, None)
-    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(1)), refused, attitude_message(sample(2))]))
+    (tmp_path / "run.mcap").write_bytes(
+        ledger([attitude_message(sample(1)), refused, attitude_message(sample(2))])
+    )
     assert [s.t_ns for s in read_log(tmp_path / "run.mcap")] == [1, 2]
 
 
 def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
     count = 40
-    data = ledger([attitude_message(sample(i)) for i in range(count)], chunk_size=1500, finish=False)
+    data = ledger(
+        [attitude_message(sample(i)) for i in range(count)], chunk_size=1500, finish=False
+    )
     seen = []
     for size in range(8, len(data) + 1, 13):
         (tmp_path / "run.mcap").write_bytes(data[:size])
@@ -114,7 +131,10 @@ def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
 
 
 def test_a_file_that_has_no_end_is_said_in_one_line_and_a_whole_one_in_none(tmp_path, caplog):
-    whole, path = ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500), tmp_path / "run.mcap"
+    whole, path = (
+        ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500),
+        tmp_path / "run.mcap",
+    )
     path.write_bytes(whole)
     assert len(list(read_attitudes(path))) == 40
     assert not caplog.messages
@@ -126,7 +146,10 @@ def test_a_file_that_has_no_end_is_said_in_one_line_and_a_whole_one_in_none(tmp_
 
 def test_what_is_no_mcap_file_is_called_so(tmp_path):
     (tmp_path / "run.mcap").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    with pytest.raises(InputError, match=r"run\.mcap: is no MCAP file; give an MCAP file, such as the ledger of a run"):
+    with pytest.raises(
+        InputError,
+        match=r"run\.mcap: is no MCAP file; give an MCAP file, such as the ledger of a run",
+    ):
         list(read_attitudes(tmp_path / "run.mcap"))
 
 
@@ -165,8 +188,12 @@ def test_chunks_taken_at_once_read_and_are_refused_as_by_the_library(tmp_path, m
 
 
 def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
-    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)]))
-    with pytest.raises(InputError, match=r"message 3 of /attitude: time does not increase .*; the sender restarted"):
+    (tmp_path / "run.mcap").write_bytes(
+        ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)])
+    )
+    with pytest.raises(
+        InputError, match=r"message 3 of /attitude: time does not increase .*; the sender restarted"
+    ):
         read_log(tmp_path / "run.mcap")
 
 

@@ -59,13 +59,20 @@ def ledger(folder: Path) -> Path:
         writer.add_metadata("hilstar", {"run_id": "1", "part": "0"})
         channel = register_attitudes(writer)
         for sample in SAMPLES:
-            writer.add_message(channel, log_time=sample.t_ns, data=attitude_message(sample), publish_time=sample.t_ns)
+            writer.add_message(
+                channel,
+                log_time=sample.t_ns,
+                data=attitude_message(sample),
+                publish_time=sample.t_ns,
+            )
         writer.finish()
     return path
 
 
 def aem(folder: Path) -> Path:
-    (folder / "a.aem").write_text(kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], QUATERNION_TYPE="LAST"))
+    (folder / "a.aem").write_text(
+        kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], QUATERNION_TYPE="LAST")
+    )
     return folder / "a.aem"
 
 
@@ -78,7 +85,14 @@ def bag(folder: Path) -> Path:
     make = ros_bags.Make("humble")
     sent = []
     for k, (w, x, y, z) in enumerate(QUATERNIONS.tolist()):
-        sent.append(("/pose", ros_bags.IMU, k * 10**9 + 1, make.imu(k * 10**9 + 1, "cam", (w, -x, -y, -z), (0, 0, 0))))
+        sent.append(
+            (
+                "/pose",
+                ros_bags.IMU,
+                k * 10**9 + 1,
+                make.imu(k * 10**9 + 1, "cam", (w, -x, -y, -z), (0, 0, 0)),
+            )
+        )
     return ros_bags.write_bag2(folder / "bag", sent, "humble")
 
 
@@ -141,23 +155,33 @@ def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
         found = attitudes(path, stated)
     except InputError as error:  # what it names is not there, or needs another statement beside it
         said = str(error)
-        assert f"{OPTIONS[statement]} " in said or str(STATEMENTS[statement]) in said or "no_such_file" in said
+        assert (
+            f"{OPTIONS[statement]} " in said
+            or str(STATEMENTS[statement]) in said
+            or "no_such_file" in said
+        )
         return
-    assert not np.allclose(found, attitudes(path, needed), atol=1e-6), "it was stated, and changed nothing"
+    assert not np.allclose(found, attitudes(path, needed), atol=1e-6), (
+        "it was stated, and changed nothing"
+    )
 
 
 @pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 @pytest.mark.parametrize("statement", ["place", "epoch_utc"])
 def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, statement):
     stated = Stated(**{statement: STATEMENTS[statement]})
-    with pytest.raises(InputError, match=f"{OPTIONS[statement]} is for attitudes that refer to a level frame"):
+    with pytest.raises(
+        InputError, match=f"{OPTIONS[statement]} is for attitudes that refer to a level frame"
+    ):
         open_log(FILES[name][0](tmp_path), stated)
 
 
 @pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
     path = FILES[name][0](tmp_path)
-    found = Rotation.from_quat(attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True)
+    found = Rotation.from_quat(
+        attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True
+    )
     wanted = Rotation.from_quat(MOUNTING, scalar_first=True) * TURNS
     assert (found * wanted.inv()).magnitude().max() < ROUNDING
 
@@ -171,7 +195,9 @@ def test_a_mounting_of_the_bench_file_that_turns_nothing_is_told(tmp_path, name)
 
 def test_a_mounting_where_the_file_says_the_cameras_is_refused(tmp_path):
     path = tmp_path / "a.aem"
-    path.write_text(kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], REF_FRAME_B="STARTRACKER_1"))
+    path.write_text(
+        kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], REF_FRAME_B="STARTRACKER_1")
+    )
     with pytest.raises(InputError, match="--mounting: its attitudes are the camera's own"):
         open_log(path, Stated(Mounting(MOUNTING, by_option=True)))
     assert not dict(open_log(path, Stated(Mounting(MOUNTING))).told)
@@ -184,7 +210,9 @@ def test_what_a_bench_file_says_of_packets_is_not_done_to_a_ledger_again(tmp_pat
     log = open_log(path, by_bench)
     assert np.array_equal([sample.q_icrs_to_cam for sample in log.samples], QUATERNIONS)
     assert not log.told
-    with pytest.raises(InputError, match=r"\[attitude\] convention: a CCSDS AEM has a convention of its own"):
+    with pytest.raises(
+        InputError, match=r"\[attitude\] convention: a CCSDS AEM has a convention of its own"
+    ):
         open_log(aem(tmp_path), by_bench)
 
 
@@ -198,7 +226,9 @@ def test_the_columns_of_a_csv_are_told_by_name_or_in_their_order(tmp_path, order
     assert np.array_equal(attitudes(path, Stated()), QUATERNIONS)
     last = [repr(float(c)) for c in TURNS[0].as_quat()]  # x, y, z, w
     path.write_text(f"t_s,{','.join(names)}\n0,{','.join(last)}\n")
-    assert np.array_equal(attitudes(path, Stated(convention=Convention(scalar="last")))[0], QUATERNIONS[0])
+    assert np.array_equal(
+        attitudes(path, Stated(convention=Convention(scalar="last")))[0], QUATERNIONS[0]
+    )
 
 
 @pytest.mark.parametrize("scalar", ["first", "last"])
@@ -206,14 +236,22 @@ def test_the_columns_of_a_csv_are_told_by_name_or_in_their_order(tmp_path, order
 @pytest.mark.parametrize("frame", ["cam", "body"])
 def test_json_lines_of_each_convention(tmp_path, scalar, direction, frame):
     rate, to_cam = np.array([0.01, -0.02, 0.03]), Rotation.from_quat(MOUNTING, scalar_first=True)
-    turn, own = (TURNS[0], rate) if frame == "cam" else (to_cam.inv() * TURNS[0], to_cam.inv().apply(rate))
+    turn, own = (
+        (TURNS[0], rate) if frame == "cam" else (to_cam.inv() * TURNS[0], to_cam.inv().apply(rate))
+    )
     sent = turn if direction == "icrs_to_cam" else turn.inv()
-    row = {"t_ns": 0, "q": sent.as_quat(scalar_first=scalar == "first").tolist(), "rate": own.tolist()}
+    row = {
+        "t_ns": 0,
+        "q": sent.as_quat(scalar_first=scalar == "first").tolist(),
+        "rate": own.tolist(),
+    }
     path = tmp_path / "a.jsonl"
     path.write_text(json.dumps(row) + "\n")
     convention = Convention(scalar=scalar, direction=direction, frame=frame)
     (sample,) = open_log(path, Stated(Mounting(MOUNTING), convention=convention)).samples
-    assert (Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True) * TURNS[0].inv()).magnitude() < ROUNDING
+    assert (
+        Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True) * TURNS[0].inv()
+    ).magnitude() < ROUNDING
     assert sample.rate_cam_rad_s == pytest.approx(rate, abs=ROUNDING)
 
 
@@ -223,7 +261,11 @@ def turning(folder: Path, sent: Convention) -> Path:
     lines = []
     for k in range(100):
         q = propagate(QUATERNIONS[0], rate_rad_s, 0.05 * k)
-        message = {"t_ns": k * 50_000_000, "q": sent.as_sent(q).tolist(), "rate": rate_rad_s.tolist()}
+        message = {
+            "t_ns": k * 50_000_000,
+            "q": sent.as_sent(q).tolist(),
+            "rate": rate_rad_s.tolist(),
+        }
         lines.append(json.dumps(message))
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -233,7 +275,10 @@ def turning(folder: Path, sent: Convention) -> Path:
     ("stated", "advice"),
     [
         (Stated(), "write --convention scalar=last,direction=cam_to_icrs"),
-        (Stated(convention=Convention(scalar="last")), "write --convention scalar=last,direction=cam_to_icrs"),
+        (
+            Stated(convention=Convention(scalar="last")),
+            "write --convention scalar=last,direction=cam_to_icrs",
+        ),
         (
             Stated(Mounting(MOUNTING, by_option=True)),
             "write --convention scalar=last,direction=cam_to_icrs,frame=body",
@@ -244,7 +289,9 @@ def turning(folder: Path, sent: Convention) -> Path:
         ),
     ],
 )
-def test_a_log_that_is_read_otherwise_is_told_what_to_state_in_place_of_what_is(tmp_path, stated, advice):
+def test_a_log_that_is_read_otherwise_is_told_what_to_state_in_place_of_what_is(
+    tmp_path, stated, advice
+):
     sent = Convention(scalar="last", direction="cam_to_icrs")
     told = dict(open_log(turning(tmp_path, sent), stated).joins().told)
     assert told["convention-wrong"].endswith(advice)
@@ -261,4 +308,7 @@ def test_a_log_with_a_convention_of_its_own_is_told_no_statement_that_it_refuses
     write_log(path, log.samples)
     told = dict(open_log(path).joins().told)
     assert "look at what the simulator puts into its quaternion" in told["convention-wrong"]
-    assert "convention =" not in told["convention-wrong"] and "--convention" not in told["convention-wrong"]
+    assert (
+        "convention =" not in told["convention-wrong"]
+        and "--convention" not in told["convention-wrong"]
+    )

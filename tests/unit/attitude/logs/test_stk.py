@@ -71,7 +71,9 @@ def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(log):
 def test_euler_angles_are_turns_of_the_axes_in_the_order_of_the_sequence(log):
     angles = [10.0, 20.0, 30.0]
     for sequence, axes in (("321", "ZYX"), ("313", "ZXZ"), ("123", "XYZ")):
-        found = turns(log([f"0 {' '.join(map(str, angles))}"], "AttitudeTimeEulerAngles", Sequence=sequence))
+        found = turns(
+            log([f"0 {' '.join(map(str, angles))}"], "AttitudeTimeEulerAngles", Sequence=sequence)
+        )
         wanted = Rotation.from_euler(axes, angles, degrees=True).inv()
         assert (found[0] * wanted.inv()).magnitude() < ROUNDING
     # the second of AGI_SPIN
@@ -86,8 +88,15 @@ def test_a_matrix_is_by_rows_from_the_axes_to_the_body(log):
         assert (turns(found)[0] * wanted.inv()).magnitude() < ROUNDING
         assert (found.samples[0].rate_cam_rad_s is None) == (not more)
     third = "0.5773503 0.5773503 0.5773503"
-    for matrix in (f"{third} {third} {third}", "1 0 0 0 1 0 0 0 -1", "2 0 0 0 2 0 0 0 2", "nan 0 0 0 1 0 0 0 1"):
-        with pytest.raises(InputError, match=r"a\.a:9: the nine numbers are no rotation matrix by rows"):
+    for matrix in (
+        f"{third} {third} {third}",
+        "1 0 0 0 1 0 0 0 -1",
+        "2 0 0 0 2 0 0 0 2",
+        "nan 0 0 0 1 0 0 0 1",
+    ):
+        with pytest.raises(
+            InputError, match=r"a\.a:9: the nine numbers are no rotation matrix by rows"
+        ):
             log([f"0 {matrix}"], "AttitudeTimeDCM")
 
 
@@ -98,7 +107,9 @@ def test_axes_that_are_fixed_to_the_earth_turn_with_it(log):
     to_earth = Rotation.from_quat(q_icrs_to_itrs(t_ns), scalar_first=True)
     assert (turns(fixed) * (inertial * to_earth).inv()).magnitude().max() < ROUNDING
     earth_rad_s = 7.292115e-5
-    assert fixed.samples[0].rate_cam_rad_s[2] - np.radians(6) == pytest.approx(earth_rad_s, abs=1e-9)
+    assert fixed.samples[0].rate_cam_rad_s[2] - np.radians(6) == pytest.approx(
+        earth_rad_s, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -139,12 +150,29 @@ COUNT = "NumberOfAttitudePoints"
     [
         (WHOLE, 3, None, ""),
         (WHOLE.replace("END Attitude", ""), 3, None, ""),
-        (WHOLE.replace("END Attitude", "").replace(f"{COUNT} 3", ""), 3, "log-cut", "neither END Attitude nor"),
-        (WHOLE.replace(f"{COUNT} 3", f"{COUNT} 2.000"), 2, "log-count", "is 2, and 3 are there; 2 are read"),
-        (WHOLE.replace(f"{COUNT} 3", f"{COUNT} 9"), 3, "log-count", "is 9, and 3 are there; 3 are read"),
+        (
+            WHOLE.replace("END Attitude", "").replace(f"{COUNT} 3", ""),
+            3,
+            "log-cut",
+            "neither END Attitude nor",
+        ),
+        (
+            WHOLE.replace(f"{COUNT} 3", f"{COUNT} 2.000"),
+            2,
+            "log-count",
+            "is 2, and 3 are there; 2 are read",
+        ),
+        (
+            WHOLE.replace(f"{COUNT} 3", f"{COUNT} 9"),
+            3,
+            "log-count",
+            "is 9, and 3 are there; 3 are read",
+        ),
     ],
 )
-def test_the_end_and_the_count_of_a_file_say_whether_it_is_whole(tmp_path, text, count, kind, words):
+def test_the_end_and_the_count_of_a_file_say_whether_it_is_whole(
+    tmp_path, text, count, kind, words
+):
     (tmp_path / "a.a").write_text(text)
     found = open_log(tmp_path / "a.a")
     assert len(found.samples) == count
@@ -157,21 +185,73 @@ def test_the_end_and_the_count_of_a_file_say_whether_it_is_whole(tmp_path, text,
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("CoordinateAxes J2000", "CoordinateAxes AWB UpWestSouth Satellite/A", ":7: CoordinateAxes AWB UpWestSouth Satel"),
-        ("CoordinateAxes J2000", "CoordinateAxes TEMEOfEpoch", ":7: CoordinateAxes TEMEOfEpoch are not read; write J2000"),
+        (
+            "CoordinateAxes J2000",
+            "CoordinateAxes AWB UpWestSouth Satellite/A",
+            ":7: CoordinateAxes AWB UpWestSouth Satel",
+        ),
+        (
+            "CoordinateAxes J2000",
+            "CoordinateAxes TEMEOfEpoch",
+            ":7: CoordinateAxes TEMEOfEpoch are not read; write J2000",
+        ),
         ("CoordinateAxes J2000", "", "states no CoordinateAxes; write CoordinateAxes and J2000"),
-        ("CoordinateAxes J2000", "CoordinateSystem J2000", ":7: CoordinateSystem is not read; did you mean Coordin"),
-        ("CentralBody Earth", "CentralBody Mars\nCoordinateAxes Fixed", ":8: CoordinateAxes is there twice"),
+        (
+            "CoordinateAxes J2000",
+            "CoordinateSystem J2000",
+            ":7: CoordinateSystem is not read; did you mean Coordin",
+        ),
+        (
+            "CentralBody Earth",
+            "CentralBody Mars\nCoordinateAxes Fixed",
+            ":8: CoordinateAxes is there twice",
+        ),
         ("BEGIN Attitude", "BEGIN Ephemeris", ":3: 'BEGIN Ephemeris' where BEGIN Attitude belongs"),
-        ("CentralBody Earth", "CoordinateAxesEpoch 1 Jan 2025", ":6: CoordinateAxesEpoch is not read; did you mean"),
-        ("CentralBody Earth", "RepeatPattern", ":6: RepeatPattern is not read; read are NumberOfAttitudePoints"),
-        ("CentralBody Earth", "CentralBody Earth\nCentralBody Earth", ":7: CentralBody is there twice"),
-        ("CentralBody Earth", "TimeFormat LCLG", ":6: TimeFormat lclg is not read; write EpSec, EpMin"),
-        ("AttitudeTimeQuaternions", "AttitudeTimeYPRAngles", ":8: AttitudeTimeYPRAngles is not read; write one of Att"),
-        ("AttitudeTimeQuaternions", "AttitudeTimeECIVector", ":8: AttitudeTimeECIVector is not read"),
-        ("AttitudeTimeQuaternions", "AttitudeTimeEulerAngles", ":9: '0 0 0 0 1': write a time and 3 numbers"),
-        ("1 Jan 2025 00:00:00.000", "1 Foo 2025 00:00:00", ":5: the date is '1 Foo 2025 00:00:00'; write it as 1 Jan"),
-        ("1 Jan 2025 00:00:00.000", "31 Feb 2025 00:00:00", ":5: the date is '31 Feb 2025 00:00:00'"),
+        (
+            "CentralBody Earth",
+            "CoordinateAxesEpoch 1 Jan 2025",
+            ":6: CoordinateAxesEpoch is not read; did you mean",
+        ),
+        (
+            "CentralBody Earth",
+            "RepeatPattern",
+            ":6: RepeatPattern is not read; read are NumberOfAttitudePoints",
+        ),
+        (
+            "CentralBody Earth",
+            "CentralBody Earth\nCentralBody Earth",
+            ":7: CentralBody is there twice",
+        ),
+        (
+            "CentralBody Earth",
+            "TimeFormat LCLG",
+            ":6: TimeFormat lclg is not read; write EpSec, EpMin",
+        ),
+        (
+            "AttitudeTimeQuaternions",
+            "AttitudeTimeYPRAngles",
+            ":8: AttitudeTimeYPRAngles is not read; write one of Att",
+        ),
+        (
+            "AttitudeTimeQuaternions",
+            "AttitudeTimeECIVector",
+            ":8: AttitudeTimeECIVector is not read",
+        ),
+        (
+            "AttitudeTimeQuaternions",
+            "AttitudeTimeEulerAngles",
+            ":9: '0 0 0 0 1': write a time and 3 numbers",
+        ),
+        (
+            "1 Jan 2025 00:00:00.000",
+            "1 Foo 2025 00:00:00",
+            ":5: the date is '1 Foo 2025 00:00:00'; write it as 1 Jan",
+        ),
+        (
+            "1 Jan 2025 00:00:00.000",
+            "31 Feb 2025 00:00:00",
+            ":5: the date is '31 Feb 2025 00:00:00'",
+        ),
         ("1 0 0 0 1", "1 0 0 0", ":10: '1 0 0 0': write a time and 4 numbers"),
         ("1 0 0 0 1", "one 0 0 0 1", ":10: the time is 'one'"),
         ("1 0 0 0 1", "1 0 0 0 x", ":10: '1 0 0 0 x'"),
@@ -191,14 +271,19 @@ def test_what_would_be_another_attitude_is_refused_by_name_and_line(tmp_path, ol
 
 
 def test_axes_of_another_body_are_refused_unless_they_are_inertial(log):
-    with pytest.raises(InputError, match=r"a\.a:7: CoordinateAxes fixed of CentralBody Mars are not read; write J2000"):
+    with pytest.raises(
+        InputError,
+        match=r"a\.a:7: CoordinateAxes fixed of CentralBody Mars are not read; write J2000",
+    ):
         log(ROWS, CentralBody="Mars", CoordinateAxes="Fixed")
     assert len(log(ROWS, CentralBody="Mars").samples) == 3
 
 
 def test_a_sequence_that_is_none_is_refused(log):
     for sequence in ("322", "421", "32"):
-        with pytest.raises(InputError, match=rf"a\.a:8: Sequence is {sequence}; write three axes such as 321"):
+        with pytest.raises(
+            InputError, match=rf"a\.a:8: Sequence is {sequence}; write three axes such as 321"
+        ):
             log(["0 1 2 3"], "AttitudeTimeEulerAngles", Sequence=sequence)
     with pytest.raises(InputError, match="Sequence is missing"):
         log(["0 1 2 3"], "AttitudeTimeEulerAngles")

@@ -24,13 +24,17 @@ START_NS = ros_bags.START_NS
 
 def csv(folder, rows):
     path = folder / "a.csv"
-    path.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{k},{','.join(map(str, q))}\n" for k, q in enumerate(rows)))
+    path.write_text(
+        "t_s,qw,qx,qy,qz\n" + "".join(f"{k},{','.join(map(str, q))}\n" for k, q in enumerate(rows))
+    )
     return path
 
 
 def json_lines(folder, rows):
     path = folder / "a.jsonl"
-    path.write_text("".join(json.dumps({"t_ns": k * 10**9, "q": q}) + "\n" for k, q in enumerate(rows)))
+    path.write_text(
+        "".join(json.dumps({"t_ns": k * 10**9, "q": q}) + "\n" for k, q in enumerate(rows))
+    )
     return path
 
 
@@ -72,7 +76,14 @@ def bag(folder, rows, stamped=True):
     for k, q in enumerate(rows):
         t_ns = START_NS + k * 10**8
         stamp_ns = t_ns if stamped or q == SET else 0
-        sent.append(("/a", ros_bags.POSE_STAMPED, t_ns, make.of(ros_bags.POSE_STAMPED, stamp_ns, "icrs", "", q, ())))
+        sent.append(
+            (
+                "/a",
+                ros_bags.POSE_STAMPED,
+                t_ns,
+                make.of(ros_bags.POSE_STAMPED, stamp_ns, "icrs", "", q, ()),
+            )
+        )
     return ros_bags.write_bag2(folder / "bag", sent, "humble")
 
 
@@ -82,7 +93,9 @@ def unstamped_bag(folder, rows):
 
 WRITERS = [csv, json_lines, aem, cic, stk, mcap, bag, unstamped_bag]
 # JSON has no NaN
-CASES = [(write, empty) for write in WRITERS for empty in (ZEROS, NAN) if (write, empty) != (mcap, NAN)]
+CASES = [
+    (write, empty) for write in WRITERS for empty in (ZEROS, NAN) if (write, empty) != (mcap, NAN)
+]
 
 
 @pytest.mark.parametrize(("write", "empty"), CASES)
@@ -90,19 +103,26 @@ def test_what_is_before_the_estimator_ran_is_left_out_with_a_notice(tmp_path, wr
     log = open_log(write(tmp_path, [empty, empty, empty, SET, SET]))
     assert len(log.samples) == 2
     assert abs(log.samples[0].q_icrs_to_cam).tolist() == [0.5] * 4
-    notice = "3 attitudes are left out at the beginning: zeros or NaN, from before the estimator ran"
+    notice = (
+        "3 attitudes are left out at the beginning: zeros or NaN, from before the estimator ran"
+    )
     assert dict(log.told)["log-start"] == notice
 
 
 @pytest.mark.parametrize(("write", "empty"), CASES)
 def test_zeros_after_an_attitude_are_refused_with_their_place(tmp_path, write, empty):
-    with pytest.raises(InputError, match=r"(norm is 0|not finite|NaN or Infinity).*are a dropout: leave those entries out"):
+    with pytest.raises(
+        InputError,
+        match=r"(norm is 0|not finite|NaN or Infinity).*are a dropout: leave those entries out",
+    ):
         open_log(write(tmp_path, [empty, SET, empty, SET]))
 
 
 @pytest.mark.parametrize(("write", "empty"), CASES)
 def test_a_log_of_nothing_else_says_that_the_estimator_never_ran(tmp_path, write, empty):
-    with pytest.raises(InputError, match=r"no attitude in 3 entries: zeros or NaN, from before the estimator ran"):
+    with pytest.raises(
+        InputError, match=r"no attitude in 3 entries: zeros or NaN, from before the estimator ran"
+    ):
         open_log(write(tmp_path, [empty, empty, empty]))
 
 
@@ -111,4 +131,6 @@ def test_a_level_frame_begins_at_the_first_attitude(tmp_path):
     path = csv(tmp_path, [ZEROS, SET, SET])
     late = open_log(path, stated)
     path.write_text(path.read_text().replace("0,0.0,0.0,0.0,0.0\n", ""))
-    assert np.array_equal(late.samples[0].q_icrs_to_cam, open_log(path, stated).samples[0].q_icrs_to_cam)
+    assert np.array_equal(
+        late.samples[0].q_icrs_to_cam, open_log(path, stated).samples[0].q_icrs_to_cam
+    )

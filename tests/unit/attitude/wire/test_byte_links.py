@@ -13,7 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.attitude.wire.byte_links import ACCEPT_EACH_S, HELD_S, TOLD_S, FileBytes, TcpBytes, refuse_no_file
+from hilstar.attitude.wire.byte_links import (
+    ACCEPT_EACH_S,
+    HELD_S,
+    TOLD_S,
+    FileBytes,
+    TcpBytes,
+    refuse_no_file,
+)
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -24,7 +31,9 @@ SOON_MS = 20
 
 
 @contextlib.contextmanager
-def listening(clock: FakeClock, notices: Notices, allow: tuple[str, ...] = ()) -> Iterator[tuple[TcpBytes, int]]:
+def listening(
+    clock: FakeClock, notices: Notices, allow: tuple[str, ...] = ()
+) -> Iterator[tuple[TcpBytes, int]]:
     with socket.socket() as made:
         made.bind(("127.0.0.1", 0))
         port = made.getsockname()[1]
@@ -87,7 +96,10 @@ def test_a_second_connection_is_refused_and_named_while_the_first_sends():
             second.sendall(b"lies")
             wait_for(lambda second=second: closed(link, second), "the refusal")
             second.close()
-            assert f"from 127.0.0.1:{own}" in link.trouble() and f":{first.getsockname()[1]} holds the line" in link.trouble()
+            assert (
+                f"from 127.0.0.1:{own}" in link.trouble()
+                and f":{first.getsockname()[1]} holds the line" in link.trouble()
+            )
             clock.work(0.9e9 * HELD_S)
             first.sendall(b"b")
             wait_for(lambda: taken(link) == b"b", "the first one's bytes")
@@ -125,7 +137,10 @@ def test_a_tracker_that_closed_its_line_is_back_at_once():
 def test_a_line_that_never_sent_holds_for_as_long_and_no_longer():
     clock = FakeClock()
     with listening(clock, Notices()) as (link, port), connect(port):
-        wait_for(lambda: link.taken(SOON_MS) == [] and link.link_counts.connections == 1, "the silent one")
+        wait_for(
+            lambda: link.taken(SOON_MS) == [] and link.link_counts.connections == 1,
+            "the silent one",
+        )
         clock.work(1e9 * HELD_S)
         with connect(port) as tracker:
             tracker.sendall(b"e")

@@ -28,7 +28,9 @@ from tests.support.waiting import PATIENCE_S
 ROUNDING, RATE_ROUNDING = 1e-14, 1e-7
 CONVENTIONS = [
     Convention(scalar=scalar, direction=direction, frame=frame)
-    for scalar, direction, frame in product(("first", "last"), ("icrs_to_cam", "cam_to_icrs"), ("cam", "body"))
+    for scalar, direction, frame in product(
+        ("first", "last"), ("icrs_to_cam", "cam_to_icrs"), ("cam", "body")
+    )
 ]
 Q_BODY_TO_CAM = (0.5, -0.5, -0.5, -0.5)
 BODY_TO_CAM = Rotation.from_quat(Q_BODY_TO_CAM, scalar_first=True)
@@ -76,7 +78,10 @@ def test_a_packet_and_json_of_each_convention_over_zeromq(convention):
         config = config_with(convention, f'endpoint = "tcp://127.0.0.1:{port}"\nbind = true')
         with open_link(config, None) as link:
             sender.connect(f"tcp://127.0.0.1:{port}")
-            for raw in (packet(1, 5, q, rate), msgspec.json.encode({"t_ns": 5, "q": q, "rate": rate})):
+            for raw in (
+                packet(1, 5, q, rate),
+                msgspec.json.encode({"t_ns": 5, "q": q, "rate": rate}),
+            ):
                 arrivals = []
                 for _ in range(round(PATIENCE_S * 20)):
                     sender.send(raw)
@@ -92,7 +97,9 @@ def test_a_packet_of_each_convention_over_udp_and_serial(convention):
     q, rate = sent_by(convention)
     raw = packet(1, 5, q, rate)
     port = free_port()
-    with open_link(config_with(convention, f'source = "udp"\nbind = "127.0.0.1:{port}"'), None) as link:
+    with open_link(
+        config_with(convention, f'source = "udp"\nbind = "127.0.0.1:{port}"'), None
+    ) as link:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(raw, ("127.0.0.1", port))
         arrival = heard(link)
@@ -100,7 +107,9 @@ def test_a_packet_of_each_convention_over_udp_and_serial(convention):
         assert_is_truth(arrival.event)
     master, slave = os.openpty()
     try:
-        with open_link(config_with(convention, f'source = "serial"\nport = "{os.ttyname(slave)}"'), None) as link:
+        with open_link(
+            config_with(convention, f'source = "serial"\nport = "{os.ttyname(slave)}"'), None
+        ) as link:
             os.write(master, b"\0" + cobs.encode(raw) + b"\0")
             arrival = heard(link)
             assert cobs.decode(arrival.raw) == raw
@@ -115,7 +124,11 @@ def test_a_request_of_each_convention_in_lockstep(convention):
     q, rate = sent_by(convention)
     port = free_port()
     config = config_with(convention, f'endpoint = "tcp://127.0.0.1:{port}"\nlockstep = true')
-    with zmq.Context() as context, context.socket(zmq.REQ) as sender, open_link(config, None) as link:
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.REQ) as sender,
+        open_link(config, None) as link,
+    ):
         sender.setsockopt(zmq.LINGER, 0)
         sender.connect(f"tcp://127.0.0.1:{port}")
         sender.send(packet(1, 5, q, rate))
@@ -138,23 +151,35 @@ def test_what_a_sender_sends_is_found_again(convention):
 
 @pytest.mark.parametrize("source", ['source = "vizard"', 'source = "42"', 'source = "scpi"'])
 def test_a_source_with_a_convention_of_its_own_refuses_another(source):
-    with pytest.raises(InputError, match=r"\[attitude\] convention = .*has a convention of its own; remove it"):
+    with pytest.raises(
+        InputError, match=r"\[attitude\] convention = .*has a convention of its own; remove it"
+    ):
         config_with(Convention(scalar="last"), source)
     config_with(HILSTARS, source)
 
 
-@pytest.mark.parametrize("table", ["attitude", 'answers]\nsource = "serial"\nport = "/dev/ttyS0"\nformat = "json"\n#'])
+@pytest.mark.parametrize(
+    "table", ["attitude", 'answers]\nsource = "serial"\nport = "/dev/ttyS0"\nformat = "json"\n#']
+)
 def test_a_body_without_a_mounting_is_refused(table):
     name = table.partition("]")[0]
     text = f'{SMALL_BENCH}\n[{table}]\nconvention = {{ frame = "body" }}\n'
-    with pytest.raises(InputError, match=rf"\[{name}\] convention = .* needs \[tracker\] q_body_to_cam"):
+    with pytest.raises(
+        InputError, match=rf"\[{name}\] convention = .* needs \[tracker\] q_body_to_cam"
+    ):
         parse_config("bench.toml", text)
 
 
 def test_a_mounting_that_turns_nothing_is_told():
     mounting, plain = Mounting(Q_BODY_TO_CAM), Mounting((1.0, 0.0, 0.0, 0.0))
-    own, body = SentAttitudes(HILSTARS).conventions, SentAttitudes(Convention(frame="body")).conventions
-    assert 'write [attitude] convention = { frame = "body" }' in dict(own.mounting_notices(mounting))["mounting"]
+    own, body = (
+        SentAttitudes(HILSTARS).conventions,
+        SentAttitudes(Convention(frame="body")).conventions,
+    )
+    assert (
+        'write [attitude] convention = { frame = "body" }'
+        in dict(own.mounting_notices(mounting))["mounting"]
+    )
     assert not own.mounting_notices(plain)
     assert not own.mounting_notices(Mounting())
     assert not body.mounting_notices(mounting)

@@ -20,7 +20,17 @@ VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 # What the types cannot hold: flags that nobody knows, and a rate that is not valid.
 UNHELD = {"all flags, known and unknown", "a rate that is not valid is not looked at"}
 ERRORS = {"format": -1, "crc": -2, "nan": -3, "norm": -4}
-COMPILER = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow", "-fno-exceptions"]
+COMPILER = [
+    "g++",
+    "-std=c++17",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-pedantic",
+    "-Wconversion",
+    "-Wshadow",
+    "-fno-exceptions",
+]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 
@@ -29,27 +39,51 @@ def driver(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("cpp") / "driver"
     source = Path(__file__).parent / "cpp_driver.cpp"
     command = [*COMPILER, *SANITIZERS, "-I", FOLDER, source, "-o", target]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert (result.returncode, result.stderr) == (0, "")
     return target
 
 
 def driven(driver: Path, lines: list[str]) -> list[list[str]]:
     """The words of each answer."""
-    result = subprocess.run([driver], input="".join(f"{line}\n" for line in lines), capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [driver],
+        input="".join(f"{line}\n" for line in lines),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return [answer.split() for answer in result.stdout.splitlines()]
 
 
 def test_every_vector_is_read_and_written_again_bit_for_bit(driver):
-    held = [vector for vector in VECTORS if "refused" not in vector and vector["name"].split(": ")[1] not in UNHELD]
+    held = [
+        vector
+        for vector in VECTORS
+        if "refused" not in vector and vector["name"].split(": ")[1] not in UNHELD
+    ]
     assert len(held) == sum("refused" not in vector for vector in VECTORS) - len(UNHELD)
-    for vector, answer in zip(held, driven(driver, [f"d {vector['packet_hex']}" for vector in held]), strict=True):
-        assert answer == [str(vector["kind"]), vector["packet_hex"], vector["frame_hex"]], vector["name"]
+    for vector, answer in zip(
+        held, driven(driver, [f"d {vector['packet_hex']}" for vector in held]), strict=True
+    ):
+        assert answer == [str(vector["kind"]), vector["packet_hex"], vector["frame_hex"]], vector[
+            "name"
+        ]
 
 
 def test_what_is_refused_has_its_fault(driver):
-    refused = [vector for vector in VECTORS if vector.get("refused", "time") != "time" and vector["packet_hex"] is not None]
-    for vector, answer in zip(refused, driven(driver, [f"d {vector['packet_hex'] or '-'}" for vector in refused]), strict=True):
+    refused = [
+        vector
+        for vector in VECTORS
+        if vector.get("refused", "time") != "time" and vector["packet_hex"] is not None
+    ]
+    for vector, answer in zip(
+        refused,
+        driven(driver, [f"d {vector['packet_hex'] or '-'}" for vector in refused]),
+        strict=True,
+    ):
         found = int(answer[0]) if int(answer[0]) < 0 else int(answer[3])
         assert found == ERRORS[vector["refused"]], vector["name"]
 
@@ -60,15 +94,29 @@ def test_random_attitudes_are_those_of_python(driver, rng):
         q = rng.normal(size=4)
         rate = None if k % 3 == 0 else rng.normal(size=3).astype(np.float32).astype(float)
         times = int(rng.integers(-(2**63), 2**63 - 1))
-        samples.append(AttitudeSample(times, q / np.linalg.norm(q), rate, int(rng.integers(2**32)), bool(k % 2)))
+        samples.append(
+            AttitudeSample(
+                times, q / np.linalg.norm(q), rate, int(rng.integers(2**32)), bool(k % 2)
+            )
+        )
     packets = [encode(sample) for sample in samples]
-    for packet, answer in zip(packets, driven(driver, [f"d {packet.hex()}" for packet in packets]), strict=True):
+    for packet, answer in zip(
+        packets, driven(driver, [f"d {packet.hex()}" for packet in packets]), strict=True
+    ):
         assert answer == ["1", packet.hex(), framed(packet).hex()]
 
 
 def test_packets_come_out_of_a_stream_with_garbage_in_it(driver, rng):
     reply = encode(TimeReply(7, -1, 2, 3))
-    stream = b"\0" + framed(reply) + rng.bytes(300).replace(b"\0", b"\1") + b"\0" + framed(reply)[:9] + b"\0" + framed(reply)
+    stream = (
+        b"\0"
+        + framed(reply)
+        + rng.bytes(300).replace(b"\0", b"\1")
+        + b"\0"
+        + framed(reply)[:9]
+        + b"\0"
+        + framed(reply)
+    )
     _, answer = driven(driver, ["i", f"p {stream.hex()}"])
     assert [word for word in answer if ":" in word] == [f"3:{reply.hex()}"] * 2
     assert answer[-2:] == ["2", "2"]

@@ -9,9 +9,27 @@ import pytest
 from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.basics.errors import InputError
 
-LOOPBACK = ("tcp://127.0.0.1:5560", "tcp://127.9.8.7:1", "tcp://localhost:5560", "tcp://[::1]:65535", "ipc:///tmp/attitude")
-BEYOND = ("tcp://10.0.0.1:5560", "tcp://bench-pc.lab.example:5560", "tcp://localhost.evil:5560", "tcp://[2001:db8::1]:5560")
-BEYOND += ("tcp://0.0.0.0:5560", "tcp://[::]:5560", "tcp://*:5560", "tcp://lo:5560", "tcp://LOCALHOST:5560", "tcp://eth0:5560")
+LOOPBACK = (
+    "tcp://127.0.0.1:5560",
+    "tcp://127.9.8.7:1",
+    "tcp://localhost:5560",
+    "tcp://[::1]:65535",
+    "ipc:///tmp/attitude",
+)
+BEYOND = (
+    "tcp://10.0.0.1:5560",
+    "tcp://bench-pc.lab.example:5560",
+    "tcp://localhost.evil:5560",
+    "tcp://[2001:db8::1]:5560",
+)
+BEYOND += (
+    "tcp://0.0.0.0:5560",
+    "tcp://[::]:5560",
+    "tcp://*:5560",
+    "tcp://lo:5560",
+    "tcp://LOCALHOST:5560",
+    "tcp://eth0:5560",
+)
 WRONG = (
     "tcp://127.0.0.1:0;10.0.0.1:5560",
     "tcp://127.0.0.1;10.0.0.1:5560",
@@ -83,7 +101,9 @@ def test_libzmq_gets_the_address_that_was_judged():
     assert parse_endpoint("tcp://[0:0::1]:7").address == "tcp://[::1]:7"
 
 
-@pytest.mark.parametrize("text", ["tcp://127.0.0.1:*", "tcp://127.0.0.1:0", "tcp://*:5560", "tcp://[::]:5560"])
+@pytest.mark.parametrize(
+    "text", ["tcp://127.0.0.1:*", "tcp://127.0.0.1:0", "tcp://*:5560", "tcp://[::]:5560"]
+)
 def test_nothing_connects_to_any_port_or_every_interface(text):
     check_use(parse_endpoint(text), text, bind=True)
     with pytest.raises(InputError, match="cannot connect to"):

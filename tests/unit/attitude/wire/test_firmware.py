@@ -66,7 +66,9 @@ def compiled(command: list[str], source: Path, target: Path, *more: str) -> Path
 def driven(driver: Path, lines: list[str]) -> list[str]:
     """The driver's answers, one a line."""
     text = "".join(line + "\n" for line in lines)
-    result = subprocess.run([str(driver)], input=text, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    result = subprocess.run(
+        [str(driver)], input=text, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert result.returncode == 0, result.stderr[-2000:]
     answers = result.stdout.splitlines()
     assert len(answers) == len(lines)
@@ -96,7 +98,11 @@ def bits(vector: dict) -> list[int]:
         for item in value if isinstance(value, list) else [value]:
             number = math.nan if item == "nan" else item
             size = 8 if name.endswith("_ns") or name in forms else 4
-            raw = struct.pack(forms[name], number) if name in forms else (number % 2 ** (8 * size)).to_bytes(size, "little")
+            raw = (
+                struct.pack(forms[name], number)
+                if name in forms
+                else (number % 2 ** (8 * size)).to_bytes(size, "little")
+            )
             found.append(int.from_bytes(raw, "little"))
     return found
 
@@ -123,7 +129,11 @@ def wire_error(body: bytes) -> int | None:
     wanted = SIZES.get(message[1]) if message[:1] == b"\1" and len(message) > 1 else None
     if len(message) not in {wanted, 64}:
         return ERRORS["format"]
-    return ERRORS["crc"] if struct.pack("<I", zlib.crc32(message[:-4])) != message[-4:] else ERRORS["format"]
+    return (
+        ERRORS["crc"]
+        if struct.pack("<I", zlib.crc32(message[:-4])) != message[-4:]
+        else ERRORS["format"]
+    )
 
 
 def wire_stream(stream: bytes) -> list[tuple[int, str]]:
@@ -143,26 +153,38 @@ def wire_stream(stream: bytes) -> list[tuple[int, str]]:
 def pushed(answer: str) -> tuple[list[tuple[int, str]], list[int], list[int]]:
     """An answer to "p": packets, errors, and the counts accepted, crc, format."""
     events, counts = answer.split(". ")
-    packets = [(int(kind), message) for kind, _, message in (event.partition(":") for event in events.split()) if message]
+    packets = [
+        (int(kind), message)
+        for kind, _, message in (event.partition(":") for event in events.split())
+        if message
+    ]
     errors = [int(event) for event in events.split() if ":" not in event]
     return packets, errors, [int(count) for count in counts.split()]
 
 
 def test_every_vector_is_written_and_read_bit_for_bit(driver):
-    encoded = driven(driver, [f"e {v['kind']} {' '.join(f'{n:x}' for n in bits(v))}" for v in ACCEPTED])
+    encoded = driven(
+        driver, [f"e {v['kind']} {' '.join(f'{n:x}' for n in bits(v))}" for v in ACCEPTED]
+    )
     decoded = driven(driver, [f"d {v['packet_hex']}" for v in ACCEPTED])
     for vector, wrote, read in zip(ACCEPTED, encoded, decoded, strict=True):
         assert wrote == f"{vector['packet_hex']} {vector['frame_hex']}", vector["name"]
-        assert read == f"{vector['kind']} 0 {' '.join(f'{n:x}' for n in bits(vector))}", vector["name"]
+        assert read == f"{vector['kind']} 0 {' '.join(f'{n:x}' for n in bits(vector))}", vector[
+            "name"
+        ]
 
 
 def test_every_refused_vector_is_refused_for_its_reason(driver):
     """What only a receiver's past can refuse (time) is a packet like any other to the wire."""
     whole = [vector for vector in REFUSED if vector["packet_hex"] is not None]
-    for vector, answer in zip(whole, driven(driver, [f"d {v['packet_hex'] or '-'}" for v in whole]), strict=True):
+    for vector, answer in zip(
+        whole, driven(driver, [f"d {v['packet_hex'] or '-'}" for v in whole]), strict=True
+    ):
         result, check, *_ = [int(word, 16) for word in f"{answer} 0".split()]
         first = result if result < 0 else check
-        assert first == (0 if vector["refused"] == "time" else ERRORS[vector["refused"]]), vector["name"]
+        assert first == (0 if vector["refused"] == "time" else ERRORS[vector["refused"]]), vector[
+            "name"
+        ]
 
 
 def test_a_frame_of_each_vector_comes_out_of_a_stream(driver):
@@ -177,7 +199,14 @@ def test_a_frame_of_each_vector_comes_out_of_a_stream(driver):
 
 def test_the_first_whole_frame_after_garbage_and_a_delimiter_is_taken(sanitized, rng):
     good = frame(TimeRequest(7, -7))
-    for garbage in (b"", b"\0" * 9, b"\xff" * 500, b"\x02", frame(TimeRequest(1, 1))[:-1], rng.bytes(3000)):
+    for garbage in (
+        b"",
+        b"\0" * 9,
+        b"\xff" * 500,
+        b"\x02",
+        frame(TimeRequest(1, 1))[:-1],
+        rng.bytes(3000),
+    ):
         (_, answer) = driven(sanitized, ["i", f"p {(garbage + DELIMITER + good).hex()}"])
         assert pushed(answer)[0][-1] == (2, cobs.decode(good[:-1]).hex())
 
@@ -185,7 +214,15 @@ def test_the_first_whole_frame_after_garbage_and_a_delimiter_is_taken(sanitized,
 def test_a_line_that_never_brings_a_delimiter_costs_one_refusal(sanitized):
     long = "55" * (MAX_FRAME_BYTES + 1)
     answers = driven(
-        sanitized, ["i", "p 00", f"p {long[2:]}", "p 55", f"p {long * 9}", f"p 00{frame(TimeRequest(3, 4)).hex()}"]
+        sanitized,
+        [
+            "i",
+            "p 00",
+            f"p {long[2:]}",
+            "p 55",
+            f"p {long * 9}",
+            f"p 00{frame(TimeRequest(3, 4)).hex()}",
+        ],
     )
     errors = [pushed(answer)[1] for answer in answers[1:]]
     assert errors == [[], [], [-1], [], []]
@@ -238,7 +275,9 @@ def test_c_takes_exactly_what_python_takes_of_mutated_frames(sanitized, rng):
         assert packets == wire_stream(stream), stream.hex()
         assert packets[-1] == (2, cobs.decode(good[:-1]).hex())
         taken += len(packets) - 1
-        assert errors == [error for body in stream.split(DELIMITER) if (error := wire_error(body)) is not None], stream.hex()
+        assert errors == [
+            error for body in stream.split(DELIMITER) if (error := wire_error(body)) is not None
+        ], stream.hex()
     # Some are valid all the same, with a new CRC or a byte replaced by itself; most are not.
     assert 0.05 * MUTATED_FRAMES < taken < 0.6 * MUTATED_FRAMES
     *_, accepted, crc, form = (int(count) for count in answers[-1].split(". ")[1].split())
@@ -249,7 +288,11 @@ def test_c_takes_exactly_what_python_takes_of_mutated_frames(sanitized, rng):
 def test_messages_as_zeromq_brings_them_are_taken_alike(sanitized, rng):
     whole = [bytes.fromhex(vector["packet_hex"]) for vector in ACCEPTED]
     messages = [rng.bytes(int(rng.integers(130))) for _ in range(1000)]
-    messages += [cobs.decode(mutant[:-1]) for mutant in (mutated([frame_of(m)], rng) for m in whole * 20) if is_cobs(mutant)]
+    messages += [
+        cobs.decode(mutant[:-1])
+        for mutant in (mutated([frame_of(m)], rng) for m in whole * 20)
+        if is_cobs(mutant)
+    ]
     answers = driven(sanitized, [f"d {message.hex() or '-'}" for message in messages])
     for message, answer in zip(messages, answers, strict=True):
         kind = int(answer.split()[0])
@@ -273,7 +316,9 @@ def code_bytes(tmp_path: Path, compiler: list[str], size: str) -> int:
     source = tmp_path / "every.c"
     source.write_text(EVERY_FUNCTION)
     target = compiled([*compiler, "-std=c99", *STRICT, "-Os", "-c"], source, tmp_path / "every.o")
-    table = subprocess.run([size, str(target)], capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
+    table = subprocess.run(
+        [size, str(target)], capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    ).stdout
     text, data, bss, *_ = (int(word) for word in table.splitlines()[1].split()[:3])
     assert data == bss == 0
     return text
@@ -284,7 +329,11 @@ def test_the_header_s_code_is_under_four_kilobytes(tmp_path):
 
 
 @pytest.mark.parametrize("core", ["cortex-m0", "cortex-m3", "cortex-m4"])
-@pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="arm-none-eabi-gcc is not installed")
+@pytest.mark.skipif(
+    shutil.which("arm-none-eabi-gcc") is None, reason="arm-none-eabi-gcc is not installed"
+)
 def test_the_header_s_code_is_as_small_on_a_microcontroller(tmp_path, core):
-    code = code_bytes(tmp_path, ["arm-none-eabi-gcc", "-mthumb", f"-mcpu={core}"], "arm-none-eabi-size")
+    code = code_bytes(
+        tmp_path, ["arm-none-eabi-gcc", "-mthumb", f"-mcpu={core}"], "arm-none-eabi-size"
+    )
     assert code < MAX_CODE_BYTES

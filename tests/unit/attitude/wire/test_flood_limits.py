@@ -12,8 +12,23 @@ from dataclasses import replace
 
 import pytest
 
-from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_NS, PAUSE_S, FloodGate, LinkCounts, RawMessage
-from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares_discontinuity, decode, encode, framed
+from hilstar.attitude.wire.links import (
+    MAX_BURST,
+    MAX_PACKETS_PER_S,
+    OVER_NS,
+    PAUSE_S,
+    FloodGate,
+    LinkCounts,
+    RawMessage,
+)
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    StreamDecoder,
+    declares_discontinuity,
+    decode,
+    encode,
+    framed,
+)
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -103,7 +118,10 @@ def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_
         taken = FloodGate(LinkCounts(), Notices()).newest(waiting, declares_discontinuity)
         events = [decode(message.parts[0]) for message in taken]
         for found in (events, on_line):
-            assert [event.sequence for event in found] == [1500, *range(2 * MAX_BURST, 3 * MAX_BURST)]
+            assert [event.sequence for event in found] == [
+                1500,
+                *range(2 * MAX_BURST, 3 * MAX_BURST),
+            ]
             assert [event.discontinuity for event in found[:2]] == [True, False]
 
 

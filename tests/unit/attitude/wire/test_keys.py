@@ -14,7 +14,9 @@ from hilstar.attitude.wire.keys import AllowList, load_public, load_secret, make
 from hilstar.basics.errors import InputError
 
 
-def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(tmp_path, monkeypatch):
+def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(
+    tmp_path, monkeypatch
+):
     """Seen at the moment when the file has just been written, by a user whose umask lets all
     read.
     """
@@ -85,7 +87,9 @@ def test_an_allow_list_follows_its_directory(tmp_path, caplog):
     assert not clients.callback("*", second)
 
 
-@pytest.mark.parametrize("text", ["", "public-key", 'public-key = "short"', f'public-key = "{"~" * 40}"', "\0\xff"])
+@pytest.mark.parametrize(
+    "text", ["", "public-key", 'public-key = "short"', f'public-key = "{"~" * 40}"', "\0\xff"]
+)
 def test_what_is_no_key_file_gets_one_line(tmp_path, text):
     path = tmp_path / "x.key"
     path.write_text(text)

@@ -10,7 +10,14 @@ import pytest
 from cobs import cobs, cobsr
 
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, likeness
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal, StreamDecoder, decode, decode_frame, frame
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Refusal,
+    StreamDecoder,
+    decode,
+    decode_frame,
+    frame,
+)
 
 Q = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
 FIELDS = "BBHIq4d3f"
@@ -63,7 +70,9 @@ PACKETS = {
 
 @pytest.mark.parametrize(("message", "words"), PACKETS.values(), ids=PACKETS)
 @pytest.mark.parametrize("road", ["datagram", "serial line"])
-def test_a_packet_in_another_order_or_of_another_crc_is_named(message: bytes, words: str, road: str) -> None:
+def test_a_packet_in_another_order_or_of_another_crc_is_named(
+    message: bytes, words: str, road: str
+) -> None:
     event = decode(message) if road == "datagram" else decode_frame(cobs.encode(message))
     assert isinstance(event, Refusal)
     assert event.telling
@@ -102,7 +111,10 @@ MESSAGES = {
     "ZeroMQ": (b"\xff" + bytes(8) + b"\x7f\x03\x00NULL", "ZeroMQ"),
     "NMEA": (b"$GPGGA,123519,4807.038,N*47\r\n", "NMEA"),
     "UBX": (b"\xb5\x62\x01\x07\x5c\x00", "UBX"),
-    "COBS in a datagram": (frame(AttitudeSample(1, np.array([1.0, 0, 0, 0]))), "as on a serial line"),
+    "COBS in a datagram": (
+        frame(AttitudeSample(1, np.array([1.0, 0, 0, 0]))),
+        "as on a serial line",
+    ),
     "quaternion": (struct.pack("<4d", *Q), "a bare quaternion of little-endian"),
     "time and quaternion": (struct.pack(">q4d", 5, *Q), "a bare quaternion of big-endian"),
 }
@@ -121,10 +133,14 @@ LINES = {
     "JSON": (b'{"t_ns":1,"q":[1,0,0,0]}\n' * 8, "JSON, '{"),
     "no 0x00": (frame(AttitudeSample(1, np.array(Q)))[:-1] * 4, "COBS frames without an end"),
     "no 0x00, from the middle": (
-        frame(AttitudeSample(1, np.array(Q)))[30:-1] + frame(AttitudeSample(1, np.array(Q)))[:-1] * 4,
+        frame(AttitudeSample(1, np.array(Q)))[30:-1]
+        + frame(AttitudeSample(1, np.array(Q)))[:-1] * 4,
         "without an end",
     ),
-    "line ends": ((frame(AttitudeSample(1, np.array(Q))) + b"\r\n") * 3, "a line end before a frame"),
+    "line ends": (
+        (frame(AttitudeSample(1, np.array(Q))) + b"\r\n") * 3,
+        "a line end before a frame",
+    ),
     "text between": (b"\0tick 5\r\n" + frame(AttitudeSample(1, np.array(Q))), "text, 'tick 5"),
     "stuck": (b"\xff" * 300, "the byte 0xff"),
 }

@@ -9,14 +9,24 @@ import zlib
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal, Status, TimeReply, TimeRequest, decode, encode
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Refusal,
+    Status,
+    TimeReply,
+    TimeRequest,
+    decode,
+    encode,
+)
 
 Q = (0.5, 0.5, -0.5, 0.5)
 # struct characters of the types that protocol.toml names.
 FORMATS = {"u8": "B", "u16": "H", "u32": "I", "i64": "q", "f32": "f", "f64": "d"}
 
 
-def packet(*, version=1, kind=1, flags=1, sequence=7, t_ns=123, q=Q, rate=(0.1, -0.2, 0.3)) -> bytes:
+def packet(
+    *, version=1, kind=1, flags=1, sequence=7, t_ns=123, q=Q, rate=(0.1, -0.2, 0.3)
+) -> bytes:
     """An attitude packet, put together from the design's section 4 alone."""
     body = struct.pack("<BBHIq4d3f", version, kind, flags, sequence, t_ns, *q, *rate)
     return body + struct.pack("<I", zlib.crc32(body))
@@ -41,10 +51,16 @@ def test_what_is_encoded_is_decoded(rng):
         q = rng.normal(size=4)
         q /= np.linalg.norm(q)
         rate = rng.normal(size=3).astype(np.float32).astype(np.float64) if flags % 2 else None
-        sent = AttitudeSample(int(rng.integers(-(2**62), 2**62)), q, rate, int(rng.integers(2**32)), bool(flags % 3))
+        sent = AttitudeSample(
+            int(rng.integers(-(2**62), 2**62)), q, rate, int(rng.integers(2**32)), bool(flags % 3)
+        )
         got = decode(encode(sent))
         assert isinstance(got, AttitudeSample)
-        assert (got.t_ns, got.sequence, got.discontinuity) == (sent.t_ns, sent.sequence, sent.discontinuity)
+        assert (got.t_ns, got.sequence, got.discontinuity) == (
+            sent.t_ns,
+            sent.sequence,
+            sent.discontinuity,
+        )
         # at most one rounding of the division by the norm
         assert np.abs(got.q_icrs_to_cam - q).max() <= 2.3e-16
         assert (got.rate_cam_rad_s is None) == (rate is None)

@@ -45,7 +45,15 @@ FIELDS = {
     1: ["flags", "sequence", "t_ns", "q_icrs_to_cam", "rate_cam_rad_s"],
     2: ["sequence", "t1_ns"],
     3: ["sequence", "t1_ns", "t2_ns", "t3_ns"],
-    4: ["health", "frame", "light_t_ns", "attitude_age_ns", "attitude_sequence", "accepted", "refused"],
+    4: [
+        "health",
+        "frame",
+        "light_t_ns",
+        "attitude_age_ns",
+        "attitude_sequence",
+        "accepted",
+        "refused",
+    ],
     5: ["flags", "sequence", "t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "stars"],
 }
 # The division of a quaternion by its norm rounds norm and quotient: each by half of 2.2e-16.
@@ -64,7 +72,10 @@ def numbers(values: list) -> list[float]:
 def same_bits(values: list, others: list) -> bool:
     """Equal as doubles, the signs of zeros too, and any NaN like any other."""
     pairs = zip(values, others, strict=True)
-    return all((a == b and math.copysign(1, a) == math.copysign(1, b)) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+    return all(
+        (a == b and math.copysign(1, a) == math.copysign(1, b)) or (math.isnan(a) and math.isnan(b))
+        for a, b in pairs
+    )
 
 
 def wire_fields(message: bytes) -> tuple[int, dict]:
@@ -97,7 +108,10 @@ def regenerated(folder: Path, *options: str) -> subprocess.CompletedProcess[str]
 def copy(tmp_path):
     shutil.copytree(FOLDER, tmp_path / "firmware_protocol")
     (tmp_path / "hilstar" / "attitude" / "wire").mkdir(parents=True)
-    shutil.copy(ROOT / "hilstar" / "attitude" / "wire" / "protocol.py", tmp_path / "hilstar" / "attitude" / "wire")
+    shutil.copy(
+        ROOT / "hilstar" / "attitude" / "wire" / "protocol.py",
+        tmp_path / "hilstar" / "attitude" / "wire",
+    )
     return tmp_path
 
 
@@ -125,7 +139,9 @@ def test_a_changed_definition_makes_every_file_stale_and_generating_mends_it(cop
     )
     stale = regenerated(copy, "--check")
     assert stale.returncode == 1
-    assert [line for line in stale.stderr.splitlines() if line.startswith("stale")] == [f"stale: {name}" for name in GENERATED]
+    assert [line for line in stale.stderr.splitlines() if line.startswith("stale")] == [
+        f"stale: {name}" for name in GENERATED
+    ]
     assert regenerated(copy).returncode == 0
     assert regenerated(copy, "--check").returncode == 0
 
@@ -163,14 +179,22 @@ def test_the_table_has_the_icd_s_sizes_and_bits():
         protocol.STATUS_BODY,
         protocol.ANSWER_BODY,
     )
-    assert {kind: struct.calcsize(form) for kind, form in FORMATS.items()} == SIZES == protocol.PACKET_BYTES
+    assert (
+        {kind: struct.calcsize(form) for kind, form in FORMATS.items()}
+        == SIZES
+        == protocol.PACKET_BYTES
+    )
     assert [body.format + "I" for body in bodies] == list(FORMATS.values())
     health = "NO_ATTITUDE STALE BLANK CLOCK_SYNCHRONISED MISSED REFUSED CLIPPED LEDGER_FAILED"
     health += " OPERATOR_OVERRIDE HIDDEN SECOND_SENDER SOURCE_FROZEN"
-    assert [getattr(protocol, f"HEALTH_{name}") for name in health.split()] == [1 << bit for bit in range(12)]
+    assert [getattr(protocol, f"HEALTH_{name}") for name in health.split()] == [
+        1 << bit for bit in range(12)
+    ]
     assert (protocol.FLAG_RATE_VALID, protocol.FLAG_DISCONTINUITY) == (1, 2)
     answer = "RATE_VALID VALID LOST_IN_SPACE TRACKING TOO_FEW_STARS BLINDED"
-    assert [getattr(protocol, f"ANSWER_{name}") for name in answer.split()] == [1 << bit for bit in range(6)]
+    assert [getattr(protocol, f"ANSWER_{name}") for name in answer.split()] == [
+        1 << bit for bit in range(6)
+    ]
     assert (protocol.NORM_TOLERANCE, protocol.FASTEST_RAD_S) == (1e-3, 1e6)
 
 
@@ -203,7 +227,9 @@ def test_hilstar_reads_a_vector_and_writes_it_again(vector):
     fields = vector["fields"]
     if not isinstance(event, AttitudeSample):
         got = {name: getattr(event, name) for name in fields}
-        assert {name: list(value) if isinstance(value, tuple) else value for name, value in got.items()} == fields
+        assert {
+            name: list(value) if isinstance(value, tuple) else value for name, value in got.items()
+        } == fields
         assert encode(event) == message
         assert frame(event).hex() == vector["frame_hex"]
         return
@@ -216,7 +242,11 @@ def test_hilstar_reads_a_vector_and_writes_it_again(vector):
     assert (event.rate_cam_rad_s is not None) == known
     if event.rate_cam_rad_s is not None:
         assert same_bits(list(event.rate_cam_rad_s), fields["rate_cam_rad_s"])
-    if norm == 1.0 and fields["flags"] < 4 and not any(value == "nan" for value in fields["rate_cam_rad_s"]):
+    if (
+        norm == 1.0
+        and fields["flags"] < 4
+        and not any(value == "nan" for value in fields["rate_cam_rad_s"])
+    ):
         assert encode(event) == message
         assert frame(event).hex() == vector["frame_hex"]
 
@@ -238,7 +268,9 @@ def test_hilstar_refuses_a_vector_for_the_reason_it_gives(vector):
         again = decode(bytes.fromhex(vector["packet_hex"]))
         assert isinstance(again, Refusal)
         assert again.reason == vector["refused"]
-        assert cobs.encode(bytes.fromhex(vector["packet_hex"])) + b"\0" == bytes.fromhex(vector["frame_hex"])
+        assert cobs.encode(bytes.fromhex(vector["packet_hex"])) + b"\0" == bytes.fromhex(
+            vector["frame_hex"]
+        )
 
 
 def test_the_readme_s_check_values_are_hilstar_s():
@@ -248,14 +280,25 @@ def test_the_readme_s_check_values_are_hilstar_s():
     for radec, *q in rows:
         expected = from_radec_roll_deg(*(float(word) for word in radec.split(",")))
         # Seven digits are shown.
-        assert min(np.abs(expected - sign * np.array(q, dtype=np.float64)).max() for sign in (1, -1)) < 0.51e-7
+        assert (
+            min(np.abs(expected - sign * np.array(q, dtype=np.float64)).max() for sign in (1, -1))
+            < 0.51e-7
+        )
 
 
 def test_the_readme_s_python_line_makes_the_first_vector():
     """The line in the ICD, run as it stands there."""
     text = (FOLDER / "README.md").read_text()
     code = text.split("```python\n")[1].split("```")[0]
-    names_: dict = {"flags": 1, "sequence": 1, "t_ns": 1_000_000_000, "w": 0.5, "x": 0.5, "y": -0.5, "z": 0.5}
+    names_: dict = {
+        "flags": 1,
+        "sequence": 1,
+        "t_ns": 1_000_000_000,
+        "w": 0.5,
+        "x": 0.5,
+        "y": -0.5,
+        "z": 0.5,
+    }
     names_ |= {"rx": 0.0, "ry": 0.0, "rz": 0.125}
     exec(code, names_)
     assert names_["packet"].hex() == VECTORS[0]["packet_hex"]

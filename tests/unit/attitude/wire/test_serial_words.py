@@ -58,5 +58,9 @@ def test_a_long_text_is_a_refused_message() -> None:
 
 
 def test_a_silent_line_is_a_sender_that_did_not_start() -> None:
-    with line() as (_, name), SerialLink(name, BAUD) as link, pytest.raises(InputError, match="start the sender"):
+    with (
+        line() as (_, name),
+        SerialLink(name, BAUD) as link,
+        pytest.raises(InputError, match="start the sender"),
+    ):
         first_attitude(link, 0.2)

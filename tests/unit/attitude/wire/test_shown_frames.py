@@ -25,7 +25,9 @@ HEAD = FrameHead(frame=7, lit_ns=123, width=5, height=3, bits=8, q=(1.0, 0.0, 0.
 LIT = np.array([2, 14], dtype=np.uint32)
 
 
-@pytest.mark.parametrize(("bits", "channels", "largest"), [(8, 1, 255), (10, 1, 1023), (8, 3, 255), (12, 3, 4095)])
+@pytest.mark.parametrize(
+    ("bits", "channels", "largest"), [(8, 1, 255), (10, 1, 1023), (8, 3, 255), (12, 3, 4095)]
+)
 def test_a_frame_comes_back_as_it_was_shown(bits, channels, largest):
     head = msgspec.structs.replace(HEAD, bits=bits, channels=channels)
     codes = np.array([[1, 2, 3], [largest, 0, 1]], dtype=np.uint16)[:, :channels].squeeze()
@@ -76,7 +78,9 @@ class RawWatcher:
     """
 
     def __init__(self, endpoint: str) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", int(endpoint.rpartition(":")[2])), PATIENCE_S)
+        self.socket = socket.create_connection(
+            ("127.0.0.1", int(endpoint.rpartition(":")[2])), PATIENCE_S
+        )
         self.socket.sendall(GREETING + READY)
         heard = b""
         while b"READY" not in heard:  # a message before that would end the handshake
@@ -128,7 +132,9 @@ def settled(sender: FrameSender) -> None:
     ],
 )
 @pytest.mark.parametrize("crashes", [True, False])
-def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(sender, said, crashes):
+def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(
+    sender, said, crashes
+):
     with closing(FrameWatch(sender.endpoint)) as watcher:
         seen_by(watcher, sender)
         other = RawWatcher(sender.endpoint)

@@ -38,7 +38,9 @@ def test_the_camera_sees_what_a_vector_turned_twice_says(seed: int) -> None:
     found = Rotation.from_quat(cam.q_icrs_to_cam, scalar_first=True).apply(star)
     assert found == pytest.approx(body_to_cam.apply(icrs_to_body.apply(star)), abs=ROUNDING * 10)
     assert cam.rate_cam_rad_s == pytest.approx(body_to_cam.apply(rate), abs=ROUNDING * 10)
-    back = Rotation.from_quat(Mounting(scalar_first(body_to_cam)).q_icrs_to_body(cam.q_icrs_to_cam), scalar_first=True)
+    back = Rotation.from_quat(
+        Mounting(scalar_first(body_to_cam)).q_icrs_to_body(cam.q_icrs_to_cam), scalar_first=True
+    )
     assert (back * icrs_to_body.inv()).magnitude() < ROUNDING
 
 
@@ -46,7 +48,9 @@ def test_without_a_mounting_a_sample_passes_as_it_is() -> None:
     sample = AttitudeSample(5, np.array([0.5, 0.5, -0.5, 0.5]))
     assert Mounting().sample(sample) is sample
     assert Mounting().told, "nobody has said how the camera sits"
-    assert not Mounting((1.0, 0.0, 0.0, 0.0)).told, "the user has said that it sits along the body's axes"
+    assert not Mounting((1.0, 0.0, 0.0, 0.0)).told, (
+        "the user has said that it sits along the body's axes"
+    )
 
 
 @pytest.mark.parametrize("conventions", [PACKETS, BODY], ids=["the camera's", "the body's"])

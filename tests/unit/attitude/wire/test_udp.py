@@ -68,16 +68,28 @@ def test_however_many_addresses_ask_each_is_judged_by_the_list():
 @pytest.mark.parametrize(
     ("stamp_ns", "arrived_ns"),
     [(70, 1070), (99, 1099), (101, 1100), (40, 1050), (None, 1100)],
-    ids=["stamped", "just now", "later than it was read", "before the socket was empty", "not stamped"],
+    ids=[
+        "stamped",
+        "just now",
+        "later than it was read",
+        "before the socket was empty",
+        "not stamped",
+    ],
 )
-def test_an_arrival_has_the_kernel_s_stamp_on_the_host_s_clock_between_the_last_look_and_now(stamp_ns, arrived_ns):
+def test_an_arrival_has_the_kernel_s_stamp_on_the_host_s_clock_between_the_last_look_and_now(
+    stamp_ns, arrived_ns
+):
     """The calendar's clock shows 10 s when the host's shows 1000 ns."""
     clock = FakeClock(1000)
     clock.realtime_ns = lambda: 10 * NS_PER_S + clock.now_ns() - 1000
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:
         stamps = KernelStamps(receiving, clock)
     stamps.empty_ns = 1050
-    told = [] if stamp_ns is None else [(socket.SOL_SOCKET, SO_TIMESTAMPNS, TIMESPEC.pack(10, stamp_ns))]
+    told = (
+        []
+        if stamp_ns is None
+        else [(socket.SOL_SOCKET, SO_TIMESTAMPNS, TIMESPEC.pack(10, stamp_ns))]
+    )
     assert stamps.arrived_ns(told, 1100) == arrived_ns
 
 
@@ -119,7 +131,10 @@ def test_credit_is_bounded_in_bytes_and_in_addresses():
 
 
 def test_the_link_itself_sends_to_nobody():
-    with UdpLink(ANYWHERE, AllowedSenders()) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with (
+        UdpLink(ANYWHERE, AllowedSenders()) as link,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
         sender.connect(("127.0.0.1", int(link.endpoint.rpartition(":")[2])))
         sender.setblocking(False)
         sender.send(packet(1, 5))
@@ -154,7 +169,9 @@ def test_the_kernel_s_filter_lets_in_whom_the_list_admits():
     ):
         allowed, bound = AllowedSenders(texts), Datagrams.bound(ANYWHERE)
         assert bound.keep_only(allowed.networks)
-        assert received(bound, b"x" * 64, sources) == {source for source in sources if allowed.admits(source)}, texts
+        assert received(bound, b"x" * 64, sources) == {
+            source for source in sources if allowed.admits(source)
+        }, texts
         assert bound.dropped() == sum(not allowed.admits(source) for source in sources)
         bound.close()
 

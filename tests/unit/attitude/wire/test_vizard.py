@@ -46,7 +46,9 @@ STEP_NS = 20_000_000
 QUICK_S = 1.0  # a refusal takes milliseconds; what reads on takes minutes
 
 
-def follower(name: str | None = None, mounting: Mounting | None = None, max_rate_rad_s: float = 1.0) -> Follower:
+def follower(
+    name: str | None = None, mounting: Mounting | None = None, max_rate_rad_s: float = 1.0
+) -> Follower:
     return Follower(name, mounting or Mounting(), DifferenceRates(10 * STEP_NS, max_rate_rad_s))
 
 
@@ -61,7 +63,9 @@ def rotation_of(sample: AttitudeSample | Refusal) -> Rotation:
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("shadow", [False, True])
-def test_an_mrp_and_its_shadow_are_the_frame_s_turn_and_the_mounting_comes_after(seed: int, shadow: bool) -> None:
+def test_an_mrp_and_its_shadow_are_the_frame_s_turn_and_the_mounting_comes_after(
+    seed: int, shadow: bool
+) -> None:
     """SciPy's parameters turn a vector, Basilisk's a frame: [BN] is the inverse."""
     rng = np.random.default_rng(seed)
     body_from_n, pose = Rotation.random(rng=rng), Rotation.random(rng=rng)
@@ -71,7 +75,9 @@ def test_an_mrp_and_its_shadow_are_the_frame_s_turn_and_the_mounting_comes_after
     mounting = Mounting(tuple(pose.as_quat(scalar_first=True).tolist()))
     sample = taken(viz_message(spacecraft=[craft(sigma=sigma)]), follower(mounting=mounting))
     star = rng.normal(size=3)
-    assert rotation_of(sample).apply(star) == pytest.approx(pose.apply(body_from_n.apply(star)), abs=10 * ROUNDING_RAD)
+    assert rotation_of(sample).apply(star) == pytest.approx(
+        pose.apply(body_from_n.apply(star)), abs=10 * ROUNDING_RAD
+    )
 
 
 def test_time_and_number_are_the_simulation_s() -> None:
@@ -87,7 +93,9 @@ def test_the_self_check_points_where_it_says() -> None:
     sigma = [float(number) for number in match[1].split(",")]
     sample = taken(viz_message(spacecraft=[craft(sigma=sigma)]), follower(mounting=pose))
     assert isinstance(sample, AttitudeSample)
-    assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=DIGITS_DEG)
+    assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(
+        CHECK_RADEC_DEG, abs=DIGITS_DEG
+    )
 
 
 # Rates
@@ -121,7 +129,10 @@ def test_a_rate_is_that_of_its_own_moment_and_the_shadow_switch_is_no_turn() -> 
 
 def test_an_acceleration_goes_with_the_rate_and_the_timeline_carries_both_on() -> None:
     """Held to the rate alone it would be 0.01 * 0.1^2 / 2 = 5e-5 rad off after 0.1 s."""
-    timeline, by = Timeline(Policy(NS_PER_S, NS_PER_S)), follower(mounting=Mounting((0.6, 0.48, 0.64, 0.0)))
+    timeline, by = (
+        Timeline(Policy(NS_PER_S, NS_PER_S)),
+        follower(mounting=Mounting((0.6, 0.48, 0.64, 0.0))),
+    )
     for k in range(4):
         sample = taken(viz_message(k * 2e7, [craft(sigma=turn_at(k * 0.02).as_mrp())]), by)
         assert isinstance(sample, AttitudeSample)
@@ -140,10 +151,25 @@ def test_the_very_first_two_wait_for_the_third_and_no_others() -> None:
     for t_s in (0.0, 0.02, 0.04, 0.06, 0.5, 0.52, 0.02, 0.04, 0.06, 0.08):
         now_ns += STEP_NS
         event = taken(viz_message(t_s * 1e9, [craft(sigma=turn_at(t_s).as_mrp())]), by)
-        went = opening.passed([Arrival(now_ns, Refusal("format", "")), Arrival(now_ns, event)], now_ns)
-        passed.append([each.event.t_ns / 1e9 for each in went if isinstance(each.event, AttitudeSample)])
+        went = opening.passed(
+            [Arrival(now_ns, Refusal("format", "")), Arrival(now_ns, event)], now_ns
+        )
+        passed.append(
+            [each.event.t_ns / 1e9 for each in went if isinstance(each.event, AttitudeSample)]
+        )
         assert sum(isinstance(each.event, Refusal) for each in went) == 1
-    assert passed == [[], [], [0, 0.02, 0.04], [0.06], [0.5], [0.52], [0.02], [0.04], [0.06], [0.08]]
+    assert passed == [
+        [],
+        [],
+        [0, 0.02, 0.04],
+        [0.06],
+        [0.5],
+        [0.52],
+        [0.02],
+        [0.04],
+        [0.06],
+        [0.08],
+    ]
 
 
 def test_a_simulation_with_long_steps_is_not_held_for_long() -> None:
@@ -165,16 +191,28 @@ def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:
 
 
 def test_the_named_spacecraft_is_followed_and_without_a_name_the_only_one() -> None:
-    pair = [craft("a", (0.1, 0, 0)), craft("b", (0, 0.1, 0)), craft("panel", (0, 0, 0.1), parentSpacecraftName="a")]
-    assert rotation_of(taken(viz_message(spacecraft=pair), follower("b"))).as_mrp()[1] == pytest.approx(-0.1)
-    assert rotation_of(taken(viz_message(spacecraft=pair), follower("panel"))).as_mrp()[2] == pytest.approx(-0.1)
+    pair = [
+        craft("a", (0.1, 0, 0)),
+        craft("b", (0, 0.1, 0)),
+        craft("panel", (0, 0, 0.1), parentSpacecraftName="a"),
+    ]
+    assert rotation_of(taken(viz_message(spacecraft=pair), follower("b"))).as_mrp()[
+        1
+    ] == pytest.approx(-0.1)
+    assert rotation_of(taken(viz_message(spacecraft=pair), follower("panel"))).as_mrp()[
+        2
+    ] == pytest.approx(-0.1)
     assert rotation_of(taken(viz_message(spacecraft=pair[::2]))).as_mrp()[0] == pytest.approx(-0.1)
 
 
 @pytest.mark.parametrize(
     ("names", "wanted", "words"),
     [
-        (["a", "b"], None, 'spacecraft: a, b; write the one that is meant, [attitude] spacecraft = "NAME"'),
+        (
+            ["a", "b"],
+            None,
+            'spacecraft: a, b; write the one that is meant, [attitude] spacecraft = "NAME"',
+        ),
         ([], None, "spacecraft: none; write"),
         (["a"], "c", "spacecraft = c: 0 have that name; there: a"),
         (["a", "a"], "a", "spacecraft = a: 2 have that name"),
@@ -200,7 +238,11 @@ def test_any_other_choice_is_refused_by_the_names_that_are_there(names, wanted, 
         (viz_message(1e30, [craft()]), "format", "simTimeElapsed 1e+30"),
         (viz_message(spacecraft=[craft(sigma=())]), "format", "0 components of its rotation"),
         (viz_message(spacecraft=[craft(sigma=(1, 2))]), "format", "2 components of its rotation"),
-        (viz_message(spacecraft=[craft(sigma=(1, 2, 3, 4))]), "format", "4 components of its rotation"),
+        (
+            viz_message(spacecraft=[craft(sigma=(1, 2, 3, 4))]),
+            "format",
+            "4 components of its rotation",
+        ),
         (viz_message(spacecraft=[craft(sigma=(float("nan"), 0, 0))]), "nan", "not finite"),
         (viz_message(spacecraft=[craft(sigma=(float("inf"), 0, 0))]), "nan", "not finite"),
         (b"\x0a\xff\xff\xff\xff\x0f", "format", "cut short"),
@@ -213,10 +255,16 @@ def test_any_other_choice_is_refused_by_the_names_that_are_there(names, wanted, 
         (b"\x28\x01" * 500_000, "format", "no currentTime"),
         ((b"\x1a\x7e" + b"\x28\x01" * 63) * 30_000, "format", f"over {MAX_PARTS} spacecraft"),
         (b"\x1a\x00" * 2**21, "format", f"over {MAX_PARTS} spacecraft"),
-        (b"\x0a\x00\x1a\x80\x80\x80\x01" + b"\x22\xfc\xff\x7f" + bytes(2**21 - 4), "format", "no protobuf message"),
+        (
+            b"\x0a\x00\x1a\x80\x80\x80\x01" + b"\x22\xfc\xff\x7f" + bytes(2**21 - 4),
+            "format",
+            "no protobuf message",
+        ),
     ],
 )
-def test_what_is_no_message_is_refused_with_what_is_wrong(message: bytes, reason: str, words: str) -> None:
+def test_what_is_no_message_is_refused_with_what_is_wrong(
+    message: bytes, reason: str, words: str
+) -> None:
     begun_s = time.thread_time()
     refusal = taken(message)
     assert isinstance(refusal, Refusal)
@@ -227,16 +275,26 @@ def test_what_is_no_message_is_refused_with_what_is_wrong(message: bytes, reason
 
 def test_a_message_that_is_cut_short_anywhere_gives_no_other_attitude() -> None:
     """Where it is cut between fields it may still be whole: then what is left is unchanged."""
-    message = viz_message(spacecraft=[craft()], cameras=[{"cameraID": 1, "resolution": [8, 9], "cameraDir_B": [0, 0, 0]}])
+    message = viz_message(
+        spacecraft=[craft()],
+        cameras=[{"cameraID": 1, "resolution": [8, 9], "cameraDir_B": [0, 0, 0]}],
+    )
     whole = rotation_of(taken(message))
     for end in range(len(message)):
         event = taken(message[:end])
-        assert isinstance(event, Refusal) or (rotation_of(event) * whole.inv()).magnitude() < ROUNDING_RAD
+        assert (
+            isinstance(event, Refusal)
+            or (rotation_of(event) * whole.inv()).magnitude() < ROUNDING_RAD
+        )
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_give_one_event(noise: bytes) -> None:
-    for message in (noise, viz_message(spacecraft=[craft()]) + noise, b"\x1a" + bytes([len(noise) % 128]) + noise):
+    for message in (
+        noise,
+        viz_message(spacecraft=[craft()]) + noise,
+        b"\x1a" + bytes([len(noise) % 128]) + noise,
+    ):
         assert isinstance(taken(message), AttitudeSample | Refusal)
 
 
@@ -244,14 +302,18 @@ def test_an_mrp_of_any_length_is_a_unit_quaternion(rng: np.random.Generator) -> 
     for length in (0.0, 1e-300, 1e-8, 1.0, 1e8, 1e160, 1e300):
         sigma = rng.normal(size=3)
         sigma *= length / np.linalg.norm(sigma)
-        assert np.linalg.norm(quaternion_of_mrp(tuple(sigma.tolist()))) == pytest.approx(1, abs=1e-15)
+        assert np.linalg.norm(quaternion_of_mrp(tuple(sigma.tolist()))) == pytest.approx(
+            1, abs=1e-15
+        )
 
 
 def test_old_encoders_that_do_not_pack_are_read_too() -> None:
     sigma = b"".join(b"\x21" + np.array([c], "<f8").tobytes() for c in (0.1, 0.2, 0.3))
     unpacked = viz_message() + b"\x1a" + bytes([len(sigma) + 3]) + b"\x0a\x01a" + sigma
     packed = viz_message(spacecraft=[craft("a")])
-    assert (rotation_of(taken(unpacked)) * rotation_of(taken(packed)).inv()).magnitude() < ROUNDING_RAD
+    assert (
+        rotation_of(taken(unpacked)) * rotation_of(taken(packed)).inv()
+    ).magnitude() < ROUNDING_RAD
 
 
 # Links and cameras
@@ -282,7 +344,12 @@ def test_a_camera_that_is_not_the_bench_s_tracker_is_told_by_what_differs() -> N
     """Its mounting goes out as Unity's; here it comes back, by SciPy."""
     pose = Rotation.from_quat([0.6, 0.48, 0.64, 0.0], scalar_first=True)
     to_unity = Rotation.from_mrp([1 / 3, 1 / 3, -1 / 3]).inv()
-    sent = {"cameraID": 4, "fieldOfView": 10.0, "resolution": [1024, 512], "cameraDir_B": (to_unity * pose).inv().as_mrp()}
+    sent = {
+        "cameraID": 4,
+        "fieldOfView": 10.0,
+        "resolution": [1024, 512],
+        "cameraDir_B": (to_unity * pose).inv().as_mrp(),
+    }
     (camera,) = decode_update(viz_message(spacecraft=[craft()], cameras=[sent])).cameras
     mounted = q_body_to_cam(camera)
     assert mounted is not None
@@ -291,7 +358,12 @@ def test_a_camera_that_is_not_the_bench_s_tracker_is_told_by_what_differs() -> N
     turned = (Rotation.from_rotvec([0, 0, np.radians(0.1)]) * pose).as_quat(scalar_first=True)
     told = disagreement(camera, TrackerCamera(turned, (1024, 1024), 20.0))
     assert told is not None
-    for words in ("camera 4", "0.1 deg from the bench's", "1024 x 512 px, not 1024 x 1024", "10 deg, not 20"):
+    for words in (
+        "camera 4",
+        "0.1 deg from the bench's",
+        "1024 x 512 px, not 1024 x 1024",
+        "10 deg, not 20",
+    ):
         assert words in told
 
 
@@ -313,9 +385,16 @@ def test_a_velocity_goes_with_the_attitude_in_km_s_where_it_is_wanted() -> None:
 
 @pytest.mark.parametrize(
     ("velocity", "words"),
-    [([], "is nothing"), ([1.0, 2.0], "is 2.24 m/s"), ([3e8, 0, 0], "is 3e+08 m/s"), ([float("nan"), 0, 0], "is nan m/s")],
+    [
+        ([], "is nothing"),
+        ([1.0, 2.0], "is 2.24 m/s"),
+        ([3e8, 0, 0], "is 3e+08 m/s"),
+        ([float("nan"), 0, 0], "is nan m/s"),
+    ],
 )
-def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(velocity, words) -> None:
+def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(
+    velocity, words
+) -> None:
     by = Follower(None, Mounting(), DifferenceRates(STEP_NS, 1.0), "velocity")
     refusal = taken(viz_message(spacecraft=[craft(velocity=velocity)]), by)
     assert isinstance(refusal, Refusal)
@@ -327,10 +406,17 @@ def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(velo
 
 
 RATES = DifferenceRates(STEP_NS, 1.0)
-SUN_CENTRED = {"bodyName": "earth", "position": [1.4e11, 2e10, 0.0], "velocity": [-4e3, 29e3, 0.0], "rotation": [1.0] * 9}
+SUN_CENTRED = {
+    "bodyName": "earth",
+    "position": [1.4e11, 2e10, 0.0],
+    "velocity": [-4e3, 29e3, 0.0],
+    "rotation": [1.0] * 9,
+}
 
 
-@pytest.mark.parametrize("bodies", [[], [SUN_CENTRED], [{"bodyName": "sun", "position": [1.0, 2.0, 3.0]}, SUN_CENTRED]])
+@pytest.mark.parametrize(
+    "bodies", [[], [SUN_CENTRED], [{"bodyName": "sun", "position": [1.0, 2.0, 3.0]}, SUN_CENTRED]]
+)
 def test_a_place_is_about_the_earth_wherever_the_message_has_it(bodies) -> None:
     origin = SUN_CENTRED if bodies else {"position": [0.0] * 3, "velocity": [0.0] * 3}
     here = craft(
@@ -357,7 +443,10 @@ def test_a_place_is_about_the_earth_wherever_the_message_has_it(bodies) -> None:
     ],
 )
 def test_a_place_that_is_none_is_refused_with_what_is_taken(position, words) -> None:
-    refusal = taken(viz_message(spacecraft=[craft(position=position)]), Follower(None, Mounting(), RATES, "state"))
+    refusal = taken(
+        viz_message(spacecraft=[craft(position=position)]),
+        Follower(None, Mounting(), RATES, "state"),
+    )
     assert isinstance(refusal, Refusal)
     assert words in refusal.detail
     assert '[spacecraft] orbit = "source" takes 6000 to 1e+07 km' in refusal.detail
@@ -379,7 +468,9 @@ def test_each_request_has_one_answer_whatever_it_asks() -> None:
         closing(context.socket(zmq.REQ)) as basilisk,
     ):
         basilisk.connect(link.endpoint)
-        link.show_camera(TrackerCamera(np.array([1.0, 0.0, 0.0, 0.0]), (100, 100), 10.0), lambda sample: b"png")
+        link.show_camera(
+            TrackerCamera(np.array([1.0, 0.0, 0.0, 0.0]), (100, 100), 10.0), lambda sample: b"png"
+        )
         update = viz_message(spacecraft=[craft()])
         for request, answer in (
             ([b"PING"], [b"PONG"]),
@@ -397,7 +488,11 @@ def test_each_request_has_one_answer_whatever_it_asks() -> None:
             basilisk.send_multipart(request)
             asked = link.receive(PATIENCE_S * 1000)
             if asked is not None:
-                link.answer(NO_STATUS, asked.host_ns, asked.event if isinstance(asked.event, Refusal) else None)
+                link.answer(
+                    NO_STATUS,
+                    asked.host_ns,
+                    asked.event if isinstance(asked.event, Refusal) else None,
+                )
             assert basilisk.poll(PATIENCE_S * 1000), request
             assert basilisk.recv_multipart() == answer
     assert notices.counts()["unknown-request"] == 3

@@ -44,7 +44,9 @@ def planted() -> Planted:
 
 
 @pytest.fixture(scope="module")
-def by_file(tmp_path_factory: pytest.TempPathFactory, planted: Planted) -> tuple[dict[str, Any], Path, list[Figure]]:
+def by_file(
+    tmp_path_factory: pytest.TempPathFactory, planted: Planted
+) -> tuple[dict[str, Any], Path, list[Figure]]:
     """What the command says of the planted tracker's telemetry, its folder, and the figures that
     it drew.
     """
@@ -52,7 +54,9 @@ def by_file(tmp_path_factory: pytest.TempPathFactory, planted: Planted) -> tuple
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(html_pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
         ledger, telemetry = write_run(folder, planted)
-        run = run_hilstar_here("assess", ledger, telemetry, "-o", folder / "out", "--json", "--display-attitudes", "0")
+        run = run_hilstar_here(
+            "assess", ledger, telemetry, "-o", folder / "out", "--json", "--display-attitudes", "0"
+        )
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout), folder / "out", drawn
 
@@ -63,9 +67,20 @@ def budget(ledger: Path, telemetry: Path | None = None) -> tuple[dict[str, Any],
     return msgspec.json.decode(msgspec.json.encode(report.budget_of(found))), found.notes
 
 
-def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(planted: Planted, by_file) -> None:
+def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
+    planted: Planted, by_file
+) -> None:
     found, out, drawn = by_file
-    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong", "missed"]
+    keys = [
+        "bias_arcsec",
+        "fov_arcsec",
+        "pixel_arcsec",
+        "noise_arcsec",
+        "clock",
+        "availability",
+        "wrong",
+        "missed",
+    ]
     keys += ["out_of_order", "limit_arcsec"]
     assert list(found) == keys
     assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
@@ -78,14 +93,25 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(planted:
     with (out / "wrong.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["row"]) for row in rows] == lines
-    assert [float(row["t_s"]) for row in rows] == pytest.approx((planted.tau_s[planted.wild] + 5).tolist(), abs=1e-8)
+    assert [float(row["t_s"]) for row in rows] == pytest.approx(
+        (planted.tau_s[planted.wild] + 5).tolist(), abs=1e-8
+    )
     # Gaps, and wild answers: what is left of one answer each 100 ms.
     due = (planted.tau_s[-1] - planted.tau_s[0]) / 0.1 + 1
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
     text = (out / "budget.html").read_text()
-    titles = ["Budget", "Errors over the run", "What repeats with the place in the field", "Noise", "By rate"]
+    titles = [
+        "Budget",
+        "Errors over the run",
+        "What repeats with the place in the field",
+        "Noise",
+        "By rate",
+    ]
     assert re.findall("<h2>(.*?)</h2>", text)[:5] == titles
-    assert text.count("data:image/svg+xml;base64,") == len(drawn) == 3 and "prefers-color-scheme: dark" in text
+    assert (
+        text.count("data:image/svg+xml;base64,") == len(drawn) == 3
+        and "prefers-color-scheme: dark" in text
+    )
     assert not re.search(r"(src|href)=.(https?:)?//|<td>1</td>", text)
     for figure in drawn:
         assert_legible(figure)
@@ -96,7 +122,9 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(planted:
     assert (out / "slices.csv").read_text().count("rate_deg_s") == 5
 
 
-def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(tmp_path: Path, planted: Planted, by_file) -> None:
+def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(
+    tmp_path: Path, planted: Planted, by_file
+) -> None:
     own_s, epoch_ns, late_ns = planted.tau_s, 10**15, 150_000_000
     records = []
     for k, (tau_s, q) in enumerate(zip(own_s.tolist(), planted.reported.tolist(), strict=True)):
@@ -105,18 +133,34 @@ def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(tmp_path: Path,
             AnswerRecord(host_ns=middle_ns + late_ns, raw="00", t_ns=middle_ns + epoch_ns, q=tuple(q), verdict="right",
                          middle_ns=middle_ns, light_ns=None if k in planted.wild else middle_ns)
         )  # fmt: skip
-    records.insert(50, AnswerRecord(host_ns=records[50].host_ns, raw="", t_ns=records[49].t_ns, valid=False, middle_ns=0))
-    ledger = write_ledger(tmp_path / "own.mcap", planted.frames_s, planted.frames_q, records=records)
+    records.insert(
+        50,
+        AnswerRecord(
+            host_ns=records[50].host_ns, raw="", t_ns=records[49].t_ns, valid=False, middle_ns=0
+        ),
+    )
+    ledger = write_ledger(
+        tmp_path / "own.mcap", planted.frames_s, planted.frames_q, records=records
+    )
     (found, notes), expected = budget(ledger), by_file[0]
     assert not any("do not overlap" in note for note in notes)
     for key in ("bias_arcsec", "fov_arcsec", "noise_arcsec"):
         assert found[key] == pytest.approx(expected[key], rel=1e-3)
     assert found["clock"]["drift_ppm"] == pytest.approx(expected["clock"]["drift_ppm"], rel=1e-3)
     # The telemetry's clock is that of the run in the file, and its own in the ledger.
-    assert found["clock"]["offset_ms"] == pytest.approx(expected["clock"]["offset_ms"] + epoch_ns / 1e6, abs=0.01)
-    assert [each["row"] for each in found["wrong"]] == (planted.wild + 1 + (planted.wild >= 50)).tolist()
+    assert found["clock"]["offset_ms"] == pytest.approx(
+        expected["clock"]["offset_ms"] + epoch_ns / 1e6, abs=0.01
+    )
+    assert [each["row"] for each in found["wrong"]] == (
+        planted.wild + 1 + (planted.wild >= 50)
+    ).tolist()
     empty = write_ledger(tmp_path / "empty.mcap", planted.frames_s[:9], planted.frames_q[:9])
-    assert_refused(run_hilstar_here("assess", empty, "-o", tmp_path / "c"), 2, "no answers of a tracker", "give its telemetry")
+    assert_refused(
+        run_hilstar_here("assess", empty, "-o", tmp_path / "c"),
+        2,
+        "no answers of a tracker",
+        "give its telemetry",
+    )
 
 
 def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path: Path) -> None:
@@ -126,8 +170,12 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     planted = plant(scan, SIZES, np.random.default_rng(11), seconds=60.0)
     write_glass(tmp_path / "psf.fits", glass_of(stack()))
     tracker = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "transmission": None}
-    ledger, telemetry = write_run(tmp_path, planted, bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
-    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "0")
+    ledger, telemetry = write_run(
+        tmp_path, planted, bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}})
+    )
+    run = run_hilstar_here(
+        "assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "0"
+    )
     glass = json.loads(run.stdout)["glass"]
     px = glass["rms_px"]
     assert glass["stars"] > 200 and glass["centroider"] == "window"
@@ -135,28 +183,49 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     assert px["without_colour"] < px["total"]
     assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"] > 0
     assert "glass without colour,roll," in (tmp_path / "out" / "budget.csv").read_text()
-    assert glass["source"] == "PSF file" and "hold only attitudes" in (tmp_path / "out" / "budget.html").read_text()
+    assert (
+        glass["source"] == "PSF file"
+        and "hold only attitudes" in (tmp_path / "out" / "budget.html").read_text()
+    )
     # Answers that name their stars tell it by these, whatever the file says: here 0.3 px of
     # distortion and 0.1 px a mag of B-V.
-    bench = bench_file_of(tmp_path / "bench.toml", bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
+    bench = bench_file_of(
+        tmp_path / "bench.toml",
+        bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}),
+    )
     stars, camera, rng = (
         bench_stars(bench.config, tmp_path),
         tracker_camera(bench.config.tracker, tmp_path),
         np.random.default_rng(3),
     )
     records, whole = [], field_stars(stars, camera, planted.reported[0])
-    for number, (tau_s, q) in enumerate(zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True)):
+    for number, (tau_s, q) in enumerate(
+        zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True)
+    ):
         rows = whole[:0] if number % 20 else field_stars(stars, camera, np.array(q))[:20]
         u = (rows["x_px"] - SIDE_PX / 2) / (SIDE_PX / 2)
         x = rows["x_px"] + 0.3 * u**3 + 0.1 * rows["bv"] + rng.normal(0, 0.02, len(rows))
         named = [
-            (*place, 1.0, hip) for *place, hip in zip(x.tolist(), rows["y_px"].tolist(), rows["hip"].tolist(), strict=True)
+            (*place, 1.0, hip)
+            for *place, hip in zip(
+                x.tolist(), rows["y_px"].tolist(), rows["hip"].tolist(), strict=True
+            )
         ]
         at_ns = round((tau_s + 5) * 1e9)
         records.append(
-            AnswerRecord(host_ns=at_ns, raw="", t_ns=at_ns, q=tuple(q), middle_ns=at_ns, light_ns=at_ns, centroids=named)
+            AnswerRecord(
+                host_ns=at_ns,
+                raw="",
+                t_ns=at_ns,
+                q=tuple(q),
+                middle_ns=at_ns,
+                light_ns=at_ns,
+                centroids=named,
+            )
         )
-    ledger = write_ledger(tmp_path / "own.mcap", planted.frames_s, planted.frames_q, bench=bench.text, records=records)
+    ledger = write_ledger(
+        tmp_path / "own.mcap", planted.frames_s, planted.frames_q, bench=bench.text, records=records
+    )
     glass = budget(ledger)[0]["glass"]
     assert glass["source"] == "answers' stars" and glass["stars"] > 200
     px = glass["rms_px"]
@@ -170,7 +239,10 @@ def test_a_split_finds_what_was_put_together() -> None:
     rng = np.random.default_rng(5)
     places, bv = rng.uniform(0, 256, (400, 2)), rng.uniform(-0.3, 1.8, 400)
     u = (places - 127.5) / 128
-    distortion, colour = 0.3 * u * (u**2).sum(axis=1, keepdims=True), 0.1 * (bv - bv.mean())[:, None] * u
+    distortion, colour = (
+        0.3 * u * (u**2).sum(axis=1, keepdims=True),
+        0.1 * (bv - bv.mean())[:, None] * u,
+    )
     rest = rng.normal(0, 0.01, (400, 2))
     split = split_errors(places, bv, distortion + colour + rest, (256, 256))
     assert split.distortion == pytest.approx(distortion, abs=0.01)
@@ -191,7 +263,9 @@ def test_a_split_finds_what_was_put_together() -> None:
         (["1,1,0,0,0,1"], "1 valid answers, and 30 are needed"),
     ],
 )
-def test_telemetry_that_is_wrong_is_refused_in_one_line(tmp_path: Path, planted: Planted, rows: list[str], said: str) -> None:
+def test_telemetry_that_is_wrong_is_refused_in_one_line(
+    tmp_path: Path, planted: Planted, rows: list[str], said: str
+) -> None:
     ledger = write_ledger(tmp_path / "run.mcap", planted.frames_s[:50], planted.frames_q[:50])
     telemetry = tmp_path / "telemetry.csv"
     telemetry.write_text("\n".join(["t_s,qw,qx,qy,qz,valid", *rows]) + "\n")
@@ -220,7 +294,9 @@ def turned(planted: Planted, left: Rotation) -> FloatArray:
         ("another run", "at no offset of its clock"),
     ],
 )
-def test_other_conventions_and_other_runs_are_told_apart(tmp_path: Path, planted: Planted, convention: str, said: str) -> None:
+def test_other_conventions_and_other_runs_are_told_apart(
+    tmp_path: Path, planted: Planted, convention: str, said: str
+) -> None:
     ledger, _ = write_run(tmp_path, planted)
     rng = np.random.default_rng(2)
     reported = {
@@ -241,7 +317,8 @@ def test_a_ledger_without_attitudes_is_refused(tmp_path: Path, planted: Planted)
 
 def test_a_still_run_does_not_invent_a_clock(tmp_path: Path) -> None:
     ledger, telemetry = write_run(
-        tmp_path, plant(still, Sizes(fov=0.0, pixel=0.0, wild=2), np.random.default_rng(12), seconds=200.0)
+        tmp_path,
+        plant(still, Sizes(fov=0.0, pixel=0.0, wild=2), np.random.default_rng(12), seconds=200.0),
     )
     found, notes = budget(ledger, telemetry)
     assert found["clock"]["offset_ms"] is None
@@ -308,7 +385,9 @@ def test_slices_by_rate_show_where_the_noise_grows() -> None:
 
 
 REFRESH_HZ, EXPOSURE_S, NOISE_ARCSEC = 60.0, 0.1, 2.0
-BENCH_60_HZ = bench_text({"monitor": {"refresh_hz": REFRESH_HZ}, "tracker": {"exposure_s": EXPOSURE_S}})
+BENCH_60_HZ = bench_text(
+    {"monitor": {"refresh_hz": REFRESH_HZ}, "tracker": {"exposure_s": EXPOSURE_S}}
+)
 
 
 def turning(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -319,7 +398,9 @@ def turning(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return 84 + 10 * np.sin(turn / 63), 5 * np.sin(turn / 41 + 0.4), 6 * np.sin(turn / 75)
 
 
-def missing_run(folder: Path, missed: int, seed: int, seconds: float = 150.0, wild: int = 0) -> tuple[Path, Path, FloatArray]:
+def missing_run(
+    folder: Path, missed: int, seed: int, seconds: float = 150.0, wild: int = 0
+) -> tuple[Path, Path, FloatArray]:
     """A run that misses frames, and a tracker that answers exactly what was lit, with noise:
     ledger, telemetry, wild rows.
     """
@@ -333,7 +414,9 @@ def missing_run(folder: Path, missed: int, seed: int, seconds: float = 150.0, wi
     frames_s = shown / REFRESH_HZ
     frames_q = scalar_first(attitude(turning, frames_s))
     before = np.diff(shown, prepend=-1) - 1
-    ledger = write_ledger(folder / "run.mcap", frames_s, frames_q, bench=BENCH_60_HZ, missed_before=before.tolist())
+    ledger = write_ledger(
+        folder / "run.mcap", frames_s, frames_q, bench=BENCH_60_HZ, missed_before=before.tolist()
+    )
     frames = LitFrames(1e9 / REFRESH_HZ / 1000)  # so that none is forgotten
     frames._early_ns = round(0.5e9 / REFRESH_HZ)
     for number, (t_s, q) in enumerate(zip(frames_s.tolist(), frames_q, strict=True)):
@@ -350,7 +433,9 @@ def missing_run(folder: Path, missed: int, seed: int, seconds: float = 150.0, wi
     wild_rows = np.sort(rng.choice(len(at_s), wild, replace=False))
     turn = Rotation.from_rotvec(np.tile(np.radians([0.0, 3.0, 0.0]), (wild, 1)))
     if wild:
-        answers[wild_rows] = scalar_first(turn * Rotation.from_quat(np.roll(answers[wild_rows], -1, axis=1)))
+        answers[wild_rows] = scalar_first(
+            turn * Rotation.from_quat(np.roll(answers[wild_rows], -1, axis=1))
+        )
     return ledger, write_telemetry(folder / "telemetry.csv", np.array(at_s), answers), wild_rows
 
 
@@ -373,12 +458,20 @@ def test_missed_frames_are_not_the_trackers_errors(tmp_path: Path, missed: int, 
 
 def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path) -> None:
     ledger, telemetry, _ = missing_run(tmp_path, 30, 4, seconds=60.0)
-    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--display-attitudes", "0")
+    run = run_hilstar_here(
+        "assess", ledger, telemetry, "-o", tmp_path / "out", "--display-attitudes", "0"
+    )
     (line,) = [line for line in run.stdout.splitlines() if line.startswith("missed frames")]
-    said = re.search(r"(\d+) \(.*% of refresh periods, up to .* s\); (\d+) answers looked while a frame was held", line)
+    said = re.search(
+        r"(\d+) \(.*% of refresh periods, up to .* s\); (\d+) answers looked while a frame was held",
+        line,
+    )
     assert said is not None and 30 <= int(said[1]) <= 37 and int(said[2]) > 0
     assert line.split(None, 2)[2] in (tmp_path / "out" / "budget.html").read_text()
-    assert f"answers left out for held frames,,{said[2]}," in (tmp_path / "out" / "budget.csv").read_text()
+    assert (
+        f"answers left out for held frames,,{said[2]},"
+        in (tmp_path / "out" / "budget.csv").read_text()
+    )
 
 
 def test_a_run_that_missed_too_many_frames_for_a_budget_is_refused(tmp_path: Path) -> None:
@@ -405,9 +498,15 @@ def own_answers(planted: Planted, share: float, seed: int = 6) -> list[AnswerRec
 
 
 @pytest.mark.parametrize("share", [0.01, 0.05])
-def test_answers_out_of_order_give_the_budget_of_those_in_order(tmp_path: Path, planted: Planted, share: float) -> None:
-    ordered = write_ledger(tmp_path / "a.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, 0.0))
-    overtaken = write_ledger(tmp_path / "b.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, share))
+def test_answers_out_of_order_give_the_budget_of_those_in_order(
+    tmp_path: Path, planted: Planted, share: float
+) -> None:
+    ordered = write_ledger(
+        tmp_path / "a.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, 0.0)
+    )
+    overtaken = write_ledger(
+        tmp_path / "b.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, share)
+    )
     (first, _), (second, notes) = budget(ordered), budget(overtaken)
     assert first["out_of_order"] == 0
     assert second["out_of_order"] == pytest.approx(share * len(planted.tau_s), rel=0.5)
@@ -418,7 +517,9 @@ def test_answers_out_of_order_give_the_budget_of_those_in_order(tmp_path: Path, 
     assert not any("clock was set" in note for note in notes)
 
 
-def test_a_trackers_clock_that_was_set_is_said_and_arrivals_count(tmp_path: Path, planted: Planted) -> None:
+def test_a_trackers_clock_that_was_set_is_said_and_arrivals_count(
+    tmp_path: Path, planted: Planted
+) -> None:
     records = own_answers(planted, 0.02)
     for record in records[1000:]:
         record.t_ns += 5 * 10**12

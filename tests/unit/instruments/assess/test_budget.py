@@ -29,7 +29,9 @@ from tests.support.planted_tracker import (
 WITHIN, PIXEL_WITHIN = 0.10, 0.15
 DRIFT_PPM = 1.0
 ISSUE = Sizes()
-OTHER = Sizes(bias=50.0, fov=5.0, pixel=1.5, noise=2.0, drift_ppm=-60.0, offset_s=123_456.7, wild=15)
+OTHER = Sizes(
+    bias=50.0, fov=5.0, pixel=1.5, noise=2.0, drift_ppm=-60.0, offset_s=123_456.7, wild=15
+)
 
 
 def assessed(planted: Planted) -> DecomposedRun:
@@ -46,7 +48,9 @@ def test_the_planted_tracker_of_the_issue_is_recovered() -> None:
     check_sizes(found, planted, ISSUE)
 
 
-def test_a_lens_like_field_error_and_a_pixel_error_of_passing_stars_are_recovered_on_a_clock_of_its_own() -> None:
+def test_a_lens_like_field_error_and_a_pixel_error_of_passing_stars_are_recovered_on_a_clock_of_its_own() -> (
+    None
+):
     planted = plant(
         scan,
         OTHER,
@@ -61,7 +65,9 @@ def check_sizes(found: DecomposedRun, planted: Planted, sizes: Sizes) -> None:
     fov = np.sqrt((planted.fov[0] ** 2 + planted.fov[1] ** 2) / 2), planted.fov[2]
     for axis, scale, field in (("cross", 1.0, fov[0]), ("roll", ROLL, fov[1])):
         assert getattr(found.fov_arcsec, axis) == pytest.approx(field, rel=WITHIN)
-        assert getattr(found.pixel_arcsec, axis) == pytest.approx(scale * sizes.pixel, rel=PIXEL_WITHIN)
+        assert getattr(found.pixel_arcsec, axis) == pytest.approx(
+            scale * sizes.pixel, rel=PIXEL_WITHIN
+        )
         assert getattr(found.noise_arcsec, axis) == pytest.approx(scale * sizes.noise, rel=WITHIN)
     # The run does not see whole periods: the field-of-view error has a mean of its own, a few
     # tenths of its rms.
@@ -93,7 +99,9 @@ def test_a_constant_slew_tells_the_drift_and_not_the_offset() -> None:
 
 
 def test_a_still_run_tells_bias_and_noise_only() -> None:
-    found = assessed(plant(still, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(5), seconds=300.0))
+    found = assessed(
+        plant(still, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(5), seconds=300.0)
+    )
     assert not found.clock.offset_told
     assert not found.clock.drift_told
     assert found.fov_arcsec.cross is None
@@ -128,4 +136,6 @@ def test_few_answers_and_wild_ones_are_refused() -> None:
         assess_cases(planted.frames_q[:20], planted.frames_q[:20], SCALE, rng)
     wild = rng.normal(size=(100, 4))
     with pytest.raises(InputError, match="wild"):
-        assess_cases(planted.frames_q[:100], wild / np.linalg.norm(wild, axis=1, keepdims=True), SCALE, rng)
+        assess_cases(
+            planted.frames_q[:100], wild / np.linalg.norm(wild, axis=1, keepdims=True), SCALE, rng
+        )

@@ -28,7 +28,10 @@ def saws(place):
 def steps(place):
     """Off one way over a part of each pixel, the other way over the rest."""
     x, y = place.T % 1
-    error = np.stack([np.where(x < 0.4, 1.0, -1.0), np.where((y + 0.3) % 1 < 0.5, 1.0, -1.0), saw(x + 0.1)], axis=1)
+    error = np.stack(
+        [np.where(x < 0.4, 1.0, -1.0), np.where((y + 0.3) % 1 < 0.5, 1.0, -1.0), saw(x + 0.1)],
+        axis=1,
+    )
     return (error - error.mean(axis=0)) / error.std(axis=0)
 
 

@@ -23,7 +23,9 @@ from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.alignment import align, groups_of, remarks_of
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs
 
-CAMERA = monitor_camera((1920, 1080), 57.65, 350.0, normalise(np.array([1.0, 0.001, -0.002, 0.003])))
+CAMERA = monitor_camera(
+    (1920, 1080), 57.65, 350.0, normalise(np.array([1.0, 0.001, -0.002, 0.003]))
+)
 PLANTED_ARCSEC = np.array([820.0, -310.0, 2400.0])
 NOISE_ARCSEC = np.array([5.0, 5.0, 40.0])
 # A mean of n is off by noise / sqrt(n); 1 in 10^4 is further off than four of these in any of three
@@ -36,7 +38,9 @@ def commanded_of(rng: np.random.Generator, count: int) -> np.ndarray:
     return normalise(rng.normal(size=(count, 4)))
 
 
-def turned_by(rng: np.random.Generator, commanded: np.ndarray, noise_arcsec: np.ndarray = NOISE_ARCSEC) -> np.ndarray:
+def turned_by(
+    rng: np.random.Generator, commanded: np.ndarray, noise_arcsec: np.ndarray = NOISE_ARCSEC
+) -> np.ndarray:
     """What a tracker with noise reports: the planted rotation after the commanded attitude."""
     noise = rng.normal(size=(len(commanded), 3)) * noise_arcsec / ARCSEC_PER_RAD
     planted = from_rotation_vector(PLANTED_ARCSEC / ARCSEC_PER_RAD)
@@ -44,18 +48,26 @@ def turned_by(rng: np.random.Generator, commanded: np.ndarray, noise_arcsec: np.
 
 
 def pairs_of(commanded: np.ndarray, reported: np.ndarray, rate: np.ndarray | None = None) -> Pairs:
-    return Pairs(Path("pairs.csv"), np.arange(len(commanded)) + 2, commanded, reported, rate_rad_s=rate)
+    return Pairs(
+        Path("pairs.csv"), np.arange(len(commanded)) + 2, commanded, reported, rate_rad_s=rate
+    )
 
 
 def test_a_rotation_vector_comes_back(rng):
     vectors = rng.normal(size=(500, 3)) * 10.0 ** rng.uniform(-12, 0, (500, 1))
     back = to_rotation_vector(from_rotation_vectors(vectors))
     assert np.abs(back - vectors).max() < 1e-15 + 1e-14 * np.linalg.norm(vectors, axis=1).max()
-    assert np.allclose(from_rotation_vectors(vectors)[0], from_rotation_vector(vectors[0]), atol=1e-16)
+    assert np.allclose(
+        from_rotation_vectors(vectors)[0], from_rotation_vector(vectors[0]), atol=1e-16
+    )
 
 
-@pytest.mark.parametrize(("count", "wild_share"), [(3, 0), (30, 0.1), (400, 0.01), (400, 0.1), (400, 0.4)])
-def test_the_planted_rotation_is_found_within_its_own_sigma_whatever_is_wild(rng, count, wild_share):
+@pytest.mark.parametrize(
+    ("count", "wild_share"), [(3, 0), (30, 0.1), (400, 0.01), (400, 0.1), (400, 0.4)]
+)
+def test_the_planted_rotation_is_found_within_its_own_sigma_whatever_is_wild(
+    rng, count, wild_share
+):
     commanded = commanded_of(rng, count)
     reported = turned_by(rng, commanded)
     wild = np.sort(rng.permutation(count)[: int(wild_share * count)])
@@ -63,8 +75,12 @@ def test_the_planted_rotation_is_found_within_its_own_sigma_whatever_is_wild(rng
     reported *= rng.choice([-1.0, 1.0], (count, 1))  # q and -q are one attitude
     found = align(pairs_of(commanded, reported), CAMERA)
     good = count - len(wild)
-    assert np.abs(np.array(found.rotation_arcsec) - PLANTED_ARCSEC).max() < SIGMAS * NOISE_ARCSEC[2] / np.sqrt(good)
-    assert np.abs(np.array(found.rotation_arcsec) - PLANTED_ARCSEC)[:2].max() < SIGMAS * NOISE_ARCSEC[0] / np.sqrt(good)
+    assert np.abs(np.array(found.rotation_arcsec) - PLANTED_ARCSEC).max() < SIGMAS * NOISE_ARCSEC[
+        2
+    ] / np.sqrt(good)
+    assert np.abs(np.array(found.rotation_arcsec) - PLANTED_ARCSEC)[
+        :2
+    ].max() < SIGMAS * NOISE_ARCSEC[0] / np.sqrt(good)
     assert set(wild + 2) <= set(found.wild)
     assert len(found.wild) == len(wild)
     if count >= 30:
@@ -81,7 +97,10 @@ def test_wild_ones_a_few_arcminutes_off_are_named_and_change_nothing(rng):
     reported[5:200:10] = multiply(off, reported[5:200:10])
     found = align(pairs_of(commanded, reported), CAMERA)
     assert found.wild == tuple(range(7, 202, 10))
-    assert np.abs(np.subtract(found.rotation_arcsec, clean.rotation_arcsec))[:2].max() < NOISE_ARCSEC[0] / 4
+    assert (
+        np.abs(np.subtract(found.rotation_arcsec, clean.rotation_arcsec))[:2].max()
+        < NOISE_ARCSEC[0] / 4
+    )
 
 
 def test_the_sigma_covers_the_error(rng):
@@ -99,7 +118,9 @@ def test_the_sigma_covers_the_error(rng):
 def test_one_attitude_determines_the_rotation_and_the_summary_says_what_it_cannot_tell(rng):
     commanded = np.repeat(commanded_of(rng, 1), 20, axis=0)
     found = align(pairs_of(commanded, turned_by(rng, commanded)), CAMERA)
-    assert np.abs(np.subtract(found.rotation_arcsec, PLANTED_ARCSEC) / NOISE_ARCSEC).max() < SIGMAS / np.sqrt(20)
+    assert np.abs(
+        np.subtract(found.rotation_arcsec, PLANTED_ARCSEC) / NOISE_ARCSEC
+    ).max() < SIGMAS / np.sqrt(20)
     assert any("one attitude" in note for note in remarks_of(found))
 
 
@@ -115,7 +136,9 @@ def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
     assert found.residual.repeat.cross == pytest.approx(5.0, rel=0.2)
     assert found.residual.unexplained.cross == pytest.approx(30.0, rel=0.35)
     assert found.residual.unexplained.roll == pytest.approx(100.0, rel=0.35)
-    assert any("a rotation does not explain" in note and "dots" in note for note in remarks_of(found))
+    assert any(
+        "a rotation does not explain" in note and "dots" in note for note in remarks_of(found)
+    )
     assert not found.residual.causes
     assert min(found.sigma_arcsec) > 30 / np.sqrt(40) / 1.5  # the attitudes count, not the pairs
 
@@ -132,12 +155,16 @@ def test_a_reference_frame_of_date_is_named(rng):
     commanded = commanded_of(rng, 60)
     precession = from_rotation_vector(np.array([0.0, 520.0, 1190.0]) / ARCSEC_PER_RAD)
     found = align(pairs_of(commanded, multiply(turned_by(rng, commanded), precession)), CAMERA)
-    assert any("reference frame" in cause and "1.3e+03 arcsec" in cause for cause in found.residual.causes)
+    assert any(
+        "reference frame" in cause and "1.3e+03 arcsec" in cause for cause in found.residual.causes
+    )
 
 
 def test_a_drift_is_named(rng):
     commanded = commanded_of(rng, 60)
-    drift = from_rotation_vectors(np.linspace(-0.5, 0.5, 60)[:, None] * np.array([200.0, 0, 0]) / ARCSEC_PER_RAD)
+    drift = from_rotation_vectors(
+        np.linspace(-0.5, 0.5, 60)[:, None] * np.array([200.0, 0, 0]) / ARCSEC_PER_RAD
+    )
     found = align(pairs_of(commanded, multiply(drift, turned_by(rng, commanded))), CAMERA)
     assert any("drift" in cause for cause in found.residual.causes)
 
@@ -198,9 +225,9 @@ def test_a_tracker_turned_by_half_a_turn_is_no_mistake(rng):
     commanded = commanded_of(rng, 40)
     half = from_rotation_vector(np.array([0.0, 0.0, np.pi]))
     found = align(pairs_of(commanded, multiply(half, commanded)), CAMERA)
-    assert found.rotation_arcsec[2] == pytest.approx(np.pi * ARCSEC_PER_RAD, abs=EXACT_ARCSEC) or found.rotation_arcsec[
-        2
-    ] == pytest.approx(-np.pi * ARCSEC_PER_RAD, abs=EXACT_ARCSEC)
+    assert found.rotation_arcsec[2] == pytest.approx(
+        np.pi * ARCSEC_PER_RAD, abs=EXACT_ARCSEC
+    ) or found.rotation_arcsec[2] == pytest.approx(-np.pi * ARCSEC_PER_RAD, abs=EXACT_ARCSEC)
 
 
 def test_two_pairs_are_too_few(rng):
@@ -218,6 +245,12 @@ def test_repeats_are_of_one_attitude_whatever_their_sign(rng):
 
 def test_telemetry_columns_are_named_in_the_cure(rng):
     commanded = commanded_of(rng, 10)
-    pairs = Pairs(Path("t.csv"), np.arange(10), commanded, conjugate(turned_by(rng, commanded)), names=COMMANDED)
+    pairs = Pairs(
+        Path("t.csv"),
+        np.arange(10),
+        commanded,
+        conjugate(turned_by(rng, commanded)),
+        names=COMMANDED,
+    )
     with pytest.raises(InputError, match="write qw,-qx,-qy,-qz"):
         align(pairs, CAMERA)

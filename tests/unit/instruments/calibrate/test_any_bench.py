@@ -19,16 +19,37 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.first_light import focus as focuses
 from hilstar.instruments.calibrate.first_light import session as sessions
-from hilstar.instruments.calibrate.first_light.context import DarkSubtracted, FittedFigure, StepContext, StepOutcome
+from hilstar.instruments.calibrate.first_light.context import (
+    DarkSubtracted,
+    FittedFigure,
+    StepContext,
+    StepOutcome,
+)
 from hilstar.instruments.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.instruments.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource
 from hilstar.instruments.calibrate.first_light.photometry import rounds_alike
 from hilstar.instruments.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.instruments.calibrate.first_light.session import FirstLightSession, Progress
-from hilstar.instruments.calibrate.first_light.stars import P95_OF_TWO, frames_for, noise_words, place_reasons
-from hilstar.instruments.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
-from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
+from hilstar.instruments.calibrate.first_light.stars import (
+    P95_OF_TWO,
+    frames_for,
+    noise_words,
+    place_reasons,
+)
+from hilstar.instruments.calibrate.geometric.calibration import (
+    calibrate_seen,
+    nominal_of,
+    rough_geometry,
+    seen_screen_of,
+)
+from hilstar.instruments.calibrate.geometric.dots import (
+    DOT_PX,
+    SeenScreen,
+    joined,
+    lit_for,
+    plan_seen_dots,
+)
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.calibrate.scale import StarReading, scale_of
 from hilstar.instruments.certify.readings import dot_settings
@@ -71,14 +92,19 @@ def true_geometry(file, turn_deg):
     q = multiply(from_rotation_vector(np.radians([0.0, 0.0, turn_deg])), q)
     lens = Lens((0.05, 0.0, 0.0), (0.0, 0.0), (math.radians(3.0), math.radians(-3.0)))
     monitor = replace(
-        nominal.monitor, focal_length_px=1.015 * nominal.monitor.focal_length_px, cam_to_image=to_matrix(q), lens=lens
+        nominal.monitor,
+        focal_length_px=1.015 * nominal.monitor.focal_length_px,
+        cam_to_image=to_matrix(q),
+        lens=lens,
     )
     return SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=0.5)
 
 
 def observed(plan, real, rng, first=0):
     """Centroids that the tracker has of a plan's dots, with their noise."""
-    u, v = real.tracker.project(real.monitor.rays(plan.x_px, plan.y_px) @ real.tracker.cam_to_image.T)
+    u, v = real.tracker.project(
+        real.monitor.rays(plan.x_px, plan.y_px) @ real.tracker.cam_to_image.T
+    )
     width, height = real.tracker.resolution_px
     inside = (u > 3) & (u < width - 4) & (v > 3) & (v < height - 4)
     dot, frame = np.nonzero(plan.lit & inside[:, None])
@@ -99,14 +125,21 @@ def test_dots_stand_where_the_tracker_sees_the_screen_and_the_fit_is_right(tmp_p
     assert rough.shows(first.x_px, first.y_px).mean() > 0.9
     second = plan_seen_dots(rough, 16, lit_for(rough), rng)
     assert real.shows(second.x_px, second.y_px).mean() > 0.95
-    found = calibrate_seen(file, joined(first, second), seen.joined(observed(second, real, rng, 8)), tracker_is_ideal=True)
+    found = calibrate_seen(
+        file,
+        joined(first, second),
+        seen.joined(observed(second, real, rng, 8)),
+        tracker_is_ideal=True,
+    )
     assert found.recognised > 0.95 * len(found.plan)
     x_px, y_px = second.x_px, second.y_px
     mine, its = (camera.rays(x_px, y_px) for camera in (found.fit.geometry.monitor, real.monitor))
     mine, its = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (mine, its))
     off_arcsec = np.linalg.norm(np.cross(mine, its), axis=1) * ARCSEC_PER_RAD
     noise_arcsec = NOISE_PX * ARCSEC_PER_RAD / real.tracker.focal_length_px
-    assert np.sqrt((off_arcsec**2).mean()) < PLACES_SIGMAS * noise_arcsec * math.sqrt(2 * 13 / (2 * len(found.data)))
+    assert np.sqrt((off_arcsec**2).mean()) < PLACES_SIGMAS * noise_arcsec * math.sqrt(
+        2 * 13 / (2 * len(found.data))
+    )
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 3.0])
@@ -114,7 +147,12 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
     screen = monitor_camera((1920, 1080), 57.65, 350, np.array([1.0, 0.0, 0.0, 0.0]))
     side_px = 1024
     focal_px = screen.focal_length_px * side_px / math.sqrt(share * 1920 * 1080)
-    tracker = replace(screen, resolution_px=(side_px, side_px), focal_length_px=focal_px, principal_point_px=(511.5, 511.5))
+    tracker = replace(
+        screen,
+        resolution_px=(side_px, side_px),
+        focal_length_px=focal_px,
+        principal_point_px=(511.5, 511.5),
+    )
     seen = SeenScreen(screen, tracker, is_sure=True, psf_sigma_px=0.5)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
     assert len(plan) >= 21
@@ -125,7 +163,10 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
 
 
 def test_too_few_dots_are_laid_to_who_asked_for_them(tmp_path):
-    with pytest.raises(InputError, match=r"--dots 1: 20 frames then hold 2 dots, and 12 are needed; write more --dots"):
+    with pytest.raises(
+        InputError,
+        match=r"--dots 1: 20 frames then hold 2 dots, and 12 are needed; write more --dots",
+    ):
         plan_seen_dots(seen_screen_of(large_screen(tmp_path)), 20, 1, np.random.default_rng(0))
 
 
@@ -150,13 +191,18 @@ def dots_image(sigma_px, side_px, turn_deg, rng):
         for row in np.linspace(50, 450, 5).astype(int):
             off_x, off_y = rng.uniform(-0.5, 0.5, 2)
             across, down = (
-                np.diff(ndtr((edges - off - part[:, None]) / sigma_px), axis=1) for off, part in ((off_x, x), (off_y, y))
+                np.diff(ndtr((edges - off - part[:, None]) / sigma_px), axis=1)
+                for off, part in ((off_x, x), (off_y, y))
             )
-            image[row - 30 : row + 31, column - 30 : column + 31] += 30_000 * down.T @ across / len(x)
+            image[row - 30 : row + 31, column - 30 : column + 31] += (
+                30_000 * down.T @ across / len(x)
+            )
     return image
 
 
-@pytest.mark.parametrize(("sigma_px", "side_px", "turn_deg"), [(0.55, 12.6, 0.0), (0.55, 12.6, 30.0), (3.0, 1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("sigma_px", "side_px", "turn_deg"), [(0.55, 12.6, 0.0), (0.55, 12.6, 30.0), (3.0, 1.0, 0.0)]
+)
 def test_psf_and_pixel_are_fitted_together(sigma_px, side_px, turn_deg):
     """A monitor pixel of 4.2 tracker px made of a PSF of 0.55 px "0.150, error 0.0": the end of
     the model.
@@ -175,7 +221,10 @@ def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
     turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
     monitor = monitor_camera((640, 480), 57.65, 30, turned)
     seen = SeenScreen(
-        monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True, psf_sigma_px=0.6
+        monitor,
+        monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])),
+        is_sure=True,
+        psf_sigma_px=0.6,
     )
     assert seen.turn_deg == pytest.approx(-turn_deg, abs=0.01)
     side_px = DOT_PX * seen.tracker_px_a_monitor_px
@@ -190,7 +239,9 @@ def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
     instead of 0.55.
     """
     turn = np.array([1.0, 0.0, 0.0, 0.0])
-    geometry = BenchGeometry(monitor_camera((64, 64), 233.1, 500, turn), monitor_camera((256, 256), 5.5, 50, turn))
+    geometry = BenchGeometry(
+        monitor_camera((64, 64), 233.1, 500, turn), monitor_camera((256, 256), 5.5, 50, turn)
+    )
     light = np.zeros((64, 64))
     for row in range(10, 60, 12):
         for column in range(10, 60, 12):
@@ -203,7 +254,9 @@ def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
 
 
 def test_no_step_is_done_with_a_figure_at_an_end_of_its_model():
-    outcome = StepOutcome("done", "PSF sigma 0.1 px", fitted=(FittedFigure("PSF sigma", 0.1, 0.1, 12.0),))
+    outcome = StepOutcome(
+        "done", "PSF sigma 0.1 px", fitted=(FittedFigure("PSF sigma", 0.1, 0.1, 12.0),)
+    )
     checked = outcome.checked()
     assert checked.verdict == "failed"
     assert "PSF sigma 0.1 is at an end of its model (0.1 to 12)" in checked.line
@@ -227,7 +280,9 @@ def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypat
     assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
 
 
-@pytest.mark.parametrize(("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")])
+@pytest.mark.parametrize(
+    ("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")]
+)
 def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
     """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
     runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
@@ -278,7 +333,9 @@ def test_a_focus_that_has_not_settled_is_not_done(tmp_path, monkeypatch):
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
 def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
     turn = np.array([1.0, 0.0, 0.0, 0.0])
-    geometry = BenchGeometry(monitor_camera((640, 480), 57.65, 120, turn), monitor_camera((400, 400), 13, 25, turn))
+    geometry = BenchGeometry(
+        monitor_camera((640, 480), 57.65, 120, turn), monitor_camera((400, 400), 13, 25, turn)
+    )
     figure, image = figure_for(geometry), np.random.default_rng(1).normal(0, 1.0, (400, 400))
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
@@ -298,7 +355,11 @@ def wide_star(spot, dn, noise_dn, rng):
     edges = np.arange(242) - 0.5
     across, down = (np.diff(ndtr((edges - place) / spot.sigma_px[0])) for place in (x_px, y_px))
     light = dn * np.outer(down, across)
-    image = light + rng.normal(0, noise_dn, light.shape) + rng.normal(0, 1, light.shape) * np.sqrt(light / spot.gain_e_per_dn)
+    image = (
+        light
+        + rng.normal(0, noise_dn, light.shape)
+        + rng.normal(0, 1, light.shape) * np.sqrt(light / spot.gain_e_per_dn)
+    )
     return image, x_px, y_px
 
 
@@ -306,7 +367,12 @@ def test_the_noise_of_wide_stars_is_known_in_place_and_light():
     """A window of 9 px lost 0.26 mag of stars of 2.5 px, and took their noise for an error of
     the geometry.
     """
-    spot, rng, dn, noise_dn = StarSpot((4.0, 4.0), 2.0, 0.0), np.random.default_rng(4), 20_000.0, 3.0
+    spot, rng, dn, noise_dn = (
+        StarSpot((4.0, 4.0), 2.0, 0.0),
+        np.random.default_rng(4),
+        20_000.0,
+        3.0,
+    )
     off_px, light = [], []
     for _ in range(60):
         image, x_px, y_px = wide_star(spot, dn, noise_dn, rng)
@@ -359,7 +425,9 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
     assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
 
 
-@pytest.mark.parametrize(("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")])
+@pytest.mark.parametrize(
+    ("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")]
+)
 def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
     limit_px = 0.1
     (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
@@ -385,7 +453,8 @@ def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
     for place_x in np.arange(12, 110, 12) + 0.3:
         for place_y in np.arange(12, 110, 12) - 0.2:
             across, down = (
-                np.diff(ndtr((edges - place - steps[:, None]) / sigma_px), axis=1).mean(axis=0) for place in (place_x, place_y)
+                np.diff(ndtr((edges - place - steps[:, None]) / sigma_px), axis=1).mean(axis=0)
+                for place in (place_x, place_y)
             )
             image += 30_000 * np.outer(down, across)
     found = sharpness(image, 2.7)
@@ -412,7 +481,8 @@ def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
     light, off_px = 1000 * side_px**2, []
     for place_x, place_y in 40 + rng.uniform(-0.5, 0.5, (10, 2)):
         across, down = (
-            np.diff(ndtr((edges - place - steps[:, None]) / 0.5), axis=1).mean(axis=0) for place in (place_x, place_y)
+            np.diff(ndtr((edges - place - steps[:, None]) / 0.5), axis=1).mean(axis=0)
+            for place in (place_x, place_y)
         )
         image = rng.normal(0, 3.0, (80, 80)) + light * np.outer(down, across)
         found = find_stars(image, dot_settings(file), noisiest_background(image))
@@ -425,7 +495,9 @@ def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
     """Dots are seen through the collimator: with a blur that the file states, `focus` asked to
     turn the focus.
     """
-    (tmp_path / "bench.toml").write_text(bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}}))
+    (tmp_path / "bench.toml").write_text(
+        bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}})
+    )
     file = read_bench_file(tmp_path / "bench.toml")
     context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)
     ratio = seen_screen_of(file).tracker_px_a_monitor_px

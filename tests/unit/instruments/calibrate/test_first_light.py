@@ -44,8 +44,15 @@ from tests.support.benches import bench_text
 from tests.support.damage import NO_JSON
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
-MOUNTINGS = [ScreenMounting(x, y, turn) for x in (False, True) for y in (False, True) for turn in (0, 90, 180, 270)]
-GEOMETRY = BenchGeometry(monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN))
+MOUNTINGS = [
+    ScreenMounting(x, y, turn)
+    for x in (False, True)
+    for y in (False, True)
+    for turn in (0, 90, 180, 270)
+]
+GEOMETRY = BenchGeometry(
+    monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN)
+)
 # The model of a dot and the image here are the same mathematics in two forms; the noise of 40 dots
 # is what is left.
 SIGMA_PX = 0.02
@@ -100,11 +107,24 @@ def test_the_figure_tells_each_way_round_and_the_mounting_that_mends_it(way):
 @pytest.mark.parametrize("key", keys_of_ways())
 def test_a_key_says_where_the_squares_of_its_way_round_are(key):
     way = keys_of_ways()[key]
-    corner, right, below = (np.array(way).reshape(2, 2) @ place for place in ([-1, -1], [1, -1], [-1, 1]))
+    corner, right, below = (
+        np.array(way).reshape(2, 2) @ place for place in ([-1, -1], [1, -1], [-1, 1])
+    )
     words = look_of(way)
-    assert f"largest square {'top' if corner[1] < 0 else 'bottom'} {'left' if corner[0] < 0 else 'right'}," in words
-    sides = {(2, 0): "to its right", (-2, 0): "to its left", (0, 2): "below it", (0, -2): "above it"}
-    assert f"next one {sides[tuple(right - corner)]}, the smallest {sides[tuple(below - corner)]}" in words
+    assert (
+        f"largest square {'top' if corner[1] < 0 else 'bottom'} {'left' if corner[0] < 0 else 'right'},"
+        in words
+    )
+    sides = {
+        (2, 0): "to its right",
+        (-2, 0): "to its left",
+        (0, 2): "below it",
+        (0, -2): "above it",
+    }
+    assert (
+        f"next one {sides[tuple(right - corner)]}, the smallest {sides[tuple(below - corner)]}"
+        in words
+    )
 
 
 def test_a_detector_that_is_clipped_at_zero_beyond_the_screen_s_glow_sees_the_figure():
@@ -134,7 +154,10 @@ def test_an_upright_figure_leaves_the_mounting_alone():
         assert corrected(mounting, (1, 0, 0, 1)) == mounting
 
 
-@pytest.mark.parametrize(("image", "words"), [("nothing", "squares"), ("alike", "told apart"), ("small", "times as large")])
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [("nothing", "squares"), ("alike", "told apart"), ("small", "times as large")],
+)
 def test_an_image_without_the_figure_is_refused(image, words):
     figure = figure_for(GEOMETRY)
     data = np.random.default_rng(1).normal(0, 1.0, (400, 400))
@@ -153,11 +176,14 @@ def test_sharpness_is_the_sigma_of_the_psf(sigma_px):
     image, side = rng.normal(0, 3.0, (400, 400)), 2.77
     steps = (np.arange(31) + 0.5) / 31 * side - side / 2
     pixels = np.arange(400)
-    for x, y in np.stack(np.meshgrid(*[np.linspace(40, 360, 7)] * 2), -1).reshape(-1, 2) + rng.uniform(-0.5, 0.5, (49, 2)):
+    for x, y in np.stack(np.meshgrid(*[np.linspace(40, 360, 7)] * 2), -1).reshape(
+        -1, 2
+    ) + rng.uniform(-0.5, 0.5, (49, 2)):
         across, down = (
-            (ndtr((pixels[:, None] + 0.5 - c - steps) / sigma_px) - ndtr((pixels[:, None] - 0.5 - c - steps) / sigma_px)).mean(
-                1
-            )
+            (
+                ndtr((pixels[:, None] + 0.5 - c - steps) / sigma_px)
+                - ndtr((pixels[:, None] - 0.5 - c - steps) / sigma_px)
+            ).mean(1)
             for c in (x, y)
         )
         image += 30_000 * np.outer(down, across)
@@ -167,7 +193,9 @@ def test_sharpness_is_the_sigma_of_the_psf(sigma_px):
 def grabbed(tmp_path, command):
     (tmp_path / "bench.toml").write_text(bench_text())
     pattern = Pattern("figure_000", black((320, 240)))
-    return GrabCommand(command).look(read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025)
+    return GrabCommand(command).look(
+        read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025
+    )
 
 
 def test_a_command_gets_the_pattern_and_writes_the_image(tmp_path):
@@ -187,7 +215,10 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}} {{output}}", "no camera on bus 3"),
+        (
+            f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}} {{output}}",
+            "no camera on bus 3",
+        ),
         ("true {pattern} {output}", "wrote no image"),
         ("sh -c 'yes {pattern} {output} >&2'", "printed more than 4 MB"),
         ("no-such-command-here {pattern} {output}", "cannot be run"),
@@ -228,14 +259,20 @@ class Counted:
             path = context.session / f"{name}.txt"
             path.write_text(name)
             now = context.file.config.monitor.flip_x
-            changes = (KeyChange(table="monitor", key="flip_x", before=now, after=True),) if name == "first" and not now else ()
+            changes = (
+                (KeyChange(table="monitor", key="flip_x", before=now, after=True),)
+                if name == "first" and not now
+                else ()
+            )
             return StepOutcome("done", "found", files=(path,), changes=changes)
 
         return run
 
     def go(self, folder, again=()):
         self.runs.clear()
-        session = FirstLightSession(folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0)
+        session = FirstLightSession(
+            folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0
+        )
         return session.run(frozenset(again), lambda line: None), session
 
 
@@ -264,13 +301,21 @@ def test_steps_run_once_and_again_when_asked_or_when_what_they_depend_on_changes
 
 
 def test_a_session_knows_the_beat_by_what_it_has_seen_of_the_display(counted, tmp_path):
-    tables = {"tracker": {"exposure_s": 0.04}, "collimator": {"focal_length_mm": 350}, "render": {"tolerance_px": 0.02}}
+    tables = {
+        "tracker": {"exposure_s": 0.04},
+        "collimator": {"focal_length_mm": 350},
+        "render": {"tolerance_px": 0.02},
+    }
     (tmp_path / "bench.toml").write_text(bench_text(tables))
     session = counted.go(tmp_path)[1]
     assert session.as_file().beat.refreshes_per_exposure == pytest.approx(2.4)
     assert session.as_file().beat.proposal.refresh_hz == pytest.approx(50)
-    seen = StepOutcome("done", "a frame every 13.4 ms", {"refresh_hz": 74.6, "modes_hz": "50 60 75"})
-    session.records["display"] = structs.replace(session.records["first"], name="display", figures=dict(seen.figures))
+    seen = StepOutcome(
+        "done", "a frame every 13.4 ms", {"refresh_hz": 74.6, "modes_hz": "50 60 75"}
+    )
+    session.records["display"] = structs.replace(
+        session.records["first"], name="display", figures=dict(seen.figures)
+    )
     assert session.beat().refreshes_per_exposure == pytest.approx(2.984)
     assert not session.beat().matters
     session.records["display"] = structs.replace(
@@ -308,14 +353,18 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
             taken.append((path.name, path.stat().st_mtime_ns))
         return StepOutcome("done", "found")
 
-    monkeypatch.setattr(sessions, "STEPS", (SessionStep("", "", "", name="frames", tables=("monitor",)),))
+    monkeypatch.setattr(
+        sessions, "STEPS", (SessionStep("", "", "", name="frames", tables=("monitor",)),)
+    )
     monkeypatch.setattr(sessions, "RUNS", {"frames": frames})
     monkeypatch.setattr(sessions, "NAMES", ("frames",))
     grab = f"sh -c 'cp {{pattern}} {{output}}; case {{output}} in *frame_2*) test -e {tmp_path / 'mended'};; esac'"
 
     def go(*again):
         taken.clear()
-        session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), GrabCommand(grab), 0)
+        session = FirstLightSession(
+            tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), GrabCommand(grab), 0
+        )
         code = session.run(frozenset(again), lambda line: None)
         return code, session.records["frames"].verdict, dict(taken)
 
@@ -332,7 +381,11 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
 def test_what_a_killed_session_was_writing_is_cleared_when_it_goes_on(counted, tmp_path):
     images = tmp_path / "s" / "images" / "geometry-1"
     images.mkdir(parents=True)
-    litter = [".frame_005.10368.part.png", ".frame_005.0123456789abcdef.part.png", ".session.fedcba9876543210.part.json"]
+    litter = [
+        ".frame_005.10368.part.png",
+        ".frame_005.0123456789abcdef.part.png",
+        ".session.fedcba9876543210.part.json",
+    ]
     own = [".notes.part.png", "frame_004.png", "part.10.part.png"]
     for name in (*litter, *own):
         (images / name).touch()

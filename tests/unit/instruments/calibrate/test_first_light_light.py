@@ -42,7 +42,9 @@ from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
-GEOMETRY = BenchGeometry(monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN))
+GEOMETRY = BenchGeometry(
+    monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN)
+)
 RATIO = GEOMETRY.tracker.focal_length_px / GEOMETRY.monitor.focal_length_px
 FLOOR_DN, GLOW_DN = 30.0, 4.0
 FULL_DN = 70_000 / 24  # the small bench's full well by its gain
@@ -70,7 +72,11 @@ def test_the_peak_of_a_lattice_is_that_of_its_light_drawn_pixel_by_pixel():
             place = phase + RATIO * period * np.arange(-40, 41)[:, None, None]
             inner = (np.arange(9) + 0.5) / 9 * RATIO - RATIO / 2
             edge = x[:, None] - place - inner
-            along = (ndtr((edge + 0.5) / SIGMA_PX) - ndtr((edge - 0.5) / SIGMA_PX)).mean(axis=2).sum(axis=0)
+            along = (
+                (ndtr((edge + 0.5) / SIGMA_PX) - ndtr((edge - 0.5) / SIGMA_PX))
+                .mean(axis=2)
+                .sum(axis=0)
+            )
             largest = max(largest, float(along[30:-30].max()) ** 2)
         # The square counts as a Gaussian of its own variance there: 6 % of the peak at most, of a
         # range used to half.
@@ -97,7 +103,10 @@ class Camera(ImageSource):
         self.taken.append((pattern.name, exposure_s))
         rows, columns = np.nonzero(pattern.codes)
         image = np.random.default_rng(len(self.taken)).normal(FLOOR_DN + GLOW_DN, 1.5, (400, 400))
-        x, y = (np.rint(part).astype(int) for part in GEOMETRY.to_tracker(columns.astype(float), rows.astype(float)))
+        x, y = (
+            np.rint(part).astype(int)
+            for part in GEOMETRY.to_tracker(columns.astype(float), rows.astype(float))
+        )
         dense = 1 + self.neighbours * (len(rows) > 10_000)
         dn = self.white * exposure_s * dense * self.light[pattern.codes[rows, columns]]
         image += np.bincount(y * 400 + x, dn, minlength=image.size).reshape(image.shape)
@@ -110,7 +119,9 @@ class Camera(ImageSource):
 
 def read(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    context = StepContext(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96)
+    context = StepContext(
+        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96
+    )
     photometer = Photometer(context, SIGMA_PX, Assumed({"w": srgb_response(10).light}, 0.0))
     return photometer.read([Patch(code, "w") for code in codes])
 
@@ -122,7 +133,9 @@ def test_light_is_read_on_lattices_and_black_against_a_monitor_that_is_off(tmp_p
     codes = np.array([patch.code for patch in found.patches])
     lit = codes > 0
     # 2000 pixels at the least, of 1.5 DN: 70 DN of noise in a sum of 10 000 DN or more.
-    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(20_000 * true[codes[lit]], rel=0.01)
+    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(
+        20_000 * true[codes[lit]], rel=0.01
+    )
     black = GLOW_DN / 0.1 * RATIO**2
     assert found.light[~lit] == pytest.approx(black, rel=0.02)
     assert found.black_known
@@ -147,7 +160,9 @@ def test_a_response_that_is_far_brighter_than_assumed_is_read_by_a_sparser_latti
     found = read(tmp_path, Camera(true, 20_000))
     codes = np.array([patch.code for patch in found.patches])
     lit = codes > 0
-    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(20_000 * true[codes[lit]], rel=0.01)
+    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(
+        20_000 * true[codes[lit]], rel=0.01
+    )
 
 
 @pytest.mark.usefixtures("without_charts")
@@ -160,7 +175,11 @@ def test_a_pixel_that_is_brighter_among_lit_ones_is_seen_by_the_links(tmp_path):
 def test_a_screen_whose_pixels_depend_on_their_neighbours_is_no_calibration(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
     camera = Camera(srgb_response(10).light, 20_000, neighbours=0.08)
-    outcome = photometry(StepContext(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 24))
+    outcome = photometry(
+        StepContext(
+            read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 24
+        )
+    )
     assert (outcome.verdict, outcome.changes) == ("failed", ())
     assert outcome.figures["links_max_mag"] == pytest.approx(2.5 * np.log10(1.08), abs=0.005)
     assert "local dimming" in outcome.line
@@ -229,18 +248,24 @@ def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
     """
     light = gamma_response(8, 2.35).light
     planted = {"r": 0.3 * light, "g": 0.5 * light**1.02, "b": 0.2 * light**0.97}
-    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv"
+    )
     columns = {name: 0.001 + value for name, value in planted.items()}
     write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
     bench = {"monitor": {"bits": 8}, "render": {"bit_stealing": True}}
-    outcome = on_the_twin(tmp_path, photometry, bench, {"monitor": {"bits": 8, "calibration": "true-response.toml"}})
+    outcome = on_the_twin(
+        tmp_path, photometry, bench, {"monitor": {"bits": 8, "calibration": "true-response.toml"}}
+    )
     assert outcome.verdict == "done", outcome.line
     found = primary_lights(tmp_path / "response.toml", 8)
     assert found[:, -1] == pytest.approx([0.3, 0.5, 0.2], abs=0.001)
     wanted = np.stack(list(planted.values()))
     shown = wanted >= 1e-3 * wanted[:, -1:]
     assert found[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
-    assert load_calibration(tmp_path / "response.toml", 8, bit_stealing=True).response.rgb is not None
+    assert (
+        load_calibration(tmp_path / "response.toml", 8, bit_stealing=True).response.rgb is not None
+    )
 
 
 @pytest.mark.usefixtures("without_charts")
@@ -251,23 +276,40 @@ def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp
     nm, powers = np.arange(400.0, 701.0, 10.0), {"r": 2.1, "g": 2.35, "b": 2.5}
     peaks = {"r": 620, "g": 540, "b": 460}
     bumps = np.array([np.exp(-(((nm - peak) / 30) ** 2)) for peak in peaks.values()])
-    rows = "".join(f"{at:g},{','.join(f'{x:.6f}' for x in three)}\n" for at, three in zip(nm, bumps.T, strict=True))
+    rows = "".join(
+        f"{at:g},{','.join(f'{x:.6f}' for x in three)}\n"
+        for at, three in zip(nm, bumps.T, strict=True)
+    )
     (tmp_path / "panel.csv").write_text(f"wavelength_nm,r,g,b\n{rows}")
     for name, one in zip(peaks, bumps, strict=True):
         (tmp_path / f"{name}.csv").write_text(
-            "wavelength_nm,value\n" + "".join(f"{a:g},{b:.6f}\n" for a, b in zip(nm, one, strict=True))
+            "wavelength_nm,value\n"
+            + "".join(f"{a:g},{b:.6f}\n" for a, b in zip(nm, one, strict=True))
         )
-    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv"
+    )
     light = {name: gamma_response(8, power).light for name, power in powers.items()}
-    columns = {name: 0.001 + share * light[name] for name, share in zip(powers, (0.3, 0.5, 0.2), strict=True)}
+    columns = {
+        name: 0.001 + share * light[name]
+        for name, share in zip(powers, (0.3, 0.5, 0.2), strict=True)
+    }
     write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
-    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks}
-    bench = {"tracker": keys, "tracker.detector": {"bayer": "rggb", "gain_e_per_dn": 2.0, "bits": 16}, "monitor": {"bits": 8}}
+    keys = {"quantum_efficiency": None} | {
+        f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks
+    }
+    bench = {
+        "tracker": keys,
+        "tracker.detector": {"bayer": "rggb", "gain_e_per_dn": 2.0, "bits": 16},
+        "monitor": {"bits": 8},
+    }
     bench |= {"monitor.primaries": {"file": "panel.csv", "layout": "rgb-stripe"}}
     truth = bench | {"monitor": {"bits": 8, "calibration": "true-response.toml"}}
     outcome = on_the_twin(tmp_path, photometry, bench, truth)
     assert outcome.verdict == "done", outcome.line
-    for found, wanted in zip(primary_responses(tmp_path / "response.toml", 8), light.values(), strict=True):
+    for found, wanted in zip(
+        primary_responses(tmp_path / "response.toml", 8), light.values(), strict=True
+    ):
         shown = wanted >= 1e-3
         assert found.light[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
 
@@ -278,7 +320,10 @@ def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
     alone 0.036.
     """
     bench = {"monitor": {"bits": 5}, "render": {"quantisation": "temporal", "cycle_frames": 4}}
-    truth = {"monitor": {"bits": 5}, "render": {"quantisation": "round", "flux_at_white_e_per_s": 2.5e6}}
+    truth = {
+        "monitor": {"bits": 5},
+        "render": {"quantisation": "round", "flux_at_white_e_per_s": 2.5e6},
+    }
     outcome = on_the_twin(tmp_path, scale, bench, truth)
     assert outcome.verdict == "done", outcome.line
     assert outcome.figures["truth_off_mag"] == pytest.approx(0.0, abs=0.01)
@@ -287,8 +332,12 @@ def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
 
 @pytest.mark.usefixtures("without_charts")
 def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(tmp_path):
-    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
-    write_calibration(tmp_path / "true-response.toml", head, {"w": gamma_response(8).light}, 0.0, NotesTable())
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv"
+    )
+    write_calibration(
+        tmp_path / "true-response.toml", head, {"w": gamma_response(8).light}, 0.0, NotesTable()
+    )
     with pytest.raises(InputError, match=r"\[weights\]"):
         on_the_twin(
             tmp_path,

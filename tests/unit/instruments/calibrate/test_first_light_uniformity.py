@@ -13,7 +13,12 @@ from hilstar.instruments.calibrate.first_light.context import StepContext, rewri
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
-from hilstar.instruments.calibrate.first_light.uniformity import DotLight, map_of, uniformity, warm_up
+from hilstar.instruments.calibrate.first_light.uniformity import (
+    DotLight,
+    map_of,
+    uniformity,
+    warm_up,
+)
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 
@@ -68,7 +73,9 @@ def did(folder, step, patches=0, known=None, watched_s=0.0):
     return outcome
 
 
-@pytest.mark.parametrize(("grid", "seen"), [(VIGNETTING, 0.1), (PANEL, 0.03)], ids=["vignetting", "panel"])
+@pytest.mark.parametrize(
+    ("grid", "seen"), [(VIGNETTING, 0.1), (PANEL, 0.03)], ids=["vignetting", "panel"]
+)
 @pytest.mark.usefixtures("charts_of_one")
 def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp_path, grid, seen):
     folder = planted(tmp_path, grid)
@@ -80,7 +87,9 @@ def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp
     assert found.verdict == "done", found.line
     assert found.figures["truth_rms_mag"] < MAP_MAG
     assert found.figures["truth_rms_mag"] < 1.5 * found.figures["map_error_mag"]
-    assert found.number.error > 0 and found.number.value == pytest.approx(100 * found.figures["darkest_of_brightest"])
+    assert found.number.error > 0 and found.number.value == pytest.approx(
+        100 * found.figures["darkest_of_brightest"]
+    )
     assert found.figures["change_rms_mag"] == pytest.approx(seen, rel=0.5)
     assert (folder / "uniformity.svg") in found.pictures
     assert load_calibration(folder / "light.toml", 10).uniformity is not None
@@ -123,11 +132,16 @@ def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
     folder = planted(tmp_path, VIGNETTING, "lcd-example")
     found = did(folder, uniformity)
     assert found.verdict == "done", found.line
-    mine, its = (load_calibration(path, 8, bit_stealing=True) for path in (folder / "light.toml", "lcd-example"))
+    mine, its = (
+        load_calibration(path, 8, bit_stealing=True)
+        for path in (folder / "light.toml", "lcd-example")
+    )
     assert mine.weights == pytest.approx(its.weights)
     assert np.array_equal(mine.response.light, its.response.light)
     assert did(folder, photometry, 96).verdict == "done"
-    measured = load_calibration(folder / read_bench_file(folder / "bench.toml").config.monitor.calibration, 8)
+    measured = load_calibration(
+        folder / read_bench_file(folder / "bench.toml").config.monitor.calibration, 8
+    )
     assert np.allclose(measured.uniformity, load_calibration(folder / "light.toml", 8).uniformity)
 
 
@@ -142,7 +156,9 @@ def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
 
 def dots(light, rng, noise=0.004):
     x, y = (part.ravel() for part in np.meshgrid(np.arange(8, 632, 12), np.arange(8, 472, 12)))
-    return DotLight(x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise)
+    return DotLight(
+        x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise
+    )
 
 
 def test_wild_dots_do_not_bend_the_map():
@@ -192,7 +208,9 @@ def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_pa
     folder = planted(tmp_path, VIGNETTING)
     found = did(folder, uniformity, known={"focus.dot_code": 1023})
     assert found.verdict == "done", found.line
-    names = {path.stem.rpartition("_")[0] for path in found.files if path.stem.startswith("lattice")}
+    names = {
+        path.stem.rpartition("_")[0] for path in found.files if path.stem.startswith("lattice")
+    }
     assert len(names) == 1
     assert names != {"lattice_01023"}
     assert found.figures["truth_rms_mag"] < MAP_MAG

@@ -48,7 +48,10 @@ def measure(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=25
     patches = plan_patches(PlanSettings(bits, repeats=repeats), rng)
     light = (curve(np.array([patch.code for patch in patches]) / (2**bits - 1)) + black) * unit
     light *= 1 + noise * rng.standard_normal(len(light))
-    return write(path, [(patch.code, patch.channel, value) for patch, value in zip(patches, light, strict=True)])
+    return write(
+        path,
+        [(patch.code, patch.channel, value) for patch, value in zip(patches, light, strict=True)],
+    )
 
 
 def errors(fit, curve):
@@ -68,7 +71,9 @@ def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, 
     repeats = 3 if name in ("gamma", "srgb") else 6
     met = 0
     for seed in range(10):
-        path = measure(tmp_path / "m.csv", CURVES[name], np.random.default_rng(seed), bits, repeats, black)
+        path = measure(
+            tmp_path / "m.csv", CURVES[name], np.random.default_rng(seed), bits, repeats, black
+        )
         error = errors(fit_channel(read_measurements(path), "w"), CURVES[name])
         met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
     assert met >= 9
@@ -78,7 +83,9 @@ def test_even_steps_of_code_do_where_the_light_is_a_power_law(tmp_path):
     codes = np.repeat(np.rint(np.linspace(0, 255, 32)).astype(int), 3)
     met = 0
     for seed in range(10):
-        light = (codes / 255) ** 2.2 * (1 + NOISE * np.random.default_rng(seed).standard_normal(len(codes)))
+        light = (codes / 255) ** 2.2 * (
+            1 + NOISE * np.random.default_rng(seed).standard_normal(len(codes))
+        )
         path = write(tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)])
         error = errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])
         met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
@@ -118,7 +125,9 @@ def test_a_held_out_residual_is_that_of_a_fit_without_the_level(tmp_path, rng):
         kept = [row for row in path.read_text().splitlines() if not row.startswith(f"{code},")]
         (tmp_path / "less.csv").write_text("\n".join(kept))
         without = fit_channel(read_measurements(tmp_path / "less.csv"), "w")
-        left = (whole.levels.mean[place] - without.black) / (without.white * without.light[code]) - 1
+        left = (whole.levels.mean[place] - without.black) / (
+            without.white * without.light[code]
+        ) - 1
         # The stiffness and the noise are chosen anew without the level: a tenth of the noise of a
         # level's mean.
         assert whole.residual[place - 1] == pytest.approx(left, abs=0.1 * NOISE)
@@ -133,7 +142,9 @@ def test_a_flat_dark_end_is_made_strictly_rising():
 
 def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):
     """Codes 1 to 16 are as black as 0."""
-    path = measure(tmp_path / "m.csv", lambda s: np.maximum(s - 16 / 255, 0) ** 2.2, rng, black=1e-3)
+    path = measure(
+        tmp_path / "m.csv", lambda s: np.maximum(s - 16 / 255, 0) ** 2.2, rng, black=1e-3
+    )
     calibrate_photometric(path, tmp_path / "monitor.toml")
     assert load_calibration(tmp_path / "monitor.toml", 8).response.light[20] < 1e-2
 
@@ -146,7 +157,12 @@ def test_every_code_of_16_bits_is_fitted(tmp_path, rng):
 def test_dn_are_divided_by_their_exposure(tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
     plain = read_measurements(path)
-    rows = [(c, "w", v * t, t) for c, v, t in zip(plain.code, plain.value, rng.uniform(0.01, 2, len(plain.code)), strict=True)]
+    rows = [
+        (c, "w", v * t, t)
+        for c, v, t in zip(
+            plain.code, plain.value, rng.uniform(0.01, 2, len(plain.code)), strict=True
+        )
+    ]
     exposed = read_measurements(write(tmp_path / "dn.csv", rows, "code,channel,value,exposure_s"))
     assert exposed.value == pytest.approx(plain.value)
 
@@ -162,7 +178,9 @@ def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
         data = read_measurements(path)
         value = np.maximum(data.value + 5e-5 * rng.standard_normal(len(data.value)), 0)
         write(path, [(c, "w", v) for c, v in zip(data.code, value, strict=True)])
-        worst.append(np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max())
+        worst.append(
+            np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max()
+        )
     assert np.median(worst) < WORST
 
 
@@ -177,7 +195,9 @@ def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3)
-    summary = calibrate_photometric(path, tmp_path / "monitor.toml", Provenance('a "b"\nc', instrument="meter", unit="cd/m2"))
+    summary = calibrate_photometric(
+        path, tmp_path / "monitor.toml", Provenance('a "b"\nc', instrument="meter", unit="cd/m2")
+    )
     calibration = load_calibration(tmp_path / "monitor.toml", 8)
     assert calibration.who == 'a "b"\nc'
     assert calibration.sha256 == summary["sha256"]
@@ -188,7 +208,9 @@ def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rn
     assert summary["noise_relative"] == pytest.approx(NOISE, rel=0.3)
     # A level's mean of three repeats to 0.58 %, seen from a response that is known better.
     assert 0.3 < summary["holdout"]["rms_percent"] < 0.9
-    assert summary["holdout"]["max_mag"] == pytest.approx(summary["holdout"]["max_percent"] / 100 * 1.0857, rel=1e-4)
+    assert summary["holdout"]["max_mag"] == pytest.approx(
+        summary["holdout"]["max_percent"] / 100 * 1.0857, rel=1e-4
+    )
     assert summary["error_percent"]["1e-3"] > summary["error_percent"]["1e-2"]
     assert summary["additivity_percent"] is None
     light = load_calibration(tmp_path / "monitor.toml", 8).response.light
@@ -219,11 +241,15 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
             planted, abs=3 * summary["crosstalk_error_percent"][decade]
         )
         assert summary["crosstalk_error_percent"][decade] < 2
-    for found, (name, power) in zip(primary_responses(tmp_path / "monitor.toml", 8), powers.items(), strict=True):
+    for found, (name, power) in zip(
+        primary_responses(tmp_path / "monitor.toml", 8), powers.items(), strict=True
+    ):
         for code, decade in ((90, "1e-1"), (31, "1e-2")):
             error = summary["channels"][name]["error_percent"][decade]
             assert found.light[code] == pytest.approx((code / 255) ** power, rel=3 * error / 100)
-    said = run_hilstar_here("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "again.toml").stdout
+    said = run_hilstar_here(
+        "calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "again.toml"
+    ).stdout
     assert "channel b" in said and "crosstalk at 1e-1" in said
     calibration = load_calibration(tmp_path / "monitor.toml", 8, bit_stealing=True)
     assert calibration.weights == pytest.approx((0.2, 0.7, 0.1), rel=0.01)
@@ -237,7 +263,12 @@ def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng
     times = {0: 5, 2: 2, 5: 2, 13: 2, 25: 2, 44: 1, 71: 1, 90: 1, 111: 1, 127: 3, 169: 1, 255: 4}
     codes = [code for code, count in times.items() for _ in range(count)]
     rows = [
-        (code, "w", 1e5 * (code / 255) ** 2.2 * (1 + 0.003 * rng.standard_normal()) + 0.2 * rng.standard_normal())
+        (
+            code,
+            "w",
+            1e5 * (code / 255) ** 2.2 * (1 + 0.003 * rng.standard_normal())
+            + 0.2 * rng.standard_normal(),
+        )
         for code in codes
     ]
     path = write(tmp_path / "m.csv", [(code, channel, abs(value)) for code, channel, value in rows])
@@ -262,7 +293,9 @@ def refused(path, **more):
 
 def ramp(codes, bits=8, curve=CURVES["gamma"], repeats=3, black=1e-3):
     return [
-        (int(c), "w", float(curve(c / (2**bits - 1)) + black) * (1 + 1e-3 * (k - 1))) for k in range(repeats) for c in codes
+        (int(c), "w", float(curve(c / (2**bits - 1)) + black) * (1 + 1e-3 * (k - 1)))
+        for k in range(repeats)
+        for c in codes
     ]
 
 
@@ -297,7 +330,9 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES["gamma"], rng)
     data = read_measurements(path)
     for seed in range(20):
-        again = read_measurements(measure(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(seed)))
+        again = read_measurements(
+            measure(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(seed))
+        )
         drift, error = drift_over_run(again)
         assert abs(drift) < 4 * error
     falling = data.value * np.linspace(1, 0.97, len(data.value))
@@ -305,7 +340,9 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
     assert "light drifts by -" in refused(write(tmp_path / "m.csv", rows))
     # The same rows sorted, their times beside them.
     timed = sorted((c, n, v, 10.0 * t) for t, (c, n, v) in enumerate(rows))
-    assert "light drifts by -" in refused(write(tmp_path / "m.csv", timed, "code,channel,value,t_s"))
+    assert "light drifts by -" in refused(
+        write(tmp_path / "m.csv", timed, "code,channel,value,t_s")
+    )
 
 
 @pytest.mark.parametrize(
@@ -346,5 +383,7 @@ def test_other_files_are_refused(tmp_path):
     assert "cannot be read" in refused(tmp_path / "none.csv")
     (tmp_path / "m.csv").write_bytes(b"\xff\xfe\x00")
     assert "not UTF-16 to its end" in refused(tmp_path / "m.csv")
-    (tmp_path / "monitor.csv").write_text("\ufeffcode,channel,value\n" + "".join(f"{c},w,{v}\n" for c, _, v in ramp(STEPS)))
+    (tmp_path / "monitor.csv").write_text(
+        "\ufeffcode,channel,value\n" + "".join(f"{c},w,{v}\n" for c, _, v in ramp(STEPS))
+    )
     assert "written over" in refused(tmp_path / "monitor.csv")  # and a byte-order mark is no fault

@@ -13,7 +13,11 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.calibrate.geometric.calibration import Calibrated, calibrate_geometry, lines_of
+from hilstar.instruments.calibrate.geometric.calibration import (
+    Calibrated,
+    calibrate_geometry,
+    lines_of,
+)
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
 from hilstar.instruments.calibrate.geometric.fit import Nominal
 from hilstar.instruments.calibrate.geometric.match import decode
@@ -35,13 +39,23 @@ def nominal_of(bench: TracedBench) -> Nominal:
     return Nominal(monitor, ALIGNED, TRACKER)
 
 
-def two_poses(bench, plan: DotPlan, tracker: Camera, rng: np.random.Generator, *tilt_deg: float) -> Observed:
+def two_poses(
+    bench, plan: DotPlan, tracker: Camera, rng: np.random.Generator, *tilt_deg: float
+) -> Observed:
     """What is seen in two poses: at rest, and turned by 90 degrees, `tilt_deg` (x, y) beside the
     boresight.
     """
     turns = (np.eye(3), turned(*tilt_deg, 90.0))
-    parts = [observed_dots(bench, plan, tracker, rng, pose_matrix=turn, pose=k) for k, turn in enumerate(turns)]
-    return Observed(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("frame", "pose", "x_px", "y_px", "sigma_px")))
+    parts = [
+        observed_dots(bench, plan, tracker, rng, pose_matrix=turn, pose=k)
+        for k, turn in enumerate(turns)
+    ]
+    return Observed(
+        *(
+            np.concatenate([getattr(p, n) for p in parts])
+            for n in ("frame", "pose", "x_px", "y_px", "sigma_px")
+        )
+    )
 
 
 @functools.lru_cache
@@ -77,7 +91,9 @@ def test_stars_are_shown_where_they_should_be_all_over_the_screen(case, rng):
 
 
 def test_a_strong_lens_asks_for_the_field_and_gets_it(rng):
-    bench = replace(BENCH, lens_shift_mm=(14.0, -9.0), lens_tilt_deg=(7.0, 4.0), screen_shift_mm=(1.0, 1.0))
+    bench = replace(
+        BENCH, lens_shift_mm=(14.0, -9.0), lens_tilt_deg=(7.0, 4.0), screen_shift_mm=(1.0, 1.0)
+    )
     plan = plan_of(*MANY[:2])
     seen = observed_dots(bench, plan, TRACKER, rng, 0.005)
     found = calibrate_geometry(plan, nominal_of(bench), seen, rng, tracker_known=True)
@@ -119,7 +135,9 @@ def test_the_field_and_the_lens_are_fitted_together(rng):
     # arcsec rms, 2.2 maximum.
     bench = ThinPrisms()
     plan = plan_of(*MANY[:2])
-    found = calibrate_geometry(plan, nominal_of(BENCH), observed_dots(bench, plan, TRACKER, rng), rng, tracker_known=True)
+    found = calibrate_geometry(
+        plan, nominal_of(BENCH), observed_dots(bench, plan, TRACKER, rng), rng, tracker_known=True
+    )
     errors = errors_arcsec(found, bench)
     assert np.sqrt((errors**2).mean()) < 0.18
     assert found.chosen.field_degree <= 5  # the prisms are of degree 4
@@ -130,17 +148,27 @@ def test_what_poses_do_not_tell_apart_does_not_run_away(rng):
     # arcsec off (20 frames of 60).
     bench, plan = ThinPrisms(), plan_of(*FEW[:2])
     real = replace(TRACKER, lens=Lens(tangential=(-2e-3, 3e-3)))
-    found = calibrate_geometry(plan, nominal_of(BENCH), two_poses(bench, plan, real, rng, 0.0, 0.0), rng, tracker_known=False)
+    found = calibrate_geometry(
+        plan,
+        nominal_of(BENCH),
+        two_poses(bench, plan, real, rng, 0.0, 0.0),
+        rng,
+        tracker_known=False,
+    )
     assert np.sqrt((errors_arcsec(found, bench) ** 2).mean()) < 3.0
     # a tracker's own round distortion is still in what the file states
     assert found.uncertainty.rms_arcsec > 10
 
 
-@pytest.mark.parametrize("lens", [None, Lens(radial=(-0.02, 0.0, 0.0))], ids=["ideal", "flight model"])
+@pytest.mark.parametrize(
+    "lens", [None, Lens(radial=(-0.02, 0.0, 0.0))], ids=["ideal", "flight model"]
+)
 def test_of_one_pose_the_file_holds_both_lenses_only_where_the_tracker_s_is_not_known(lens, rng):
     plan, tracker = plan_of(*FEW[:2]), replace(TRACKER, lens=lens)
     nominal = replace(nominal_of(BENCH), tracker=tracker)
-    found = calibrate_geometry(plan, nominal, observed_dots(BENCH, plan, tracker, rng), rng, tracker_known=True)
+    found = calibrate_geometry(
+        plan, nominal, observed_dots(BENCH, plan, tracker, rng), rng, tracker_known=True
+    )
     (note,) = (line for line in lines_of(found) if line.startswith("one pose"))
     assert ("this file holds both" in note) == (lens is None)
     assert ("holds the collimator alone" in note) == (lens is not None)
@@ -190,8 +218,14 @@ REFUSED = {
     "reversed": (lambda seen: replace(seen, frame=19 - seen.frame), "reverse order"),
     "from one": (lambda seen: replace(seen, frame=seen.frame + 1), "numbered from 1"),
     "shuffled": (shuffled, "match no dots"),
-    "a dark corner": (lambda seen: seen.at(np.flatnonzero(seen.x_px + seen.y_px > 1620)), "upper left"),
-    "few": (lambda seen: seen.at(np.flatnonzero(np.hypot(seen.x_px - 1023, seen.y_px - 1023) < 130)), "dots"),
+    "a dark corner": (
+        lambda seen: seen.at(np.flatnonzero(seen.x_px + seen.y_px > 1620)),
+        "upper left",
+    ),
+    "few": (
+        lambda seen: seen.at(np.flatnonzero(np.hypot(seen.x_px - 1023, seen.y_px - 1023) < 130)),
+        "dots",
+    ),
 }
 
 
@@ -207,7 +241,13 @@ def test_what_cannot_be_fitted_is_refused_with_its_cure(kind, rng):
 def test_one_pose_and_no_flight_model_is_refused(rng):
     plan = plan_of(*FEW[:2])
     with pytest.raises(InputError, match="--tracker-is-ideal"):
-        calibrate_geometry(plan, nominal_of(BENCH), observed_dots(BENCH, plan, TRACKER, rng), rng, tracker_known=False)
+        calibrate_geometry(
+            plan,
+            nominal_of(BENCH),
+            observed_dots(BENCH, plan, TRACKER, rng),
+            rng,
+            tracker_known=False,
+        )
 
 
 def test_a_mount_that_moved_between_frames_is_refused(rng):
@@ -240,13 +280,19 @@ def test_a_tracker_that_sees_part_of_the_screen_gets_its_own_field_right_and_no_
     wide = TracedBench(focal_mm=120.0, to_lens_mm=30.0)
     narrow = replace(TRACKER, resolution_px=(1024, 1024), principal_point_px=(511.5, 511.5))
     nominal = replace(nominal_of(wide), tracker=narrow)
-    found = calibrate_geometry(plan, nominal, observed_dots(wide, plan, narrow, rng), rng, tracker_known=True)
+    found = calibrate_geometry(
+        plan, nominal, observed_dots(wide, plan, narrow, rng), rng, tracker_known=True
+    )
     monitor = bounded(found.fit.geometry.monitor, 20.0)
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0, 1023, 31), np.linspace(0, 1023, 31)))
+    x, y = (
+        part.ravel() for part in np.meshgrid(np.linspace(0, 1023, 31), np.linspace(0, 1023, 31))
+    )
     rays = narrow.rays(x, y)
     wanted_x, wanted_y = wide.places_px(rays)
     shown_x, shown_y = monitor.project(rays @ monitor.cam_to_image.T)
-    errors = np.hypot(shown_x - wanted_x, shown_y - wanted_y) * ARCSEC_PER_RAD / monitor.focal_length_px
+    errors = (
+        np.hypot(shown_x - wanted_x, shown_y - wanted_y) * ARCSEC_PER_RAD / monitor.focal_length_px
+    )
     assert errors.max() < 3.0  # NaN would fail: every place of the tracker's field is known
     far = np.tan(2 * monitor.field_radius_rad(0.0))
     assert np.isnan(monitor.places_px(np.array([far]), np.array([0.0]))[0]).all()

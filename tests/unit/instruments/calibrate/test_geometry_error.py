@@ -33,7 +33,12 @@ from tests.support.benches import bench_text
 
 # A tracker of 256 x 256 px, of 39 arcsec that sees the whole of a small screen.
 SMALL_FIELD = {
-    "tracker": {"focal_length_mm": 45, "pixel_pitch_um": 8.5, "resolution_px": [256, 256], "psf_sigma_px": [1.0, 1.0]},
+    "tracker": {
+        "focal_length_mm": 45,
+        "pixel_pitch_um": 8.5,
+        "resolution_px": [256, 256],
+        "psf_sigma_px": [1.0, 1.0],
+    },
     "monitor": {"resolution_px": [640, 360], "pixel_pitch_um": 60.0},
     "collimator": {"focal_length_mm": 900},
 }
@@ -49,7 +54,9 @@ def planted(folder, tilt_deg=0.0):
     (folder / "bench.toml").write_text(bench_text(SMALL_FIELD))
     file = read_bench_file(folder / "bench.toml")
     nominal = nominal_of(file)
-    monitor = dataclasses.replace(nominal.monitor, lens=Lens(tilt_rad=(math.radians(tilt_deg), 0.0)))
+    monitor = dataclasses.replace(
+        nominal.monitor, lens=Lens(tilt_rad=(math.radians(tilt_deg), 0.0))
+    )
     return file, SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=1.0)
 
 
@@ -60,11 +67,17 @@ def error_of(file, seen, names, seed, noise_px, dot_noise_px=0.0):
     """
     rng = np.random.default_rng(seed)
     plan = plan_seen_dots(seen, FRAMES, lit_for(seen), rng)
-    places = np.stack(seen.tracker.project(seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T))
+    places = np.stack(
+        seen.tracker.project(seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T)
+    )
     dot, frame = np.nonzero(plan.lit)
-    places = (places + rng.normal(0, dot_noise_px, places.shape))[:, dot] + rng.normal(0, noise_px, (2, len(dot)))
+    places = (places + rng.normal(0, dot_noise_px, places.shape))[:, dot] + rng.normal(
+        0, noise_px, (2, len(dot))
+    )
     data = MatchedDots(Observed(frame, np.zeros_like(frame), *places, np.ones(len(dot))), dot)
-    problem = Problem(plan, nominal_of(file), np.array([[1.0, 0.0, 0.0, 0.0]]), noise_of_repeats(data))
+    problem = Problem(
+        plan, nominal_of(file), np.array([[1.0, 0.0, 0.0, 0.0]]), noise_of_repeats(data)
+    )
     found = fit(problem, Model(names), 0, data)
     return off_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
 
@@ -92,7 +105,10 @@ def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
 
 def test_dots_with_errors_of_their_own_are_not_averaged_over_frames(tmp_path):
     file, seen = planted(tmp_path, tilt_deg=3.0)
-    off = [error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02) for seed in range(SEEDS)]
+    off = [
+        error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
+        for seed in range(SEEDS)
+    ]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
 
 
@@ -104,7 +120,10 @@ def candidate(name, off_arcsec):
 def test_a_larger_model_is_taken_for_more_than_chance(is_chance, chosen):
     """Both are 4 % better: one has other residuals, the other smaller ones."""
     rng = np.random.default_rng(2)
-    small, other = candidate("small", rng.normal(0, 1.0, (50, 2))), candidate("other", rng.normal(0, 1.0, (50, 2)))
+    small, other = (
+        candidate("small", rng.normal(0, 1.0, (50, 2))),
+        candidate("other", rng.normal(0, 1.0, (50, 2))),
+    )
     large = other if is_chance else small
     large = candidate("large", large.off_arcsec * (0.96 * small.rms_arcsec / large.rms_arcsec))
     assert large.rms_arcsec < GAIN * small.rms_arcsec
@@ -116,7 +135,9 @@ def test_no_dot_is_planned_whose_window_leaves_the_image(tmp_path, psf_sigma_px)
     _, seen = planted(tmp_path)
     seen = dataclasses.replace(seen, psf_sigma_px=psf_sigma_px)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
-    x, y = seen.tracker.project(seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T)
+    x, y = seen.tracker.project(
+        seen.monitor.rays(plan.x_px, plan.y_px) @ seen.tracker.cam_to_image.T
+    )
     reach = dot_centroids(seen.dot_sigma_px).radius_px
     assert min(x.min(), y.min()) >= reach
     assert max(x.max(), y.max()) <= 255 - reach

@@ -22,7 +22,10 @@ def test_any_latency_is_found_again_through_jitter_lost_edges_and_noise(latency_
     seen_ns = shown_edges.host_ns + round(latency_ms * 1e6) + jitter_ns
     kept = np.sort(rng.choice(len(changed), len(changed) * 4 // 5, replace=False))
     noise_ns = rng.integers(swap_ns[0], swap_ns[-1], 20)
-    seen = Edges(np.concatenate([seen_ns[kept], noise_ns]), np.concatenate([level[changed][kept], rng.integers(0, 2, 20)]))
+    seen = Edges(
+        np.concatenate([seen_ns[kept], noise_ns]),
+        np.concatenate([level[changed][kept], rng.integers(0, 2, 20)]),
+    )
     paired = pair(seen, shown_edges, PERIOD_NS)
     assert not paired.ambiguous
     assert np.median(paired.latency_ns) == pytest.approx(latency_ms * 1e6, abs=1e5)

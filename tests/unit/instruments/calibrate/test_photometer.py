@@ -9,7 +9,13 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.display.calibration import CalibrationHead, NotesTable, load_calibration, read_toml, write_calibration
+from hilstar.display.calibration import (
+    CalibrationHead,
+    NotesTable,
+    load_calibration,
+    read_toml,
+    write_calibration,
+)
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.response import gamma_response
 from hilstar.instruments.calibrate.first_light.context import StepContext
@@ -31,7 +37,13 @@ SURE = 4.0  # sigmas: one figure in 16 000 is further off
 # Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
 # three times.
 MAX_RMS = 1.6
-NOISY = {"gain_e_per_dn": 8.0, "read_noise_e": 12.0, "full_well_e": 30_000.0, "offset_dn": 40.0, "prnu": 0.005}
+NOISY = {
+    "gain_e_per_dn": 8.0,
+    "read_noise_e": 12.0,
+    "full_well_e": 30_000.0,
+    "offset_dn": 40.0,
+    "prnu": 0.005,
+}
 # Nothing spreads a level over the ADC's steps: the defaults of a bench file.
 SILENT = {"gain_e_per_dn": 24.0, "read_noise_e": 0.0, "dark_e_per_s": 0.0, "offset_dn": 40.0}
 
@@ -39,9 +51,15 @@ SILENT = {"gain_e_per_dn": 24.0, "read_noise_e": 0.0, "dark_e_per_s": 0.0, "offs
 def planted(folder, detector, collimator_mm=120):
     """A bench file that supposes sRGB, and its truth: a power law with a black level."""
     light = gamma_response(BITS, POWER).light + BLACK
-    head = CalibrationHead("photometric", "planted", "2026-11-28", "none", "relative", BITS, "true-response.csv")
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-28", "none", "relative", BITS, "true-response.csv"
+    )
     write_calibration(folder / "true-light.toml", head, {"w": light}, 0.0, NotesTable())
-    tables = {"monitor": {"bits": BITS}, "tracker.detector": detector, "collimator": {"focal_length_mm": collimator_mm}}
+    tables = {
+        "monitor": {"bits": BITS},
+        "tracker.detector": detector,
+        "collimator": {"focal_length_mm": collimator_mm},
+    }
     (folder / "bench.toml").write_text(bench_text(TWIN, tables))
     true = tables | {"monitor": {"bits": BITS, "calibration": "true-light.toml"}}
     (folder / "truth.toml").write_text(bench_text(TWIN, true))
@@ -55,7 +73,9 @@ def measured(folder, seed, sets_exposure=True):
     source = VirtualBench(file, true, seed)
     source.sets_exposure = sets_exposure
     try:
-        outcome = photometry(StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96))
+        outcome = photometry(
+            StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96)
+        )
     finally:
         source.close()
     assert outcome.verdict == "done", outcome.line
@@ -115,7 +135,10 @@ def test_the_command_and_the_step_give_the_same_figures(tmp_path):
     assert mine == its
     assert found["holdout"]["rms_mag"] == outcome.figures["held_out_rms_mag"]
     assert found["black_level"]["relative"] == pytest.approx(outcome.figures["black_level"])
-    responses = [load_calibration(tmp_path / name, BITS).response.light for name in ("response.toml", "again.toml")]
+    responses = [
+        load_calibration(tmp_path / name, BITS).response.light
+        for name in ("response.toml", "again.toml")
+    ]
     assert np.array_equal(*responses)
 
 
@@ -135,7 +158,11 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
         codes = np.array([patch.code for patch in patches])
         light = gamma_response(BITS, POWER).light[codes]
         faint = (codes < 128) & (codes > 0)
-        value = light * (1 + 0.001 * rng.standard_normal(len(codes))) * np.where(faint, 1 + 0.01 * rng.standard_normal(), 1)
+        value = (
+            light
+            * (1 + 0.001 * rng.standard_normal(len(codes)))
+            * np.where(faint, 1 + 0.01 * rng.standard_normal(), 1)
+        )
         rows = [
             (code, "w", one, 0.001 * one + 1e-7, 0.01 * one * below)
             for code, one, below in zip(codes, value, faint, strict=True)
@@ -143,7 +170,9 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
         path = written(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
         fit = fit_channel(read_measurements(path), "w")
         code = 60
-        ratios.append((fit.light[code] / gamma_response(BITS, POWER).light[code] - 1) / fit.error[code])
+        ratios.append(
+            (fit.light[code] / gamma_response(BITS, POWER).light[code] - 1) / fit.error[code]
+        )
     # 40 draws give an rms to 11 %; the fit takes most of the step away, for a power law is smooth.
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
 
@@ -157,7 +186,9 @@ def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     scatter = np.repeat(1 + 0.005 * rng.standard_normal(18), 2)
     light = gamma_response(BITS, POWER).light[codes] * scatter
     rows = [(code, "w", one, 1e-4 * one + 1e-9) for code, one in zip(codes, light, strict=True)]
-    fit = fit_channel(read_measurements(written(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w")
+    fit = fit_channel(
+        read_measurements(written(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
+    )
     codes = np.arange(40, 255)
     off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1
     assert fit.lack_of_fit > 10
@@ -169,12 +200,16 @@ def test_rounding_is_that_of_levels_in_noise():
     level = np.linspace(0, 1, 9)
     for noise_dn in (0.15, 0.3, 0.5):
         read = np.rint(level + noise_dn * rng.standard_normal((200_000, 9)))
-        assert rounding_error(level, np.array(noise_dn)) == pytest.approx(read.mean(axis=0) - level, abs=0.005)
+        assert rounding_error(level, np.array(noise_dn)) == pytest.approx(
+            read.mean(axis=0) - level, abs=0.005
+        )
     assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
     assert rounding_rms(0.6) < 1e-3
 
 
-@pytest.mark.parametrize(("dark_dn", "noise_dn", "light_dn"), [(0.0, 0.63, 2.0), (0.2, 0.63, 0.3), (-0.3, 1.5, 10.0)])
+@pytest.mark.parametrize(
+    ("dark_dn", "noise_dn", "light_dn"), [(0.0, 0.63, 2.0), (0.2, 0.63, 0.3), (-0.3, 1.5, 10.0)]
+)
 def test_the_cut_at_code_0_is_that_of_noise_that_an_adc_reads(dark_dn, noise_dn, light_dn):
     """Of two million pixels each, dark and lit, with shot noise of 24 e- a DN."""
     rng = np.random.default_rng(1)
@@ -184,7 +219,9 @@ def test_the_cut_at_code_0_is_that_of_noise_that_an_adc_reads(dark_dn, noise_dn,
     lit = np.maximum(np.rint(dark_dn + light_dn + spread_dn * rng.standard_normal(count)), 0)
     added_dn = float(lit.mean() - dark.mean()) - light_dn
     assert added_dn < -0.05
-    assert cut_light(np.array([light_dn]), float(dark.mean()), noise_dn, 1 / 24) == pytest.approx(added_dn, rel=0.06)
+    assert cut_light(np.array([light_dn]), float(dark.mean()), noise_dn, 1 / 24) == pytest.approx(
+        added_dn, rel=0.06
+    )
 
 
 def test_an_adc_with_an_offset_cuts_nothing():

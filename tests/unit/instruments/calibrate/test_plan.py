@@ -10,7 +10,13 @@ from PIL import Image
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.photometric import calibrate_photometric
-from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches, planned_codes, write_patches, write_plan
+from hilstar.instruments.calibrate.plan import (
+    PlanSettings,
+    plan_patches,
+    planned_codes,
+    write_patches,
+    write_plan,
+)
 
 
 def read_png(path):
@@ -35,7 +41,9 @@ def test_a_plan_is_random_reproducible_and_can_be_filled_in(tmp_path):
         calibrate_photometric(tmp_path / "0.csv", tmp_path / "monitor.toml")
 
 
-@pytest.mark.parametrize(("bits", "levels"), [(1, 2), (2, 4), (8, 32), (8, 256), (10, 32), (16, 64)])
+@pytest.mark.parametrize(
+    ("bits", "levels"), [(1, 2), (2, 4), (8, 32), (8, 256), (10, 32), (16, 64)]
+)
 def test_planned_codes_are_distinct_from_black_to_white(bits, levels):
     codes = planned_codes(bits, levels)
     assert len(codes) == levels
@@ -45,7 +53,12 @@ def test_planned_codes_are_distinct_from_black_to_white(bits, levels):
 
 @pytest.mark.parametrize(("bits", "code", "stored"), [(8, 255, 255), (10, 1023, 1023 << 6)])
 def test_patches_are_written_as_the_codes_of_frames_are(bits, code, stored, tmp_path):
-    write_patches(tmp_path / "patches", plan_patches(PlanSettings(bits, 8), np.random.default_rng(1)), (60, 40), bits)
+    write_patches(
+        tmp_path / "patches",
+        plan_patches(PlanSettings(bits, 8), np.random.default_rng(1)),
+        (60, 40),
+        bits,
+    )
     image = read_png(tmp_path / "patches" / f"w-{code:05d}.png")
     assert image.shape == (40, 60)
     assert image[20, 30] == stored
@@ -62,7 +75,15 @@ def test_a_patch_of_one_primary_lights_that_primary(tmp_path):
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"bits": 17}, {"levels": 1}, {"levels": 300}, {"repeats": 0}, {"channels": ""}, {"channels": "ww"}, {"channels": "wx"}],
+    [
+        {"bits": 17},
+        {"levels": 1},
+        {"levels": 300},
+        {"repeats": 0},
+        {"channels": ""},
+        {"channels": "ww"},
+        {"channels": "wx"},
+    ],
 )
 def test_a_plan_that_cannot_be_measured_is_refused(arguments):
     with pytest.raises(InputError, match="; write "):

@@ -67,15 +67,27 @@ def write_frames(
 
 def test_frames_of_the_virtual_detector_give_its_settings_back(tmp_path):
     found = measure_sensor(*write_frames(tmp_path, SENSOR, LEVELS_E))
-    for key in ("gain_e_per_dn", "read_noise_e", "prnu", "dsnu_e", "dark_e_per_s", "dsnu_e_per_s", "offset_dn"):
-        assert found.keys[key] == pytest.approx(getattr(SENSOR, key), abs=SIGMAS * found.sigmas[key]), key
+    for key in (
+        "gain_e_per_dn",
+        "read_noise_e",
+        "prnu",
+        "dsnu_e",
+        "dark_e_per_s",
+        "dsnu_e_per_s",
+        "offset_dn",
+    ):
+        assert found.keys[key] == pytest.approx(
+            getattr(SENSOR, key), abs=SIGMAS * found.sigmas[key]
+        ), key
         assert found.sigmas[key] < 0.02 * found.keys[key], key
     # The flat before saturation, of levels 3000 e- apart.
     assert found.keys["full_well_e"] == pytest.approx(30_000.0, abs=4000.0)
     assert found.keys["bits"] == math.ceil(math.log2(200 + 30_000 / 1.5 + 60))
 
 
-@pytest.mark.parametrize(("key", "in_extension"), [("EXPOSURE", False), ("EXPTIME", True), ("EXPOINUS", False)])
+@pytest.mark.parametrize(
+    ("key", "in_extension"), [("EXPOSURE", False), ("EXPTIME", True), ("EXPOINUS", False)]
+)
 def test_exposures_are_read_wherever_they_stand(tmp_path, key, in_extension):
     """The same frames with their exposure under another keyword, or in a header that fpack's
     image has.
@@ -97,7 +109,10 @@ def test_darks_of_unknown_exposures_are_no_repeats_of_one_level(tmp_path):
     flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
     for path in (*flats, *darks):
         fits.delval(path, "EXPTIME")
-    with pytest.raises(InputError, match=r"--darks: their means differ by .* DN, and no header says their exposures.*EXPTIME"):
+    with pytest.raises(
+        InputError,
+        match=r"--darks: their means differ by .* DN, and no header says their exposures.*EXPTIME",
+    ):
         measure_sensor(flats, darks)
     # Darks of one exposure are repeats, whatever it was.
     assert "dark_e_per_s" not in measure_sensor(flats, darks[:2]).keys
@@ -116,12 +131,19 @@ def test_frames_by_plain_numpy_give_back_what_made_them(tmp_path):
     rng = np.random.default_rng(1)
     response = 1 + prnu * rng.standard_normal(SHAPE)
     paths = []
-    for number, level_e in enumerate(np.repeat([0.0, 2000.0, 8000.0, 20_000.0, 40_000.0, 60_000.0], 2)):
+    for number, level_e in enumerate(
+        np.repeat([0.0, 2000.0, 8000.0, 20_000.0, 40_000.0, 60_000.0], 2)
+    ):
         charge_e = rng.poisson(level_e * response) + read_e * rng.standard_normal(SHAPE)
         paths.append(tmp_path / f"{number:02}.png")
         Image.fromarray(np.rint(charge_e / gain + 100).astype(np.uint16)).save(paths[-1])
     found = measure_sensor(paths[2:], paths[:2])
-    for key, value in {"gain_e_per_dn": gain, "read_noise_e": read_e, "prnu": prnu, "offset_dn": 100.0}.items():
+    for key, value in {
+        "gain_e_per_dn": gain,
+        "read_noise_e": read_e,
+        "prnu": prnu,
+        "offset_dn": 100.0,
+    }.items():
         assert found.keys[key] == pytest.approx(value, abs=SIGMAS * found.sigmas[key]), key
         assert found.sigmas[key] < 0.02 * value, key
     # No pattern in the dark, no saturation, no EXPTIME: none is claimed.
@@ -136,7 +158,12 @@ def test_a_data_sheet_gives_the_keys_in_their_units(tmp_path):
     found = import_emva(tmp_path / "emva.csv")
     settings = found.settings
     assert settings.gain_e_per_dn == 4.0  # K is DN/e-
-    assert (settings.read_noise_e, settings.full_well_e, settings.bits, settings.offset_dn) == (6.2, 10_500.0, 12, 30.0)
+    assert (settings.read_noise_e, settings.full_well_e, settings.bits, settings.offset_dn) == (
+        6.2,
+        10_500.0,
+        12,
+        30.0,
+    )
     assert (settings.dsnu_e, settings.dsnu_e_per_s) == (1.4, 0.0)  # an offset map, and no rate
     assert settings.prnu == pytest.approx(0.005)
     assert settings.dark_factor == 1.0
@@ -149,23 +176,36 @@ def test_a_data_sheet_gives_the_keys_in_their_units(tmp_path):
 def test_json_says_what_csv_says(tmp_path):
     (tmp_path / "emva.csv").write_text(SHEET)
     rows = [line.split(",") for line in SHEET.splitlines()[1:] if not line.startswith("#")]
-    objects = [{"quantity": name, "value": float(value), "unit": unit} for name, value, unit in rows]
+    objects = [
+        {"quantity": name, "value": float(value), "unit": unit} for name, value, unit in rows
+    ]
     (tmp_path / "emva.json").write_text(json.dumps(objects))
     assert import_emva(tmp_path / "emva.json") == import_emva(tmp_path / "emva.csv")
 
 
 def test_photon_transfer_of_an_imported_sensor_gives_its_sheet_back(tmp_path):
-    (tmp_path / "emva.csv").write_text(SHEET.replace("K,0.25,DN/e-", "1/K,0.8,e-/DN").replace("bits,12", "bits,16"))
+    (tmp_path / "emva.csv").write_text(
+        SHEET.replace("K,0.25,DN/e-", "1/K,0.8,e-/DN").replace("bits,12", "bits,16")
+    )
     sheet = import_emva(tmp_path / "emva.csv")
-    found = measure_sensor(*write_frames(tmp_path, sheet.settings, (800.0, 2000.0, 4000.0, 6000.0, 9000.0)))
+    found = measure_sensor(
+        *write_frames(tmp_path, sheet.settings, (800.0, 2000.0, 4000.0, 6000.0, 9000.0))
+    )
     for key in ("gain_e_per_dn", "read_noise_e", "prnu", "dsnu_e", "dark_e_per_s"):
-        assert found.keys[key] == pytest.approx(sheet.keys[key], abs=SIGMAS * found.sigmas[key]), key
+        assert found.keys[key] == pytest.approx(sheet.keys[key], abs=SIGMAS * found.sigmas[key]), (
+            key
+        )
 
 
 def test_a_bench_takes_the_tables_that_are_written(tmp_path):
     (tmp_path / "emva.csv").write_text(SHEET)
     files = write_sensor(tmp_path / "camera.toml", import_emva(tmp_path / "emva.csv"), "a test")
-    assert [file.name for file in files] == ["camera.toml", "camera_qe.csv", "camera_curves.png", "camera_curves.svg"]
+    assert [file.name for file in files] == [
+        "camera.toml",
+        "camera_qe.csv",
+        "camera_curves.png",
+        "camera_curves.svg",
+    ]
     assert all(file.is_file() for file in files)
     _, tables = files[0].read_text().split("[tracker]\n")
     bench = SMALL_BENCH.replace('quantum_efficiency = "ccd47-20"\n', "").replace(
@@ -175,7 +215,9 @@ def test_a_bench_takes_the_tables_that_are_written(tmp_path):
     tracker = read_config(tmp_path / "bench.toml").tracker
     for key, value in import_emva(tmp_path / "emva.csv").keys.items():
         assert getattr(tracker.detector, key) == pytest.approx(value, rel=1e-5), key  # six digits
-    assert bench_optics(tracker, tmp_path).quantum_efficiency(np.array([490.0])) == pytest.approx(0.595)
+    assert bench_optics(tracker, tmp_path).quantum_efficiency(np.array([490.0])) == pytest.approx(
+        0.595
+    )
 
 
 @pytest.mark.parametrize(
@@ -202,8 +244,12 @@ def test_a_sheet_that_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch, sh
 
 def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    flats, darks = ([path.name for path in paths] for paths in write_frames(tmp_path, SENSOR, LEVELS_E[:5]))
-    result = run_hilstar_here("sensor", "measure", *flats, "--darks", *darks, "-o", "sensor.toml", "--json")
+    flats, darks = (
+        [path.name for path in paths] for paths in write_frames(tmp_path, SENSOR, LEVELS_E[:5])
+    )
+    result = run_hilstar_here(
+        "sensor", "measure", *flats, "--darks", *darks, "-o", "sensor.toml", "--json"
+    )
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
     assert told["keys"]["gain_e_per_dn"] == pytest.approx(1.5, rel=0.02)
@@ -220,11 +266,26 @@ def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch
 
 
 SPELLED = {
-    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {"gain_e_per_dn": 4, "read_noise_e": 2.5, "full_well_e": 10500},
-    "K,0.25,ADU/e-\nσ_{d},0.65,ADU\nDSNU_1288,0.2,counts": {"gain_e_per_dn": 4, "read_noise_e": 2.6, "dsnu_e": 0.8},
+    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {
+        "gain_e_per_dn": 4,
+        "read_noise_e": 2.5,
+        "full_well_e": 10500,
+    },
+    "K,0.25,ADU/e-\nσ_{d},0.65,ADU\nDSNU_1288,0.2,counts": {
+        "gain_e_per_dn": 4,
+        "read_noise_e": 2.6,
+        "dsnu_e": 0.8,
+    },
     "sigma_d,0.65,DN\nsigma_d,2.6,e-\nK,0.25,DN/e-": {"gain_e_per_dn": 4, "read_noise_e": 2.6},
-    "K,0.25,DN/e−\nµ_I,3,e-/pixel/s\nTemperature,−10,°C": {"gain_e_per_dn": 4, "dark_e_per_s": 3, "temperature_k": 263.15},
-    "K,0.25,LSB/electron\nmu_I.mean,0.5,DN/s\nmu_I.mean,2,e-/(pixel s)": {"gain_e_per_dn": 4, "dark_e_per_s": 2},
+    "K,0.25,DN/e−\nµ_I,3,e-/pixel/s\nTemperature,−10,°C": {
+        "gain_e_per_dn": 4,
+        "dark_e_per_s": 3,
+        "temperature_k": 263.15,
+    },
+    "K,0.25,LSB/electron\nmu_I.mean,0.5,DN/s\nmu_I.mean,2,e-/(pixel s)": {
+        "gain_e_per_dn": 4,
+        "dark_e_per_s": 2,
+    },
     "K,0.25,DN/e-\nK,0.25,DN/e-\n1/K,4.02,e-/DN": {"gain_e_per_dn": 4},
 }
 
@@ -233,7 +294,9 @@ SPELLED = {
 def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, rows):
     (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
     sensor = import_emva(tmp_path / "sheet.csv")
-    keys = {key: value for key, value in sensor.keys.items() if key != "dark_reference_temperature_k"}
+    keys = {
+        key: value for key, value in sensor.keys.items() if key != "dark_reference_temperature_k"
+    }
     assert keys == pytest.approx(SPELLED[rows])
     assert sensor.notes == ()
     assert [nm for nm, _ in sensor.efficiency] == ([530] if "530" in rows else [])

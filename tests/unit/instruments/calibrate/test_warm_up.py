@@ -9,7 +9,13 @@ import pytest
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.warm_up import MAX_TAU, STABLE, WarmUp, judge_warm_up, watch_white
+from hilstar.instruments.calibrate.warm_up import (
+    MAX_TAU,
+    STABLE,
+    WarmUp,
+    judge_warm_up,
+    watch_white,
+)
 from tests.support.fake_clock import FakeClock
 
 CHANGE, TAU_S = 0.04, 200.0
@@ -46,7 +52,9 @@ def test_an_exponential_is_found_with_its_time_to_stable_white(kind: str) -> Non
     )  # where white brightens, "relative to white" differs a little
     assert found.tau_s == pytest.approx(TAU_S, rel=1e-3)
     true = -100 * 3600 * CHANGE / TAU_S * math.exp(-(READINGS - 1) * EVERY_S / TAU_S)
-    assert found.drift_percent_per_h == pytest.approx(true if kind == "exponential" else -true, rel=0.01)
+    assert found.drift_percent_per_h == pytest.approx(
+        true if kind == "exponential" else -true, rel=0.01
+    )
 
 
 def test_a_warm_monitor_is_stable_from_the_first_reading_on() -> None:
@@ -56,23 +64,45 @@ def test_a_warm_monitor_is_stable_from_the_first_reading_on() -> None:
 
 
 @pytest.mark.parametrize(("kind", "drift_percent_per_h"), [("never", -6.12), ("slow", -4.01)])
-def test_a_drift_that_does_not_end_is_not_called_stable(kind: str, drift_percent_per_h: float) -> None:
+def test_a_drift_that_does_not_end_is_not_called_stable(
+    kind: str, drift_percent_per_h: float
+) -> None:
     found = planted(kind, 2e-4)
     assert not found.is_stable and found.stable_after_s > READINGS * EVERY_S
-    assert abs(found.drift_percent_per_h - drift_percent_per_h) < 3 * found.drift_error_percent_per_h < 0.6
+    assert (
+        abs(found.drift_percent_per_h - drift_percent_per_h)
+        < 3 * found.drift_error_percent_per_h
+        < 0.6
+    )
     assert "not" in found.line
 
 
 def test_noise_of_a_fifth_of_a_percent_leaves_the_stated_errors_true() -> None:
     true = -100 * 3600 * CHANGE / TAU_S * math.exp(-(READINGS - 1) * EVERY_S / TAU_S)
     trials = [planted("exponential", 2e-3, seed) for seed in range(TRIALS)]
-    assert np.mean([abs(each.stable_after_s - STABLE_S) < 2 * each.stable_after_error_s for each in trials]) > HELD
-    assert np.mean([abs(each.drift_percent_per_h - true) < 2 * each.drift_error_percent_per_h for each in trials]) > HELD
+    assert (
+        np.mean(
+            [abs(each.stable_after_s - STABLE_S) < 2 * each.stable_after_error_s for each in trials]
+        )
+        > HELD
+    )
+    assert (
+        np.mean(
+            [
+                abs(each.drift_percent_per_h - true) < 2 * each.drift_error_percent_per_h
+                for each in trials
+            ]
+        )
+        > HELD
+    )
     assert np.median([each.noise for each in trials]) == pytest.approx(2e-3, rel=0.05)
 
 
 def test_what_noise_hides_is_not_called_stable() -> None:
-    assert sum(planted("never", 2e-3, seed, readings=40).is_stable for seed in range(TRIALS)) < 0.05 * TRIALS
+    assert (
+        sum(planted("never", 2e-3, seed, readings=40).is_stable for seed in range(TRIALS))
+        < 0.05 * TRIALS
+    )
     short = planted("none", 2e-3, readings=20)
     assert not short.is_stable and short.ahead_error > STABLE / 2
 
@@ -88,7 +118,9 @@ def test_readings_before_a_step_are_left_out() -> None:
 def test_a_fast_start_is_left_out_before_a_slow_exponential() -> None:
     found = planted("two", 1e-5)
     assert found.is_stable and found.from_s > 0
-    assert found.stable_after_s == pytest.approx(300 * math.log(0.02 * -math.expm1(-2) / STABLE), abs=5.0)
+    assert found.stable_after_s == pytest.approx(
+        300 * math.log(0.02 * -math.expm1(-2) / STABLE), abs=5.0
+    )
 
 
 def test_white_is_watched_until_it_is_stable_on_the_given_clock() -> None:
@@ -96,7 +128,9 @@ def test_white_is_watched_until_it_is_stable_on_the_given_clock() -> None:
 
     def read() -> float:
         clock.sleep(0.5)  # an exposure
-        return float(1 + CHANGE * math.exp(-clock.now_ns() / 1e9 / TAU_S) + 1e-4 * rng.standard_normal())
+        return float(
+            1 + CHANGE * math.exp(-clock.now_ns() / 1e9 / TAU_S) + 1e-4 * rng.standard_normal()
+        )
 
     t_s, light = watch_white(read, clock.now_ns, clock.sleep)
     assert np.diff(t_s) == pytest.approx(EVERY_S) and len(t_s) == len(light)
@@ -107,7 +141,9 @@ def test_white_is_watched_until_it_is_stable_on_the_given_clock() -> None:
 
 def test_watching_ends_at_the_longest_time_and_refuses_a_dark_reading() -> None:
     clock = FakeClock()
-    t_s, _ = watch_white(lambda: 1 + clock.now_ns() / 1e12, clock.now_ns, clock.sleep, longest_s=300.0)
+    t_s, _ = watch_white(
+        lambda: 1 + clock.now_ns() / 1e12, clock.now_ns, clock.sleep, longest_s=300.0
+    )
     assert t_s[-1] == pytest.approx(300, abs=EVERY_S)
     with pytest.raises(InputError, match="white reads 0"):
         watch_white(lambda: 0.0, clock.now_ns, clock.sleep)

@@ -45,5 +45,9 @@ def test_the_case_that_kills_its_workers_is_named_and_the_others_are_run(tmp_pat
         else:
             ran |= set(range(task.begin, task.begin + len(task)))
             this.done(task, 0.3 * len(task))
-    assert died[-1] == 7 and died[:-1] == [None] * (len(died) - 1) and MAX_DEATHS <= len(died) <= MAX_DEATHS + 1
+    assert (
+        died[-1] == 7
+        and died[:-1] == [None] * (len(died) - 1)
+        and MAX_DEATHS <= len(died) <= MAX_DEATHS + 1
+    )
     assert ran == set(range(1, 12)) - {7} and this.to_run == 0

@@ -44,7 +44,13 @@ def session(folder: Path, images: bool = False) -> Session:
 
 
 def points(this: Session, cases: int) -> Any:
-    design = Design("sobol", this.plan.seed, cases, this.maker.attitude_dimensions, [1] * len(this.maker.parameters))
+    design = Design(
+        "sobol",
+        this.plan.seed,
+        cases,
+        this.maker.attitude_dimensions,
+        [1] * len(this.maker.parameters),
+    )
     return design.points(0, cases)
 
 
@@ -66,7 +72,16 @@ def test_a_case_is_made_again_by_simulate_and_its_image_has_its_truth(tmp_path: 
     row = this.row(0, points(this, 1)[0])
     this.close()
     q = ",".join(repr(row[name]) for name in ("qw", "qx", "qy", "qz"))
-    again = run_hilstar_here("simulate", "bench.toml", f"--quaternion={q}", "--seed", "11", "-o", "again.fits", cwd=tmp_path)
+    again = run_hilstar_here(
+        "simulate",
+        "bench.toml",
+        f"--quaternion={q}",
+        "--seed",
+        "11",
+        "-o",
+        "again.fits",
+        cwd=tmp_path,
+    )
     assert again.returncode == 0, again.stderr
     with fits.open(tmp_path / row["image"]) as kept, fits.open(tmp_path / "again.fits") as made:
         assert np.array_equal(kept[0].data, made[0].data)
@@ -80,7 +95,9 @@ def test_a_run_of_frames_turns_at_its_rate_and_its_scatter_is_its_noise(tmp_path
     where = points(this, 1)[0]
     case = this.maker.case(0, where)
     last = this.maker.view(case, 3, 0.1)
-    assert last.q_icrs_to_cam == pytest.approx(propagate(case.first.q_icrs_to_cam, np.radians([0, 0, 2.0]), 1.5), abs=1e-12)
+    assert last.q_icrs_to_cam == pytest.approx(
+        propagate(case.first.q_icrs_to_cam, np.radians([0, 0, 2.0]), 1.5), abs=1e-12
+    )
     assert last.t_ns == 1_500_000_000
     row = this.row(0, where)
     this.close()
@@ -93,12 +110,23 @@ FEW_CODES = {"key": "misalignment_arcsec.x", "values": [0.0, 300.0]}
 def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_path: Path) -> None:
     """A turn of the mounting by 300 arcsec is an attitude error of as much about the same axis."""
     looks = {"kind": "field", "radec_deg": [84.0, -1.0], "radius_deg": 0.0, "roll_deg": [0, 0]}
-    keys = {"sampling": "grid", "cases": None, "through": "display", "noise": "none", "attitudes": looks}
+    keys = {
+        "sampling": "grid",
+        "cases": None,
+        "through": "display",
+        "noise": "none",
+        "attitudes": looks,
+    }
     write_campaign(tmp_path, FEW_CODES, **keys)
     text = (tmp_path / "bench.toml").read_text().replace("[320, 240]", "[640, 480]")
     text = text.replace("[monitor]", "[monitor]\nbits = 10")
-    (tmp_path / "bench.toml").write_text(text.replace("focal_length_mm = 60", "focal_length_mm = 170"))
-    assert parse_plan(tmp_path / "plan.toml", (tmp_path / "plan.toml").read_text()).through == "display"
+    (tmp_path / "bench.toml").write_text(
+        text.replace("focal_length_mm = 60", "focal_length_mm = 170")
+    )
+    assert (
+        parse_plan(tmp_path / "plan.toml", (tmp_path / "plan.toml").read_text()).through
+        == "display"
+    )
     this = session(tmp_path)
     rows = [this.row(k, np.array([0.5, 0.0, 0.0, share])) for k, share in enumerate((0.25, 0.75))]
     this.close()
@@ -106,7 +134,9 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
     # 10-bit codes of stars over 1.1 monitor pixels a tracker's: the twin's own tests hold them to
     # 0.02 px, 3 arcsec here.
     assert np.abs(straight[:2]).max() < 3
-    assert np.abs(turned - straight)[0] == pytest.approx(300, abs=3) and abs(turned - straight)[1] < 3
+    assert (
+        np.abs(turned - straight)[0] == pytest.approx(300, abs=3) and abs(turned - straight)[1] < 3
+    )
     assert rows[0]["matched"] >= 5
 
 
@@ -119,13 +149,20 @@ for_s = 2.0
 """
 
 
-def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_campaign(tmp_path: Path) -> None:
+def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_campaign(
+    tmp_path: Path,
+) -> None:
     scenario = {"key": "scenario", "values": ["", "dark.toml"]}
     (tmp_path / "dark.toml").write_text(SCENARIO)
-    write_campaign(tmp_path, scenario, {"key": "time_s", "values": [0.0, 2.0]}, sampling="grid", cases=None)
+    write_campaign(
+        tmp_path, scenario, {"key": "time_s", "values": [0.0, 2.0]}, sampling="grid", cases=None
+    )
     this = session(tmp_path)
     look = np.array([0.3, 0.6, 0.1])
-    found = [this.row(k, np.append(look, [(k // 2 + 0.5) / 2, (k % 2 + 0.5) / 2]))["matched"] for k in range(4)]
+    found = [
+        this.row(k, np.append(look, [(k // 2 + 0.5) / 2, (k % 2 + 0.5) / 2]))["matched"]
+        for k in range(4)
+    ]
     this.close()
     assert found[0] == found[1] == found[2] > 0 == found[3]
     before = files_sha256(this.plan, tmp_path)
@@ -143,9 +180,13 @@ def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> 
     (tmp_path / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{x},{y},{z},{w}\n9,{x},{y},{z},{w}\n")
     plan = write_campaign(tmp_path, attitudes={"kind": "log", "log": "log.csv"})
     bench = tmp_path / "bench.toml"
-    text = bench.read_text().replace("[tracker]", "[tracker]\nq_body_to_cam = [0.5, -0.5, -0.5, -0.5]", 1)
+    text = bench.read_text().replace(
+        "[tracker]", "[tracker]\nq_body_to_cam = [0.5, -0.5, -0.5, -0.5]", 1
+    )
     table = 'convention = { scalar = "last", direction = "cam_to_icrs", frame = "body" }'
     bench.write_text(f"{text}\n[attitude]\n{table}\n")
     maker = CaseMaker(parse_plan(plan, plan.read_text()), read_bench_file(bench), tmp_path)
     first = maker.case(0, np.full(maker.attitude_dimensions + len(maker.parameters), 0.5)).first
-    assert (Rotation.from_quat(first.q_icrs_to_cam, scalar_first=True) * camera.inv()).magnitude() < 1e-12
+    assert (
+        Rotation.from_quat(first.q_icrs_to_cam, scalar_first=True) * camera.inv()
+    ).magnitude() < 1e-12

@@ -35,16 +35,30 @@ WRONG = {
     "half a range": ({"maximum": None}, {}, ["minimum"]),
     "neither": ({"minimum": None, "maximum": None}, {}, ["values"]),
     "both": ({"values": [1.0]}, {}, ["either"]),
-    "log of 0": ({"key": "rate_deg_s.x", "minimum": 0, "maximum": 1, "scale": "log"}, {}, ["log", "above 0"]),
+    "log of 0": (
+        {"key": "rate_deg_s.x", "minimum": 0, "maximum": 1, "scale": "log"},
+        {},
+        ["log", "above 0"],
+    ),
     "grid without steps": ({}, {"sampling": "grid"}, ["steps"]),
-    "rate of text": ({"key": "rate_deg_s.x", "minimum": None, "maximum": None, "values": ["fast"]}, {}, ["fast"]),
-    "display's key, no display": ({"key": "monitor.refresh_hz", "minimum": 50, "maximum": 60}, {}, ["display"]),
+    "rate of text": (
+        {"key": "rate_deg_s.x", "minimum": None, "maximum": None, "values": ["fast"]},
+        {},
+        ["fast"],
+    ),
+    "display's key, no display": (
+        {"key": "monitor.refresh_hz", "minimum": 50, "maximum": 60},
+        {},
+        ["display"],
+    ),
     "index beyond": ({"key": "tracker.psf_sigma_px.7"}, {}, ["0 to 1"]),
 }
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_is_wrong_with_a_plan_is_said_in_one_line_with_exit_code_2(tmp_path: Path, wrong: str) -> None:
+def test_what_is_wrong_with_a_plan_is_said_in_one_line_with_exit_code_2(
+    tmp_path: Path, wrong: str
+) -> None:
     varied, keys, words = WRONG[wrong]
     plan = write_campaign(tmp_path, PSF | varied, **keys)
     assert_refused(run_hilstar_here("campaign", plan, "-o", tmp_path / "out"), 2, *words)
@@ -52,7 +66,11 @@ def test_what_is_wrong_with_a_plan_is_said_in_one_line_with_exit_code_2(tmp_path
 
 
 def test_a_log_or_a_field_that_is_not_said_is_asked_for(tmp_path: Path) -> None:
-    for attitudes, word in (({"kind": "field"}, "radec_deg"), ({"kind": "log"}, "log"), ({"radec_deg": [1, 2]}, "field")):
+    for attitudes, word in (
+        ({"kind": "field"}, "radec_deg"),
+        ({"kind": "log"}, "log"),
+        ({"radec_deg": [1, 2]}, "field"),
+    ):
         plan = write_campaign(tmp_path, attitudes=attitudes)
         with pytest.raises(InputError, match=word):
             read_plan(plan)
@@ -91,7 +109,11 @@ def test_values_are_those_of_the_plan_and_reach_the_bench(tmp_path: Path) -> Non
     design = Design("grid", 7, 12, 3, [3, 1, 2, 2, 1])
     cases = [maker.case(k, point) for k, point in enumerate(design.points(0, 12))]
     trackers = [maker.bench(case).config.tracker for case in cases]
-    assert sorted({tracker.psf_sigma_px for tracker in trackers}) == [(0.5, 0.7), (0.75, 0.7), (1.0, 0.7)]
+    assert sorted({tracker.psf_sigma_px for tracker in trackers}) == [
+        (0.5, 0.7),
+        (0.75, 0.7),
+        (1.0, 0.7),
+    ]
     assert {tracker.detector.bits for tracker in trackers} == {8, 12}
     assert {maker.bench(case).config.sky.spectrum for case in cases} == {"pickles", "blackbody"}
     assert {case.noise_seed for case in cases} == {5}
@@ -114,7 +136,9 @@ def test_attitudes_are_even_over_the_sky_and_within_the_field(tmp_path: Path) ->
     maker = CaseMaker(read_plan(write_campaign(tmp_path, PSF, attitudes=field)), file, tmp_path)
     dec, ra = math.radians(-89), math.radians(84)
     middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
-    looks = np.array([to_matrix(maker.case(k, rng.random(4)).first.q_icrs_to_cam)[2] for k in range(500)])
+    looks = np.array(
+        [to_matrix(maker.case(k, rng.random(4)).first.q_icrs_to_cam)[2] for k in range(500)]
+    )
     off_deg = np.degrees(np.arccos(np.clip(looks @ middle, -1, 1)))
     assert off_deg.max() <= 3.0 + 1e-6
     # Even over a small cap: half of the cases are beyond radius / sqrt 2; 500 of them have a sigma

@@ -77,9 +77,20 @@ def simulated(
     within[right - off < 2] = np.nan
     error[~some] = np.nan
     first = np.where(rng.random(n) < slow, 1.0 + rng.exponential(1.0, n), rng.random(n))
-    columns: dict[str, FloatArray] = {"case": np.arange(n, dtype=float), "frames": np.full(n, float(frames))}
-    columns |= {"solved": right.astype(float), "wrong": off.astype(float), "first_attitude_s": first}
-    columns |= {"vary.rate_deg_s.across": rng.random(n), "fault_end_s": np.full(n, 2.0), "recovery_s": first}
+    columns: dict[str, FloatArray] = {
+        "case": np.arange(n, dtype=float),
+        "frames": np.full(n, float(frames)),
+    }
+    columns |= {
+        "solved": right.astype(float),
+        "wrong": off.astype(float),
+        "first_attitude_s": first,
+    }
+    columns |= {
+        "vary.rate_deg_s.across": rng.random(n),
+        "fault_end_s": np.full(n, 2.0),
+        "recovery_s": first,
+    }
     for k, axis in enumerate("xyz"):
         columns |= {f"error_{axis}_arcsec": error[:, k], f"scatter_{axis}_arcsec": within[:, k]}
     for k, axis in enumerate("wxyz"):
@@ -94,21 +105,41 @@ def verdict(cases: Columns, **keys: Any) -> RequirementVerdict:
 # Each quantity: how a campaign is planted at `factor` times the limit, and the limit as keys.
 PLANTED: dict[str, tuple[Any, dict[str, Any]]] = {
     "noise": (lambda rng, factor: simulated(rng, ERRORS, noise=2 * factor), {"maximum": 2.0}),
-    "bias": (lambda rng, factor: simulated(rng, ERRORS, noise=2.0, bias=(5 * factor, 0, 0)), {"maximum": 5.0, "axis": "x"}),
-    "nea": (lambda rng, factor: simulated(rng, ERRORS, frames=4, scatter=3 * factor), {"maximum": 3.0}),
-    "availability": (lambda rng, factor: simulated(rng, RATES, answered=1 - 0.1 * factor), {"minimum": 0.9}),
+    "bias": (
+        lambda rng, factor: simulated(rng, ERRORS, noise=2.0, bias=(5 * factor, 0, 0)),
+        {"maximum": 5.0, "axis": "x"},
+    ),
+    "nea": (
+        lambda rng, factor: simulated(rng, ERRORS, frames=4, scatter=3 * factor),
+        {"maximum": 3.0},
+    ),
+    "availability": (
+        lambda rng, factor: simulated(rng, RATES, answered=1 - 0.1 * factor),
+        {"minimum": 0.9},
+    ),
     "wrong-rate": (lambda rng, factor: simulated(rng, RATES, wrong=0.1 * factor), {"maximum": 0.1}),
-    "time-to-first-attitude": (lambda rng, factor: simulated(rng, RATES, slow=0.1 * factor), {"maximum": 1.0, "share": 0.9}),
-    "recovery": (lambda rng, factor: simulated(rng, RATES, slow=0.1 * factor), {"maximum": 1.0, "share": 0.9}),
+    "time-to-first-attitude": (
+        lambda rng, factor: simulated(rng, RATES, slow=0.1 * factor),
+        {"maximum": 1.0, "share": 0.9},
+    ),
+    "recovery": (
+        lambda rng, factor: simulated(rng, RATES, slow=0.1 * factor),
+        {"maximum": 1.0, "share": 0.9},
+    ),
     "fov-error": (lambda rng, factor: simulated(rng, 4 * ERRORS, fov=4 * factor), {"maximum": 4.0}),
-    "pixel-error": (lambda rng, factor: simulated(rng, 2 * ERRORS, pixel=4 * factor), {"maximum": 4.0}),
+    "pixel-error": (
+        lambda rng, factor: simulated(rng, 2 * ERRORS, pixel=4 * factor),
+        {"maximum": 4.0},
+    ),
 }
 CHEAP = ("nea", "availability", "wrong-rate", "time-to-first-attitude", "recovery")
 VIOLATIONS, CLEAN = 6, 20  # campaigns of each cheap quantity: 30 and 100
 
 
 @pytest.mark.parametrize("quantity", PLANTED)
-def test_planted_violations_are_found_and_clean_campaigns_are_not_accused(quantity: str, rng: np.random.Generator) -> None:
+def test_planted_violations_are_found_and_clean_campaigns_are_not_accused(
+    quantity: str, rng: np.random.Generator
+) -> None:
     make, keys = PLANTED[quantity]
     many = quantity in CHEAP
     for _ in range(VIOLATIONS if many else 1):
@@ -129,10 +160,14 @@ def test_a_limit_of_clopper_pearson_and_of_order_statistics_fails_as_often_as_it
     assert np.mean([clopper_pearson(k, n, 0.95)[1] < share for k in seen]) < 0.07
     assert np.mean([clopper_pearson(k, n, 0.95)[0] > share for k in seen]) < 0.07
     limits = np.array([quantile_limits(rng.random(n), share, 0.95) for _ in range(runs)])
-    assert 0.01 < np.mean(limits[:, 1] < share) < 0.07 and 0.01 < np.mean(limits[:, 0] > share) < 0.065
+    assert (
+        0.01 < np.mean(limits[:, 1] < share) < 0.07 and 0.01 < np.mean(limits[:, 0] > share) < 0.065
+    )
 
 
-def test_answers_of_one_case_that_go_together_are_not_counted_as_independent(rng: np.random.Generator) -> None:
+def test_answers_of_one_case_that_go_together_are_not_counted_as_independent(
+    rng: np.random.Generator,
+) -> None:
     cases = simulated(rng, RATES, frames=10)
     cases.numbers["solved"] = 10.0 * (rng.random(RATES) < 0.903)  # a case answers always or never
     found = verdict(cases, quantity="availability", minimum=0.9)
@@ -145,7 +180,12 @@ def test_the_benchs_own_error_is_taken_off_a_limit(rng: np.random.Generator) -> 
     found = verdicts_of(require, cases, SCALE, 1, (0.6, 30.0))[0]
     assert found.verdict == NOT_SHOWN
     assert "0.6 arcsec taken off for the bench" in found.method
-    assert verdicts_of([Require(quantity="noise", maximum=1.8)], cases, SCALE, 1, (0.6, 30.0))[0].verdict == NOT_SHOWN
+    assert (
+        verdicts_of([Require(quantity="noise", maximum=1.8)], cases, SCALE, 1, (0.6, 30.0))[
+            0
+        ].verdict
+        == NOT_SHOWN
+    )
 
 
 def test_too_few_cases_say_how_many_more_it_takes(rng: np.random.Generator) -> None:
@@ -160,7 +200,9 @@ def test_too_few_cases_say_how_many_more_it_takes(rng: np.random.Generator) -> N
 
 
 def test_a_pixel_error_that_the_noise_hides_is_not_called_met(rng: np.random.Generator) -> None:
-    found = verdict(simulated(rng, ERRORS, noise=20.0, pixel=2.0), quantity="pixel-error", maximum=1.0)
+    found = verdict(
+        simulated(rng, ERRORS, noise=20.0, pixel=2.0), quantity="pixel-error", maximum=1.0
+    )
     assert found.verdict == NOT_SHOWN and found.bound is not None and found.bound > 2.0
 
 
@@ -169,9 +211,13 @@ def test_a_condition_chooses_cases(rng: np.random.Generator) -> None:
     rate = cases.numbers["vary.rate_deg_s.across"]
     chosen = chosen_cases("rate_deg_s.across <= 0.5 and rate_deg_s.across > 0.1", cases)
     assert np.array_equal(chosen, (rate <= 0.5) & (rate > 0.1))
-    found = verdict(cases, quantity="availability", minimum=0.9, condition="rate_deg_s.across <= 0.5")
+    found = verdict(
+        cases, quantity="availability", minimum=0.9, condition="rate_deg_s.across <= 0.5"
+    )
     assert found.cases == int((rate <= 0.5).sum())
-    with pytest.raises(InputError, match=r"nonsense is no key that the plan varies \(rate_deg_s.across\)"):
+    with pytest.raises(
+        InputError, match=r"nonsense is no key that the plan varies \(rate_deg_s.across\)"
+    ):
         verdict(cases, quantity="availability", minimum=0.9, condition="nonsense <= 1")
 
 
@@ -184,7 +230,10 @@ def test_a_condition_chooses_cases(rng: np.random.Generator) -> None:
         ('quantity = "availability"\nminimum = 95', "a share from 0 to 1"),
         ('quantity = "availability"\nminimum = 0.9\naxis = "x"', "has no axis"),
         ('quantity = "bias"\nmaximum = 3\nshare = 0.9', "leave share out"),
-        ('quantity = "noise"\nmaximum = 3\ncondition = "fast"', 'write such as "rate_deg_s.across <= 0.5"'),
+        (
+            'quantity = "noise"\nmaximum = 3\ncondition = "fast"',
+            'write such as "rate_deg_s.across <= 0.5"',
+        ),
         ('quantity = "noise"\nmaximum = 3\nconfidence = 95', "confidence"),
     ],
 )

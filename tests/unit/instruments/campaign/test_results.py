@@ -30,8 +30,14 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     names = ("wrong", "solved", "frames")
     rows = []
     for case in range(CASES):
-        a, b, word = float(rng.random()), float(rng.random()), str(rng.choice(["one", "two", "three"]))
-        q = from_radec_roll_deg(360 * rng.random(), np.degrees(np.arcsin(2 * rng.random() - 1)), 360 * rng.random())
+        a, b, word = (
+            float(rng.random()),
+            float(rng.random()),
+            str(rng.choice(["one", "two", "three"])),
+        )
+        q = from_radec_roll_deg(
+            360 * rng.random(), np.degrees(np.arcsin(2 * rng.random() - 1)), 360 * rng.random()
+        )
         error = BIAS_ARCSEC + NOISE_ARCSEC * (1 + COST * a) * rng.standard_normal(3)
         wild = case % 50 == 7
         row = dict.fromkeys(f"error_{axis}_arcsec" for axis in "xyz") | dict.fromkeys(
@@ -41,17 +47,25 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
         solved = from_radec_roll_deg(*(360 * rng.random(), 10.0, 20.0)) if wild else q
         row |= {f"solved_q{axis}": float(value) for axis, value in zip("wxyz", solved, strict=True)}
         if not wild:
-            row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip("xyz", error, strict=True)}
+            row |= {
+                f"error_{axis}_arcsec": float(value)
+                for axis, value in zip("xyz", error, strict=True)
+            }
         row |= {"status": "done", "why": "", "vary.a": a, "vary.b": b, "vary.word": word}
         rows.append(row | dict(zip(names, (int(wild), 1, 1), strict=True)))
     texts = ("status", "why", "vary.word")
-    columns = {name: "int64" if name in names else "text" if name in texts else "float64" for name in rows[0]}
+    columns = {
+        name: "int64" if name in names else "text" if name in texts else "float64"
+        for name in rows[0]
+    }
     write_table(tmp_path / "cases.parquet", schema_of(columns, {}), iter([rows[:900], rows[900:]]))
     return tmp_path / "cases.parquet"
 
 
 def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> None:
-    found = write_results(table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1)
+    found = write_results(
+        table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1
+    )
     # of its own stars, whatever was planted
     assert 0 < found["limit_arcsec"].cross < 1 < found["limit_arcsec"].roll < 100
     assert np.all(np.abs(np.array(found["bias_arcsec"]) - BIAS_ARCSEC) < BIAS_LIMIT_ARCSEC)
@@ -80,12 +94,16 @@ def test_few_cases_have_no_budget_and_a_note_says_so(tmp_path: Path) -> None:
 
 
 def read_cases_of(folder: Path, rows: list[dict[str, float]]) -> Columns:
-    write_table(folder / "t.parquet", schema_of(dict.fromkeys(rows[0], "float64"), {}), iter([rows]))
+    write_table(
+        folder / "t.parquet", schema_of(dict.fromkeys(rows[0], "float64"), {}), iter([rows])
+    )
     return read_cases(folder / "t.parquet")
 
 
 def test_a_large_table_is_read_in_part(tmp_path: Path) -> None:
     rows = [{"case": float(k)} for k in range(100)]
-    write_table(tmp_path / "t.parquet", schema_of({"case": "float64"}, {}), iter([rows[:60], rows[60:]]))
+    write_table(
+        tmp_path / "t.parquet", schema_of({"case": "float64"}, {}), iter([rows[:60], rows[60:]])
+    )
     part = read_cases(tmp_path / "t.parquet", 10)
     assert part.cases == 100 and len(part.numbers["case"]) == 10

@@ -49,15 +49,22 @@ def solver(text: str, folder: Path = EXAMPLES, timeout_s: float = 60.0):
     [
         "centroids",
         "python:star_solver:solve",
-        pytest.param(f"{sys.executable} star_solver.py {{image}} {{focal_length_px}}", marks=pytest.mark.e2e),
+        pytest.param(
+            f"{sys.executable} star_solver.py {{image}} {{focal_length_px}}", marks=pytest.mark.e2e
+        ),
     ],
 )
-def test_a_solver_finds_the_commanded_attitude_in_the_pixels(seen: tuple[Simulator, Exposure], text: str) -> None:
+def test_a_solver_finds_the_commanded_attitude_in_the_pixels(
+    seen: tuple[Simulator, Exposure], text: str
+) -> None:
     simulator, exposure = seen
     answer = solver(text).solve(exposure, simulator)
     assert answer.q_icrs_to_cam is not None
     error_arcsec = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
-    assert np.abs(error_arcsec[:2]).max() < CROSS_LIMIT_ARCSEC and abs(error_arcsec[2]) < ROLL_LIMIT_ARCSEC
+    assert (
+        np.abs(error_arcsec[:2]).max() < CROSS_LIMIT_ARCSEC
+        and abs(error_arcsec[2]) < ROLL_LIMIT_ARCSEC
+    )
     assert np.abs(error_arcsec).max() > 0
 
 
@@ -93,31 +100,56 @@ FAULTS = {
 def test_a_command_that_fails_says_how(seen: tuple[Simulator, Exposure], text: str) -> None:
     simulator, exposure = seen
     try:
-        said = solver(text, timeout_s=0.3 if "sleep" in text else PATIENCE_S).solve(exposure, simulator).why
+        said = (
+            solver(text, timeout_s=0.3 if "sleep" in text else PATIENCE_S)
+            .solve(exposure, simulator)
+            .why
+        )
     except SolverFault as fault:
         said = str(fault)
     assert FAULTS[text] in said and "hilstar-solver" not in said
 
 
 def test_what_a_program_prints_is_read_from_its_last_line_with_an_attitude() -> None:
-    assert printed_attitude("loading 4 files\n0.5 0.5 -0.5 0.5\ndone in 3 s\n") == [0.5, 0.5, -0.5, 0.5]
+    assert printed_attitude("loading 4 files\n0.5 0.5 -0.5 0.5\ndone in 3 s\n") == [
+        0.5,
+        0.5,
+        -0.5,
+        0.5,
+    ]
     assert printed_attitude('{"q": [1, 0, 0, 0], "stars": 7}\n') == [1, 0, 0, 0]
     assert printed_attitude("[1e0, -0.0, 0, 0]") == [1, 0, 0, 0]
-    assert printed_attitude("1 2 3\n") is None and printed_attitude("") is None and printed_attitude('{"q": null}') is None
+    assert (
+        printed_attitude("1 2 3\n") is None
+        and printed_attitude("") is None
+        and printed_attitude('{"q": null}') is None
+    )
 
 
-@pytest.mark.parametrize("line", ['{"q": 5}', '{"q": {"w": 1}}', '{"q": [1, 0, 0]}', '{"q": "north"}'])
-def test_an_answer_that_is_no_quaternion_is_a_fault_of_the_solver(seen: tuple[Simulator, Exposure], line: str) -> None:
+@pytest.mark.parametrize(
+    "line", ['{"q": 5}', '{"q": {"w": 1}}', '{"q": [1, 0, 0]}', '{"q": "north"}']
+)
+def test_an_answer_that_is_no_quaternion_is_a_fault_of_the_solver(
+    seen: tuple[Simulator, Exposure], line: str
+) -> None:
     simulator, exposure = seen
     with pytest.raises(SolverFault, match="four numbers"):
-        solver(f"sh -c 'cat $0 >/dev/null; echo \"$1\"' {{image}} '{line}'", timeout_s=PATIENCE_S).solve(exposure, simulator)
+        solver(
+            f"sh -c 'cat $0 >/dev/null; echo \"$1\"' {{image}} '{line}'", timeout_s=PATIENCE_S
+        ).solve(exposure, simulator)
 
 
 def test_what_is_nested_too_deep_is_no_answer() -> None:
     assert printed_attitude('{"q":' * 20_000) is None
 
 
-NO_SOLVERS = ["solve me", "python:nothing", "python:no_such_module:f", "python:math:nothing", "a 'b {image}"]
+NO_SOLVERS = [
+    "solve me",
+    "python:nothing",
+    "python:no_such_module:f",
+    "python:math:nothing",
+    "a 'b {image}",
+]
 
 
 @pytest.mark.parametrize("text", NO_SOLVERS)
@@ -138,4 +170,7 @@ def test_a_solver_that_keeps_printing_is_ended_at_the_bound_with_its_children(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 50_000
     child = Path(f"/proc/{(tmp_path / 'child').read_text().strip()}/stat")
     # Without an init of its own a container keeps what has ended as a zombie.
-    wait_for(lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z", "the solver's child to end")
+    wait_for(
+        lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z",
+        "the solver's child to end",
+    )

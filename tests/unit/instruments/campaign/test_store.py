@@ -13,7 +13,14 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.campaign import store
-from hilstar.instruments.campaign.store import About, Directory, Journal, file_sha256, schema_of, write_table
+from hilstar.instruments.campaign.store import (
+    About,
+    Directory,
+    Journal,
+    file_sha256,
+    schema_of,
+    write_table,
+)
 from tests.support.campaigns import read_columns
 from tests.support.damage import NO_JSON
 
@@ -22,7 +29,13 @@ def row(case: int) -> dict[str, object]:
     return {"case": case, "why": "ä\n", "value": 0.1 * case, "whole": 3.0, "none": None}
 
 
-COLUMNS = {"case": "int64", "why": "text", "value": "float64", "whole": "float64", "none": "float64"}
+COLUMNS = {
+    "case": "int64",
+    "why": "text",
+    "value": "float64",
+    "whole": "float64",
+    "none": "float64",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -73,11 +86,17 @@ def test_a_table_is_the_same_bytes_whatever_the_order_and_the_pauses(tmp_path: P
         journal = Journal(tmp_path / str(turn), 20)
         assert journal.done == 20 and journal.blocks == 3
         path = tmp_path / f"{turn}.parquet"
-        write_table(path, schema_of(COLUMNS, {"a": "b"}), (journal.rows(block) for block in range(journal.blocks)))
+        write_table(
+            path,
+            schema_of(COLUMNS, {"a": "b"}),
+            (journal.rows(block) for block in range(journal.blocks)),
+        )
         found.append(file_sha256(path))
     assert len(set(found)) == 1
     columns = read_columns(path)
-    assert columns["case"] == list(range(20)) and columns["value"] == [0.1 * case for case in range(20)]
+    assert columns["case"] == list(range(20)) and columns["value"] == [
+        0.1 * case for case in range(20)
+    ]
     journal.remove()
     assert not (tmp_path / "2").exists()
 
@@ -93,7 +112,9 @@ def test_a_full_block_that_lost_rows_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [*NO_JSON, b"[]", b'{"case":"1"}', b"{}"])
-def test_a_line_that_is_no_row_is_dropped_though_its_checksum_is_right(tmp_path: Path, text: bytes) -> None:
+def test_a_line_that_is_no_row_is_dropped_though_its_checksum_is_right(
+    tmp_path: Path, text: bytes
+) -> None:
     journal = Journal(tmp_path / "j", 6)
     journal.append([row(case) for case in range(3)])
     journal.close()
@@ -105,5 +126,8 @@ def test_a_line_that_is_no_row_is_dropped_though_its_checksum_is_right(tmp_path:
 @pytest.mark.parametrize("text", NO_JSON)
 def test_a_campaign_file_that_is_none_is_refused(tmp_path: Path, text: bytes) -> None:
     (tmp_path / "campaign.json").write_bytes(text)
-    with contextlib.closing(Directory(tmp_path)) as directory, pytest.raises(InputError, match=r"campaign\.json"):
+    with (
+        contextlib.closing(Directory(tmp_path)) as directory,
+        pytest.raises(InputError, match=r"campaign\.json"),
+    ):
         directory.claim(About({}, "", {}, "centroids", False, {}))

@@ -19,13 +19,27 @@ from hilstar.instruments.certify.budget import Input, by_trials, first_order, wh
 from hilstar.instruments.certify.check import compare, take_check
 from hilstar.instruments.certify.estimates import light_deviation, place_errors
 from hilstar.instruments.certify.lens import lens_fit
-from hilstar.instruments.certify.readings import LightReadings, VirtualReader, dot_places, geometry_of, grey_response
+from hilstar.instruments.certify.readings import (
+    LightReadings,
+    VirtualReader,
+    dot_places,
+    geometry_of,
+    grey_response,
+)
 from hilstar.instruments.certify.structure import in_place
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.record.ledger_records import read_head
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.planted_certify import BENCH, REGIONS, coverage, coverage_by_images, drawn, plant, stated_lens
+from tests.support.planted_certify import (
+    BENCH,
+    REGIONS,
+    coverage,
+    coverage_by_images,
+    drawn,
+    plant,
+    stated_lens,
+)
 from tests.support.planted_readings import (
     ARCSEC,
     DELAY_MS,
@@ -54,8 +68,19 @@ DIRECTION = "[certify.tracker]\ndirection_expanded_arcsec = 0.0\n"
 
 def test_intervals_hold_the_truth_of_planted_benches() -> None:
     held = coverage(KINDS["as supposed"], BENCHES, 7)
-    assert {quantity for quantity, _ in held} >= {"flux", "place_along", "place_across", "attitude_x", "attitude_z", "latency"}
-    assert {region for quantity, region in held if quantity == "flux"} == {"left third", "middle third", "right third"}
+    assert {quantity for quantity, _ in held} >= {
+        "flux",
+        "place_along",
+        "place_across",
+        "attitude_x",
+        "attitude_z",
+        "latency",
+    }
+    assert {region for quantity, region in held if quantity == "flux"} == {
+        "left third",
+        "middle third",
+        "right third",
+    }
     for where, counted in held.items():
         assert abs(np.mean(counted.held) - 0.95) < FAR, (where, np.mean(counted.held))
         assert 1 / LONGEST < counted.ratio < LONGEST, where
@@ -63,9 +88,18 @@ def test_intervals_hold_the_truth_of_planted_benches() -> None:
 
 # What each has wrong where it is hard, and the figures that it moves.
 HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] = {
-    "readings in time": (lambda rng: replace(supposed(rng), lasts_readings=20.0), ("latency", "flux")),
-    "dots over 60 px": (lambda rng: dots_in_place(rng, 60, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
-    "dots over 200 px": (lambda rng: dots_in_place(rng, 200, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
+    "readings in time": (
+        lambda rng: replace(supposed(rng), lasts_readings=20.0),
+        ("latency", "flux"),
+    ),
+    "dots over 60 px": (
+        lambda rng: dots_in_place(rng, 60, 0.5),
+        ("place_along", "place_across", "attitude_x", "attitude_y"),
+    ),
+    "dots over 200 px": (
+        lambda rng: dots_in_place(rng, 200, 0.5),
+        ("place_along", "place_across", "attitude_x", "attitude_y"),
+    ),
     "light over 30 px": (lambda rng: uneven(rng, 30, 0.01), ("flux",)),
 }
 
@@ -130,7 +164,9 @@ IN_PHASE = (29, 66, 72, 85)
 @pytest.mark.parametrize("number", IN_PHASE)
 def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
     path = tmp_path / "bench.toml"
-    path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
     file = read_bench_file(path)
     one = supposed(np.random.default_rng((32, number)))
     x_px, y_px = dot_places(geometry_of(file))
@@ -157,14 +193,48 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
     and theirs are not wider.
     """
     path = tmp_path / "bench.toml"
-    path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
     file = read_bench_file(path)
-    codes = np.array([0, 255, 40, 80, 120, 160, 200, 0, 255, 40, 80, 120, 160, 200, 0, 255, 40, 80, 120, 160, 200, 0])
+    codes = np.array(
+        [
+            0,
+            255,
+            40,
+            80,
+            120,
+            160,
+            200,
+            0,
+            255,
+            40,
+            80,
+            120,
+            160,
+            200,
+            0,
+            255,
+            40,
+            80,
+            120,
+            160,
+            200,
+            0,
+        ]
+    )
     shape = np.where(codes == 255, 10.0, 1.0)
     rng = np.random.default_rng(4)
     light = (grey_response(file).light[codes] + 1e-3) * 1e6
-    noisy = light * (1 + 1e-4 * shape * np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal()))
-    deviation = light_deviation(file, LightReadings(codes, noisy, np.zeros(len(codes)), noise_shape=shape))
+    noisy = light * (
+        1
+        + 1e-4
+        * shape
+        * np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal())
+    )
+    deviation = light_deviation(
+        file, LightReadings(codes, noisy, np.zeros(len(codes)), noise_shape=shape)
+    )
     sigma = np.linalg.norm(deviation.factors, axis=1) / deviation.value
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
 
@@ -215,7 +285,12 @@ def checked(tmp_path_factory: pytest.TempPathFactory):
     """A planted bench, its readings at its certificate, and a function that checks it with other
     things planted.
     """
-    one = dataclasses.replace(drawn(np.random.default_rng(5)), reading_noise=0.002, dot_noise_px=0.02, drift_percent_per_h=0.0)
+    one = dataclasses.replace(
+        drawn(np.random.default_rng(5)),
+        reading_noise=0.002,
+        dot_noise_px=0.02,
+        drift_percent_per_h=0.0,
+    )
     folder = tmp_path_factory.mktemp("check")
     bench, truth = (read_bench_file(path) for path in plant(folder, one))
     reference = take_check(bench, VirtualReader(bench, truth, 0))
@@ -230,8 +305,12 @@ def checked(tmp_path_factory: pytest.TempPathFactory):
                 new = now * value if name == "white" else now + value
             changed = dataclasses.replace(changed, **{name: new})
         as_it_is = read_bench_file(plant(folder, changed)[1])
-        tracker = msgspec.structs.replace(as_it_is.config.tracker, psf_sigma_px=(0.55 * focus, 0.55 * focus))
-        as_it_is = dataclasses.replace(as_it_is, config=msgspec.structs.replace(as_it_is.config, tracker=tracker))
+        tracker = msgspec.structs.replace(
+            as_it_is.config.tracker, psf_sigma_px=(0.55 * focus, 0.55 * focus)
+        )
+        as_it_is = dataclasses.replace(
+            as_it_is, config=msgspec.structs.replace(as_it_is.config, tracker=tracker)
+        )
         return compare(bench, reference, take_check(bench, VirtualReader(bench, as_it_is, seed, 1)))
 
     return check
@@ -251,7 +330,11 @@ def test_a_check_is_quiet_where_nothing_moved(checked) -> None:
     for seed in range(UNCHANGED):
         figures = checked(seed)
         assert all(each.in_tolerance for each in figures), seed
-        assert all(abs(each.value) < 6 * each.standard_uncertainty for each in figures if each.quantity != "psf")
+        assert all(
+            abs(each.value) < 6 * each.standard_uncertainty
+            for each in figures
+            if each.quantity != "psf"
+        )
 
 
 def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
@@ -283,28 +366,61 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
 
 @pytest.mark.usefixtures("without_charts")
 def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
-    bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION)
+    bench, truth = plant(
+        tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION
+    )
     words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
     number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
-    bench.write_text(bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"'))
-    assert run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode == 0
+    bench.write_text(
+        bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"')
+    )
+    assert (
+        run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode
+        == 0
+    )
     assert fits.getheader(tmp_path / "a.fits")["CERTIF"] == number
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0.0,1,0,0,0\n0.1,1,0,0,0\n")
-    words = ("replay", bench, tmp_path / "log.csv", "--headless", "--speed", "max", "--ledger", tmp_path / "run.mcap")
+    words = (
+        "replay",
+        bench,
+        tmp_path / "log.csv",
+        "--headless",
+        "--speed",
+        "max",
+        "--ledger",
+        tmp_path / "run.mcap",
+    )
     assert run_hilstar_here(*words).returncode == 0
     assert read_head(tmp_path / "run.mcap")["certificate"] == number
     ledger, telemetry = write_run(
-        tmp_path, planted_run, bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}})
+        tmp_path,
+        planted_run,
+        bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}}),
     )
-    words = ("assess", ledger, telemetry, "-o", tmp_path / "assessed", "--json", "--display-attitudes", "0")
+    words = (
+        "assess",
+        ledger,
+        telemetry,
+        "-o",
+        tmp_path / "assessed",
+        "--json",
+        "--display-attitudes",
+        "0",
+    )
     part = msgspec.json.decode(run_hilstar_here(*words).stdout)["bench"]
     assert part["certificate"] == number
     assert 0 < part["share_of_bias"]["cross"] <= 1
     assert "could have made" in (tmp_path / "assessed" / "budget.html").read_text()
     (tmp_path / "out" / "certificate.json").write_text("{}")
-    assert_refused(run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "b.fits"), 2, "is no certificate")
+    assert_refused(
+        run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "b.fits"),
+        2,
+        "is no certificate",
+    )
 
 
 @pytest.fixture(scope="module")
 def planted_run() -> Planted:
-    return plant_tracker(scan, Sizes(wild=5, offset_s=0.02), np.random.default_rng(11), seconds=60.0)
+    return plant_tracker(
+        scan, Sizes(wild=5, offset_s=0.02), np.random.default_rng(11), seconds=60.0
+    )

@@ -58,7 +58,9 @@ class Field:
 
     def frame(self):
         size_px = self.bench.camera.resolution_px
-        sprites = pack_sprites(self.x_px, self.y_px, self.flux, self.sprites.star, size_px, self.sprites.footprint_px)
+        sprites = pack_sprites(
+            self.x_px, self.y_px, self.flux, self.sprites.star, size_px, self.sprites.footprint_px
+        )
         self.bench.renderer.draw(sprites)
         return replace(self.golden, light=self.bench.renderer.linear()[np.newaxis].copy())
 
@@ -66,7 +68,11 @@ class Field:
         return compare(self.frame(), self.golden).bad
 
 
-SKIES = {"default": "", "faint stars": "[sky]\nfaintest_v_mag = 9.5\n", "wide": "[render]\nsprite_sigma_px = [1.6, 0.6]\n"}
+SKIES = {
+    "default": "",
+    "faint stars": "[sky]\nfaintest_v_mag = 9.5\n",
+    "wide": "[render]\nsprite_sigma_px = [1.6, 0.6]\n",
+}
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +113,11 @@ def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
     bench = benches[sky]
     field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
     oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.psf)
-    for one, other in ((field.golden, oracle), (oracle, field.golden), (field.golden.linear, oracle)):
+    for one, other in (
+        (field.golden, oracle),
+        (oracle, field.golden),
+        (field.golden.linear, oracle),
+    ):
         stars = assert_same_sky(one, other).stars
         assert np.mean([abs(star.flux_error_mag) < DRIVER_MAG for star in stars]) > DRIVER_SHARE
         assert np.mean([star.centroid_error_px < DRIVER_PX for star in stars]) > DRIVER_SHARE
@@ -122,7 +132,9 @@ def test_one_star_shifted_by_a_fiftieth_of_a_pixel_is_named(field, which):
     field.y_px[k] -= 0.8 * FAULT_PX
     (star,) = field.bad()
     assert star.kind == "changed" and star.hip == (field.hip[k],)
-    assert (star.dx_px, star.dy_px) == pytest.approx((0.6 * FAULT_PX, -0.8 * FAULT_PX), abs=MEASURED_PX)
+    assert (star.dx_px, star.dy_px) == pytest.approx(
+        (0.6 * FAULT_PX, -0.8 * FAULT_PX), abs=MEASURED_PX
+    )
     assert star.flux_error_mag == pytest.approx(0, abs=MEASURED_MAG)
 
 
@@ -148,9 +160,13 @@ def test_a_star_gone_a_star_too_many_and_a_star_moved_are_told_apart(field):
     assert "Not the same sky" in lines[0] and "1 changed, 2 missing, 1 extra" in lines[0]
     assert len(lines) == 5
     for k in (gone, far):
-        assert any(line.startswith(f"HIP {field.hip[k]} at") and "missing" in line for line in lines[1:])
+        assert any(
+            line.startswith(f"HIP {field.hip[k]} at") and "missing" in line for line in lines[1:]
+        )
     assert f"star at ({field.x_px[far]:.1f}, {field.y_px[far]:.1f}): extra" in str(failure.value)
-    assert f"HIP {field.hip[moved]} at" in lines[4] and "1.5000 px (+1.5000, +0.0000) off" in lines[4]
+    assert (
+        f"HIP {field.hip[moved]} at" in lines[4] and "1.5000 px (+1.5000, +0.0000) off" in lines[4]
+    )
 
 
 def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(field):
@@ -160,7 +176,9 @@ def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(field):
     golden = field.frame()
     (star,) = compare(frame, golden.linear).bad
     assert star.kind == "extra" and star.hip == (field.hip[k],)
-    assert star.flux_e_per_s == pytest.approx(frame.truth["electrons_per_s"][frame.truth["hip"] == field.hip[k]][0], rel=1e-3)
+    assert star.flux_e_per_s == pytest.approx(
+        frame.truth["electrons_per_s"][frame.truth["hip"] == field.hip[k]][0], rel=1e-3
+    )
 
 
 def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_is_named(field):
@@ -176,7 +194,11 @@ def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_
         field.flux[odd] /= 0.9
         assert found.common is not None and not found.same
         assert found.common.shift_px == pytest.approx((right, down), abs=MEASURED_PX)
-        assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (0, 0, 0)
+        assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (
+            0,
+            0,
+            0,
+        )
         (named,) = [star for star in found.differing if star.hip == (int(field.hip[odd]),)]
         assert named.flux_error_mag == pytest.approx(2.5 * np.log10(1 / 0.9), abs=MEASURED_MAG)
         # Stars that share their light with a neighbour may be one star there and two here; in this
@@ -238,7 +260,9 @@ def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(field):
 
 def grid(x_px, y_px, flux, sigma_px=(0.85, 0.85), size_px=(160, 120)):
     x_px, y_px, flux = (np.asarray(values, dtype=float) for values in (x_px, y_px, flux))
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), size_px, GaussianPsf(sigma_px).footprint_px)
+    sprites = pack_sprites(
+        x_px, y_px, flux, np.arange(len(flux)), size_px, GaussianPsf(sigma_px).footprint_px
+    )
     return linear_image(sprites, size_px, GaussianPsf(sigma_px)).astype(np.float32)
 
 
@@ -248,10 +272,15 @@ def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
     """The other's light in its window is no fault of the neighbour, 100 times fainter as that
     one may be.
     """
-    x, y = np.array([60.2, 60.2 + apart_px, 120.4, 20.1, 130.3]), np.array([50.3, 50.1, 90.2, 99.7, 20.5])
+    x, y = (
+        np.array([60.2, 60.2 + apart_px, 120.4, 20.1, 130.3]),
+        np.array([50.3, 50.1, 90.2, 99.7, 20.5]),
+    )
     flux = np.array([1e6, 1e6 * ratio, 3e5, 3e5, 3e5])
     golden, truth = grid(x, y, flux), np.zeros(5, dtype=TRUTH_DTYPE)
-    for name, values in zip(("hip", "x_px", "y_px", "electrons_per_s"), (np.arange(1, 6), x, y, flux), strict=True):
+    for name, values in zip(
+        ("hip", "x_px", "y_px", "electrons_per_s"), (np.arange(1, 6), x, y, flux), strict=True
+    ):
         truth[name] = values
     for k in (0, 1):
         changed = np.arange(5) == k
@@ -265,7 +294,9 @@ def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
             # Without a table a star that outshines its neighbour hides it; what that one does is
             # still seen, and where.
             bad = compare(frame, golden).bad
-            assert bad and all(abs(star.x_px - x[k]) < 2 and abs(star.y_px - y[k]) < 2 for star in bad)
+            assert bad and all(
+                abs(star.x_px - x[k]) < 2 and abs(star.y_px - y[k]) < 2 for star in bad
+            )
 
 
 def test_a_blend_is_one_star_with_both_names(field):
@@ -287,7 +318,9 @@ def test_a_star_cut_by_the_edge_is_compared(x_px):
     places, flux = ([x_px, 80.3], [60.2, 40.4]), np.array([2e4, 1e6])
     golden = grid(*places, flux)
     (star,) = compare(grid([x_px + FAULT_PX, 80.3], places[1], flux), golden).bad
-    assert star.dx_px == pytest.approx(FAULT_PX, rel=0.05) and star.x_px == pytest.approx(x_px, abs=0.01)
+    assert star.dx_px == pytest.approx(FAULT_PX, rel=0.05) and star.x_px == pytest.approx(
+        x_px, abs=0.01
+    )
     (star,) = compare(grid(*places, flux * [10 ** (-0.4 * FAULT_MAG), 1]), golden).bad
     assert star.flux_error_mag == pytest.approx(FAULT_MAG, rel=0.05)
 
@@ -316,7 +349,10 @@ def test_files_arrays_and_frames_are_one_sky(field, tmp_path):
     k = field.inside()[0]
     field.x_px[k] += FAULT_PX
     frame = field.frame()
-    for golden, truth in ((str(tmp_path / "golden.fits"), tmp_path / "truth.csv"), (tmp_path / "golden.fits", None)):
+    for golden, truth in (
+        (str(tmp_path / "golden.fits"), tmp_path / "truth.csv"),
+        (tmp_path / "golden.fits", None),
+    ):
         (star,) = compare(frame.linear if truth else frame, golden, truth=truth).bad
         assert star.hip == (field.hip[k],)
     (star,) = compare(frame.linear, field.golden.linear).bad
@@ -343,6 +379,8 @@ def test_what_is_no_sky_is_refused(field):
     with pytest.raises(InputError, match="centroid_px"):
         assert_same_sky(golden, golden, centroid_px=float("nan"))
     with pytest.raises(InputError, match="truth table"):
-        assert_same_sky(golden, golden, truth=field.bench.frame(from_radec_roll_deg(280, 35, 20)).truth)
+        assert_same_sky(
+            golden, golden, truth=field.bench.frame(from_radec_roll_deg(280, 35, 20)).truth
+        )
     with pytest.raises(AssertionError, match="missing"):
         assert_same_sky(nothing, golden)

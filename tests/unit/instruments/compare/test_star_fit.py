@@ -20,7 +20,9 @@ def test_normal_matrix_and_fit_are_those_of_the_columns(rng):
     assert np.abs(templates.normal.toarray() - columns.T @ columns).max() < ROUNDING
     assert np.abs(templates.in_view - columns[:, ::3].sum(axis=0)).max() < ROUNDING
     image = columns @ rng.uniform(1, 2, 180)
-    alone = StarTemplates(np.array([[8.2, 9.7], [30.1, 20.4]]), GaussianPsf(SIGMA_PX), SIZE_PX[::-1])
+    alone = StarTemplates(
+        np.array([[8.2, 9.7], [30.1, 20.4]]), GaussianPsf(SIGMA_PX), SIZE_PX[::-1]
+    )
     dense = np.stack([alone.image(unit).ravel() for unit in np.eye(6)], axis=1)
     wanted = np.linalg.lstsq(dense, image, rcond=None)[0].reshape(2, 3)
     assert np.allclose(alone.fit(image.reshape(30, 40)), wanted, rtol=1e-10)

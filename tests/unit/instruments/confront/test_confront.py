@@ -20,7 +20,17 @@ from hilstar.attitude.logs.earth import q_icrs_to_enu
 from hilstar.basics.rotation import conjugate, rotate
 from hilstar.instruments.confront import page
 from tests.support.commands import run_hilstar_here
-from tests.support.planted_sky import HEIGHT, NOTHING_WRONG, SKY, WIDTH, Extras, Planted, photograph, rotation_of, write_bench
+from tests.support.planted_sky import (
+    HEIGHT,
+    NOTHING_WRONG,
+    SKY,
+    WIDTH,
+    Extras,
+    Planted,
+    photograph,
+    rotation_of,
+    write_bench,
+)
 from tests.support.skies import STATION_TLE, skyfield
 
 RAW = sorted((Path(__file__).parents[3] / "data" / "confront").glob("*.tiff"))
@@ -43,7 +53,9 @@ NEAR_PX = 1.0
 WRONG = Extras(false_stars=FALSE_STARS, trail_px=((60, 60), (200, 110)), cloud_mag=1.5)
 
 
-def confronted(bench: Path, images: list[Path], output: Path, *options: str, charts: bool = False) -> dict[str, Any]:
+def confronted(
+    bench: Path, images: list[Path], output: Path, *options: str, charts: bool = False
+) -> dict[str, Any]:
     """What the command finds. The page's charts are a third of its time: raw, held-out and
     planted photographs have them.
     """
@@ -69,7 +81,9 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
     return folder, confronted(bench, RAW[::2], folder / "out", charts=True)
 
 
-def test_raw_frames_give_the_camera_that_was_measured_apart(raw: tuple[Path, dict[str, Any]]) -> None:
+def test_raw_frames_give_the_camera_that_was_measured_apart(
+    raw: tuple[Path, dict[str, Any]],
+) -> None:
     _, found = raw
     camera = found["camera"]
     assert abs(206264.8 / camera["focal_length_px"] - 40.33) < 0.05  # arcsec a pixel
@@ -94,7 +108,14 @@ def test_raw_frames_agree_within_the_aims(raw: tuple[Path, dict[str, Any]]) -> N
 
 def test_a_frame_that_was_held_out_agrees_as_well(raw: tuple[Path, dict[str, Any]]) -> None:
     folder, fitted = raw
-    found = confronted(folder / "out" / "tracker.toml", RAW[1:2], folder / "held", "--fixed", "--strict", charts=True)
+    found = confronted(
+        folder / "out" / "tracker.toml",
+        RAW[1:2],
+        folder / "held",
+        "--fixed",
+        "--strict",
+        charts=True,
+    )
     image = found["images"][0]
     assert image["rms_px"] < HELD_OUT * fitted["excess"]["rms_px"]
     assert image["rms_mag"] < HELD_OUT * fitted["excess"]["rms_mag"]
@@ -104,11 +125,23 @@ def test_a_frame_that_was_held_out_agrees_as_well(raw: tuple[Path, dict[str, Any
 
 def test_frame_and_simulate_take_the_tracker_file(raw: tuple[Path, dict[str, Any]]) -> None:
     folder, found = raw
-    tracker, q = folder / "out" / "tracker.toml", ",".join(map(str, found["images"][0]["q_icrs_to_cam"]))
-    done = run_hilstar_here("simulate", tracker, f"--quaternion={q}", "--dn-png", folder / "like.png")
+    tracker, q = (
+        folder / "out" / "tracker.toml",
+        ",".join(map(str, found["images"][0]["q_icrs_to_cam"])),
+    )
+    done = run_hilstar_here(
+        "simulate", tracker, f"--quaternion={q}", "--dn-png", folder / "like.png"
+    )
     assert done.returncode == 0, done.stderr
-    assert run_hilstar_here("frame", tracker, f"--quaternion={q}", "--preview", folder / "frame.png").returncode == 0
-    levels = [float(np.median(np.asarray(Image.open(path)))) for path in (folder / "like.png", RAW[0])]
+    assert (
+        run_hilstar_here(
+            "frame", tracker, f"--quaternion={q}", "--preview", folder / "frame.png"
+        ).returncode
+        == 0
+    )
+    levels = [
+        float(np.median(np.asarray(Image.open(path)))) for path in (folder / "like.png", RAW[0])
+    ]
     # two skies of 3161 and 2032 DN have one mean
     assert levels[0] == pytest.approx(levels[1], rel=0.35)
 
@@ -123,14 +156,23 @@ def photographs(folder: Path, camera: Planted) -> list[Path]:
     return paths
 
 
-def test_a_planted_camera_comes_back_within_its_errors_and_what_was_planted_is_named(tmp_path: Path) -> None:
+def test_a_planted_camera_comes_back_within_its_errors_and_what_was_planted_is_named(
+    tmp_path: Path,
+) -> None:
     camera = Planted(hot=HOT)
-    found = confronted(write_bench(tmp_path / "guess.toml"), photographs(tmp_path, camera), tmp_path / "out", charts=True)
+    found = confronted(
+        write_bench(tmp_path / "guess.toml"),
+        photographs(tmp_path, camera),
+        tmp_path / "out",
+        charts=True,
+    )
     figures = found["camera"]
     sigma = figures["sigma"]
     assert abs(figures["focal_length_px"] - camera.focal_px) < SIGMAS * sigma["focal_length_px"]
     assert abs(figures["distortion"]["k1"] - camera.k1) < SIGMAS * sigma["k1"]
-    for value, true, error in zip(figures["principal_point_px"], camera.centre_px, sigma["principal_point_px"], strict=True):
+    for value, true, error in zip(
+        figures["principal_point_px"], camera.centre_px, sigma["principal_point_px"], strict=True
+    ):
         assert abs(value - true) < SIGMAS * error
     assert abs(figures["gain_e_per_dn"] - camera.gain_e_per_dn) < SIGMAS * sigma["gain_e_per_dn"]
     assert figures["colour_term"] == pytest.approx(camera.colour, abs=0.02)
@@ -138,9 +180,15 @@ def test_a_planted_camera_comes_back_within_its_errors_and_what_was_planted_is_n
     assert figures["hot_pixels"] == len(HOT)
     assert found["images"][0]["dim"][0].startswith("lower right")
     assert not any(image["dim"] for image in found["images"][1:])
-    others = [r for r in rows_of(tmp_path / "out" / "sources.csv") if r["image"] and not r["explained_by"].startswith("HIP ")]
+    others = [
+        r
+        for r in rows_of(tmp_path / "out" / "sources.csv")
+        if r["image"] and not r["explained_by"].startswith("HIP ")
+    ]
     named = [r for r in others if float(r["snr"]) >= 8]
-    words = {r["explained_by"].rstrip("0123456789 pxlong,") for r in named} - {"light of a bright star"}
+    words = {r["explained_by"].rstrip("0123456789 pxlong,") for r in named} - {
+        "light of a bright star"
+    }
     assert sorted(words) == ["", "a hot pixe", "a trai"]
     unexplained = [(float(r["x_px"]), float(r["y_px"])) for r in named if not r["explained_by"]]
     assert len(unexplained) == len(FALSE_STARS)
@@ -157,13 +205,17 @@ extinction = 0.15
 TIMES = ("20T20:00:00", "20T23:00:00", "21T01:00:00")  # of September 2020
 
 
-def test_a_site_tells_air_mass_and_extinction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_site_tells_air_mass_and_extinction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # as where photographs are more than memory holds
     monkeypatch.setattr("hilstar.instruments.confront.run.MEMORY_PX", 0)
     camera, rng, paths, wanted = Planted(), np.random.default_rng(8), [], []
     for time in TIMES:
         t_ns = np.datetime64(f"2020-09-{time}", "ns").astype(np.int64)
-        up = rotate(conjugate(q_icrs_to_enu(np.array([t_ns]), 40.0, 10.0)[0]), np.array([[0.0, 0.0, 1.0]]))[0]
+        up = rotate(
+            conjugate(q_icrs_to_enu(np.array([t_ns]), 40.0, 10.0)[0]), np.array([[0.0, 0.0, 1.0]])
+        )[0]
         extras = Extras(zenith=tuple(up), k_mag=0.25)
         wanted.append(1 / float(rotation_of(*SKY.pointings[2])[2] @ up))
         paths.append(tmp_path / f"night_2020-09-{time.replace(':', '-')}.png")
@@ -174,14 +226,24 @@ def test_a_site_tells_air_mass_and_extinction(tmp_path: Path, monkeypatch: pytes
     assert abs(figures["extinction_mag_per_air_mass"] - 0.25) < SIGMAS * sigma
     assert sigma < 0.03
     # aberration
-    assert abs(figures["focal_length_px"] - camera.focal_px) < SIGMAS * figures["sigma"]["focal_length_px"] + 0.3
+    assert (
+        abs(figures["focal_length_px"] - camera.focal_px)
+        < SIGMAS * figures["sigma"]["focal_length_px"] + 0.3
+    )
     masses = [image["air_mass"] for image in found["images"]]
     assert masses == pytest.approx(wanted, abs=0.01)
     assert all(image["rms_px"] < MAX_RMS_PX for image in found["images"])
     # 600 e- in 68.75 arcsec squared, where 6e6 are V = 0; a night sky of that V has more red light
     # than such a star
     assert 19.18 < found["images"][0]["sky_v_mag_arcsec2"] < 19.6
-    done = run_hilstar_here("simulate", tmp_path / "out" / "tracker.toml", "--radec", "310,40,110", "-o", tmp_path / "a.fits")
+    done = run_hilstar_here(
+        "simulate",
+        tmp_path / "out" / "tracker.toml",
+        "--radec",
+        "310,40,110",
+        "-o",
+        tmp_path / "a.fits",
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -210,7 +272,9 @@ def test_a_photograph_that_cannot_be_used_is_refused_with_what_to_do(
 
 def refused(folder: Path, image: np.ndarray[Any, Any], name: str, says: str) -> None:
     Image.fromarray(image).save(folder / name)
-    done = run_hilstar_here("confront", write_bench(folder / "guess.toml"), folder / name, "-o", folder / "out")
+    done = run_hilstar_here(
+        "confront", write_bench(folder / "guess.toml"), folder / name, "-o", folder / "out"
+    )
     assert done.returncode == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
@@ -224,7 +288,10 @@ def test_mirrored_cropped_and_coloured_photographs_are_told_apart(tmp_path: Path
     colours = np.stack([image >> 4, image >> 5, image >> 6], axis=2).clip(0, 255).astype(np.uint8)
     refused(tmp_path, colours, "rgb.png", "three colours for each pixel")
     rng = np.random.default_rng(9)
-    false = tuple((rng.uniform(5, WIDTH - 5), rng.uniform(5, HEIGHT - 5), 10 ** rng.uniform(3.2, 5)) for _ in range(60))
+    false = tuple(
+        (rng.uniform(5, WIDTH - 5), rng.uniform(5, HEIGHT - 5), 10 ** rng.uniform(3.2, 5))
+        for _ in range(60)
+    )
     other = photograph(Planted(), SKY.pointings[1], rng, Extras(stars=False, false_stars=false))
     refused(tmp_path, other, "other.png", "no part of the sky fits them")
 
@@ -254,9 +321,13 @@ def test_a_date_that_is_ten_years_off_is_told_by_a_fast_star(tmp_path: Path) -> 
     Image.fromarray(image).save(tmp_path / "cygnus.png")
     bench = write_bench(tmp_path / "guess.toml")
     for year, off in (("2010", 10.0), ("2020", 0.0)):
-        found = confronted(bench, [tmp_path / "cygnus.png"], tmp_path / year, "--at", f"{year}-01-01T00:00:00")
+        found = confronted(
+            bench, [tmp_path / "cygnus.png"], tmp_path / year, "--at", f"{year}-01-01T00:00:00"
+        )
         image_figures = found["images"][0]
-        assert image_figures["date_off_years"] == pytest.approx(off, abs=max(3 * image_figures["date_sigma_years"], 0.5))
+        assert image_figures["date_off_years"] == pytest.approx(
+            off, abs=max(3 * image_figures["date_sigma_years"], 0.5)
+        )
 
 
 def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path) -> None:
@@ -268,28 +339,53 @@ def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path)
         below = wgs84.subpoint(station.at(when))
         latitude, longitude = below.latitude.degrees - 3, below.longitude.degrees
         seen = station - wgs84.latlon(latitude, longitude)
-        ends = [seen.at(times.tt_jd(when.tt + seconds / 86400)).radec()[:2] for seconds in (-1.0, 0.0, 1.0)]
+        ends = [
+            seen.at(times.tt_jd(when.tt + seconds / 86400)).radec()[:2]
+            for seconds in (-1.0, 0.0, 1.0)
+        ]
     places = [np.radians([ra.hours * 15, dec.degrees]) for ra, dec in ends]
-    vectors = np.array([(np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)) for r, d in places])
+    vectors = np.array(
+        [(np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)) for r, d in places]
+    )
     pointing = (*np.degrees(places[1]), 0.0)
     x, y, z = rotation_of(*pointing) @ vectors.T
     camera = Planted(epoch_jyear=2008.7, vignetting_mag=0.0)
-    trail = [(camera.centre_px[0] + 3000 * a / c, camera.centre_px[1] + 3000 * b / c) for a, b, c in zip(x, y, z, strict=True)]
+    trail = [
+        (camera.centre_px[0] + 3000 * a / c, camera.centre_px[1] + 3000 * b / c)
+        for a, b, c in zip(x, y, z, strict=True)
+    ]
     utc = when.utc_datetime().strftime("%Y-%m-%dT%H:%M:%S")
     t_ns = np.datetime64(utc, "ns").astype(np.int64)
-    up = rotate(conjugate(q_icrs_to_enu(np.array([t_ns]), latitude, longitude)[0]), np.array([[0.0, 0.0, 1.0]]))[0]
+    up = rotate(
+        conjugate(q_icrs_to_enu(np.array([t_ns]), latitude, longitude)[0]),
+        np.array([[0.0, 0.0, 1.0]]),
+    )[0]
     extras = Extras(trail_px=(trail[0], trail[2]), zenith=tuple(up))
-    Image.fromarray(photograph(camera, pointing, np.random.default_rng(4), extras)).save(tmp_path / "pass.png")
+    Image.fromarray(photograph(camera, pointing, np.random.default_rng(4), extras)).save(
+        tmp_path / "pass.png"
+    )
     (tmp_path / "tles.txt").write_text(STATION_TLE)
     keys = f"[site]\nlatitude_deg = {latitude}\nlongitude_deg = {longitude}\n"
     keys += '[sky]\nepoch_utc = "2008-09-20T12:00:00Z"\n[sky.bodies]\nsatellites = "tles.txt"\n'
-    confronted(write_bench(tmp_path / "guess.toml", more=keys), [tmp_path / "pass.png"], tmp_path / "out", "--at", utc)
-    trails = [row["explained_by"] for row in rows_of(tmp_path / "out" / "sources.csv") if " px long" in row["explained_by"]]
+    confronted(
+        write_bench(tmp_path / "guess.toml", more=keys),
+        [tmp_path / "pass.png"],
+        tmp_path / "out",
+        "--at",
+        utc,
+    )
+    trails = [
+        row["explained_by"]
+        for row in rows_of(tmp_path / "out" / "sources.csv")
+        if " px long" in row["explained_by"]
+    ]
     assert trails
     assert all(text.startswith("ISS (ZARYA), ") for text in trails)
 
 
-def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(tmp_path: Path) -> None:
+def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(
+    tmp_path: Path,
+) -> None:
     """The date that bodies need was left out; a gain that one photograph does not tell is the
     bench file's, or not written.
     """
@@ -304,5 +400,7 @@ def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(
     assert written["tracker"]["detector"].get("gain_e_per_dn") == given
     assert str(written["sky"]["epoch_utc"]).startswith("2020-09-20")
     radec = ",".join(map(str, SKY.pointings[2]))
-    done = run_hilstar_here("simulate", tmp_path / "out" / "tracker.toml", f"--radec={radec}", "-o", tmp_path / "a.fits")
+    done = run_hilstar_here(
+        "simulate", tmp_path / "out" / "tracker.toml", f"--radec={radec}", "-o", tmp_path / "a.fits"
+    )
     assert done.returncode == 0, done.stderr

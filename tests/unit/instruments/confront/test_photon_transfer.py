@@ -33,7 +33,9 @@ def fitted(images, bench=BENCH):
     images = list(images)
     levels = [sky_level(dn, 1.0).level for dn in images]
     points = [transfer_points(dn, level, EVERY) for dn, level in zip(images, levels, strict=True)]
-    pattern = fixed_pattern((dn - level, level, ~EVERY) for dn, level in zip(images, levels, strict=True))
+    pattern = fixed_pattern(
+        (dn - level, level, ~EVERY) for dn, level in zip(images, levels, strict=True)
+    )
     return fit_pixels(np.concatenate(points), 1.0, None, bench, pattern or NO_PATTERN)
 
 
@@ -55,7 +57,9 @@ def test_one_photograph_does_not_tell_the_gain_from_the_response(rng, ramp_e):
 
 
 def test_several_photographs_of_one_level_tell_the_gain_with_its_sigma(rng):
-    pixels = fitted(photographs(rng, [SKY_E] * 4), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E))
+    pixels = fitted(
+        photographs(rng, [SKY_E] * 4), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E)
+    )
     assert pixels.gain_told
     sigma = pixels.sigma["gain_e_per_dn"]
     assert sigma < 0.05 * GAIN
@@ -74,13 +78,17 @@ def test_columns_are_no_share_of_the_response(rng):
 def test_one_photograph_of_levels_that_differ_widely_tells_the_gain(rng):
     """From 200 to 30 000 e- shot noise and response part: the gain is the photograph's own."""
     levels_e = np.geomspace(200.0, 30_000.0, SHAPE[1])
-    pixels = fitted(photographs(rng, [levels_e]), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E))
+    pixels = fitted(
+        photographs(rng, [levels_e]), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E)
+    )
     assert pixels.gain_told
     assert abs(pixels.gain_e_per_dn - GAIN) < SIGMAS * pixels.sigma["gain_e_per_dn"]
 
 
 def test_a_gain_too_small_for_the_noise_is_named_with_the_least_that_is_possible(rng):
-    pixels = fitted(photographs(rng, [SKY_E], prnu=0.0), DetectorSettings(gain_e_per_dn=5, read_noise_e=READ_E))
+    pixels = fitted(
+        photographs(rng, [SKY_E], prnu=0.0), DetectorSettings(gain_e_per_dn=5, read_noise_e=READ_E)
+    )
     assert pixels.gain_e_per_dn == 5
     assert any("write [tracker.detector] gain_e_per_dn = 1" in note for note in pixels.notes)
     assert pixels.pattern.rms[0] == 0

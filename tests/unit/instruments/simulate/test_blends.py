@@ -32,10 +32,17 @@ def twin(tmp_path_factory):
 def pairs_of(twin: Twin, parted: float = 1.0) -> TwinField:
     """A field of pairs, each separation with each ratio of light, on a grid of the tracker."""
     sigma_px = max(Comparison(twin).finder.psf.width_px)
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(110, 290, len(SEPARATIONS)), np.linspace(110, 290, len(RATIOS))))
+    x, y = (
+        axis.ravel()
+        for axis in np.meshgrid(
+            np.linspace(110, 290, len(SEPARATIONS)), np.linspace(110, 290, len(RATIOS))
+        )
+    )
     separation = np.tile(SEPARATIONS, len(RATIOS)) * sigma_px * parted
     ratio = np.repeat(RATIOS, len(SEPARATIONS))
-    places = np.concatenate([np.column_stack([x, y]), np.column_stack([x + 0.6 * separation, y + 0.8 * separation])])
+    places = np.concatenate(
+        [np.column_stack([x, y]), np.column_stack([x + 0.6 * separation, y + 0.8 * separation])]
+    )
     u, v = twin.camera.tangents(*places.T)
     image = np.column_stack([u, v, np.ones_like(u)])
     vectors = image @ twin.camera.cam_to_image @ to_matrix(np.array(ORION_Q))
@@ -68,9 +75,14 @@ def test_the_sum_has_the_light_the_magnitude_and_the_centre_of_both(twin):
     summed = with_blends_as_one(seen, Comparison(twin).finder.psf)
     count = len(SEPARATIONS) * len(RATIOS)
     assert (len(seen.truth), len(summed.truth)) == (2 * count, count)
-    assert summed.truth["electrons_per_s"].sum() == pytest.approx(seen.truth["electrons_per_s"].sum())
+    assert summed.truth["electrons_per_s"].sum() == pytest.approx(
+        seen.truth["electrons_per_s"].sum()
+    )
     for place in ("x_px", "y_px"):
-        moments = [(field.truth["electrons_per_s"] * getattr(field, place)).sum() for field in (seen, summed)]
+        moments = [
+            (field.truth["electrons_per_s"] * getattr(field, place)).sum()
+            for field in (seen, summed)
+        ]
         assert moments[0] == pytest.approx(moments[1])
     by_hip = {int(row["hip"]): row for row in summed.truth}
     assert sorted(by_hip) == list(range(count))  # the brighter ones' names
@@ -85,7 +97,9 @@ def test_a_chain_of_stars_is_not_one_blend(twin):
     x_px, y_px = 100 + 0.9 * BLEND_SIGMAS * psf.width_px[0] * np.arange(n), np.full(n, 100.0)
     y_px[-1] = np.nan
     seen.truth["electrons_per_s"] = np.arange(n, 0, -1)
-    chain = TwinField(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px, seen.pixels_e)
+    chain = TwinField(
+        seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px, seen.pixels_e
+    )
     summed = with_blends_as_one(chain, psf)
     assert len(summed.truth) == n // 2 + 1
     assert np.isnan(summed.y_px).sum() == 1

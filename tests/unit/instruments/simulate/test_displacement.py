@@ -25,9 +25,14 @@ def displaced(seen_x, seen_y, moved_from, noise=None):
 
 def test_scale_rotation_and_shift_are_told_apart(rng):
     x, y = rng.uniform(0, 400, (2, 30))
-    dx, dy = 0.01 * (x - 199.5) - 0.002 * (y - 199.5) + 0.3, 0.01 * (y - 199.5) + 0.002 * (x - 199.5) - 0.1
+    dx, dy = (
+        0.01 * (x - 199.5) - 0.002 * (y - 199.5) + 0.3,
+        0.01 * (y - 199.5) + 0.002 * (x - 199.5) - 0.1,
+    )
     fit = fit_geometry(np.column_stack([x, y, dx, dy]), TRACKER, LIMIT_PX)
-    assert (fit.scale_error, fit.rotation_rad, *fit.offset_px) == pytest.approx((0.01, 0.002, 0.3, -0.1))
+    assert (fit.scale_error, fit.rotation_rad, *fit.offset_px) == pytest.approx(
+        (0.01, 0.002, 0.3, -0.1)
+    )
     assert (fit.tilt_rad, fit.k1, fit.tilt_px, fit.distortion_px) == ((0, 0), 0, 0, 0)
     assert fit.left < 1e-20
 
@@ -59,12 +64,18 @@ def test_noise_alone_names_no_lens_and_no_tilt(rng):
     for _ in range(50):
         x, y = rng.uniform(-0.2, 0.2, (2, 40))
         noise = rng.normal(0, NOISE_PX, (2, 40))
-        fit = fit_geometry(displaced(x, y, lambda u, v: (1.01 * u, 1.01 * v), noise), TRACKER, LIMIT_PX)
+        fit = fit_geometry(
+            displaced(x, y, lambda u, v: (1.01 * u, 1.01 * v), noise), TRACKER, LIMIT_PX
+        )
         assert max(fit.tilt_px, fit.distortion_px) < LIMIT_PX
         assert fit.scale_error == pytest.approx(1 / 1.01 - 1, abs=1e-4)
 
 
 def test_what_no_lens_does_is_said_to_be_left(rng):
     x, y = rng.uniform(-0.2, 0.2, (2, 200))
-    fit = fit_geometry(displaced(x, y, lambda u, v: (1.05 * u + 5e-4 * np.sin(60 * v), 1.05 * v)), TRACKER, LIMIT_PX)
+    fit = fit_geometry(
+        displaced(x, y, lambda u, v: (1.05 * u + 5e-4 * np.sin(60 * v), 1.05 * v)),
+        TRACKER,
+        LIMIT_PX,
+    )
     assert fit.left_px > 2 * LIMIT_PX

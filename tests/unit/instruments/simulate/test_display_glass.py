@@ -20,7 +20,13 @@ from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
-from hilstar.server.bench.cameras import before_detector, bench_camera, display_psfs, tracker_camera, tracker_psf
+from hilstar.server.bench.cameras import (
+    before_detector,
+    bench_camera,
+    display_psfs,
+    tracker_camera,
+    tracker_psf,
+)
 from hilstar.server.bench.frame import drawn_line
 from hilstar.server.bench.least_psf import candidates, least_psf, psf_errors
 from tests.support.benches import ORION_Q, bench_text
@@ -28,7 +34,12 @@ from tests.support.commands import run_hilstar_here
 from tests.support.glass import SIDE_PX, moments, stack
 from tests.support.psfs import coma, sampled
 
-TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
+TRACKER = {
+    "resolution_px": [SIDE_PX, SIDE_PX],
+    "focal_length_mm": 12,
+    "exposure_s": 0.2,
+    "transmission": None,
+}
 SMALL = {"points": 3, "wavelengths_nm": (450.0, 750.0)}
 # Monitor pixels to a tracker pixel, and a relay's blur, without which both grids beat: 0.01 px in a
 # star's place.
@@ -65,9 +76,15 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
         table, glass = exposure.truth, simulator.glass
         shares = glass.shares_of(simulator.stars, table["hip"])
         exact = glass.psf.of_stars(table["x_px"], table["y_px"], shares, np.ones(len(table)))
-    with open_bench(file) as shown, TwinOptics(BenchGeometry(shown.camera, camera), shown.tracker_psf) as optics:
+    with (
+        open_bench(file) as shown,
+        TwinOptics(BenchGeometry(shown.camera, camera), shown.tracker_psf) as optics,
+    ):
         assert isinstance(shown.psf, GlassPsf)
-        assert "each star by its place and spectrum; exact; one PSF for all stars would be" in drawn_line(shown)
+        assert (
+            "each star by its place and spectrum; exact; one PSF for all stars would be"
+            in drawn_line(shown)
+        )
         frame = shown.frame(q)
         lit = [frame.linear.astype(np.float64), shown_light(frame.levels, shown.panel)]
         images = [optics.image_e_per_s(light) * TRACKER["exposure_s"] for light in lit]
@@ -75,7 +92,9 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
     zones = set()
     for row, stamp in zip(table, exact, strict=True):
         line, column = round(row["y_px"]), round(row["x_px"])
-        parts = [image[max(line - 8, 0) : line + 9, max(column - 8, 0) : column + 9] for image in images]
+        parts = [
+            image[max(line - 8, 0) : line + 9, max(column - 8, 0) : column + 9] for image in images
+        ]
         alone = (np.hypot(table["x_px"] - row["x_px"], table["y_px"] - row["y_px"]) < 22).sum() == 1
         if not alone or parts[0].shape != (17, 17):
             continue
@@ -84,7 +103,9 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
         true_px = row["x_centroid_px"] - column, row["y_centroid_px"] - line
         assert linear[0] == pytest.approx(light, rel=FLUX)
         assert linear[1:3] == pytest.approx(true_px, abs=CENTROID_PX)
-        assert linear[3:] - wanted[3:] == pytest.approx((1 / 6 + RELAY_PX**2) / SCALE**2, rel=WIDENED)
+        assert linear[3:] - wanted[3:] == pytest.approx(
+            (1 / 6 + RELAY_PX**2) / SCALE**2, rel=WIDENED
+        )
         assert codes[1:3] == pytest.approx(true_px, abs=CODES_PX)
         zones.add((3 * line // SIDE_PX, 3 * column // SIDE_PX))
     assert len(zones) == 9
@@ -127,10 +148,14 @@ def test_a_gaussian_and_one_image_are_scaled_to_the_display(bench, tmp_path):
     with open_bench(file) as shown:
         assert shown.psf.width_px == pytest.approx((0.5 * SCALE, 0.7 * SCALE))
         assert shown.tracker_psf.width_px[0] < 0.01
-        blur = before_detector(bench(relay_px=0.8, psf="gaussian").config, tmp_path, shown.camera).width_px
+        blur = before_detector(
+            bench(relay_px=0.8, psf="gaussian").config, tmp_path, shown.camera
+        ).width_px
         own = tracker_psf(bench().config.tracker, tmp_path).width_px
     assert np.square(blur) - np.square(own) == pytest.approx((0.8 / SCALE) ** 2, rel=0.05)
-    samples, per_px = regridded(sampled(coma(), 4, 7)[None] / 16, 4, np.array([[0.0, -SCALE], [SCALE, 0.0]]))
+    samples, per_px = regridded(
+        sampled(coma(), 4, 7)[None] / 16, 4, np.array([[0.0, -SCALE], [SCALE, 0.0]])
+    )
     assert samples.sum() == pytest.approx(1, abs=1e-3)
     turned, own = SampledPsf(samples[0], per_px), SampledPsf(sampled(coma(), 4, 7), 4)
     assert turned.width_px == pytest.approx(
@@ -143,7 +168,9 @@ def test_the_least_that_the_tolerance_allows_is_drawn(bench):
     Gaussian, and says so.
     """
     even = stack(3, wavelengths_nm=(600.0,))
-    even = replace(even, images=np.tile(even.images[4], (9, 1, 1)), facts=np.tile([1.0, 0, 0, 0], (9, 1)))
+    even = replace(
+        even, images=np.tile(even.images[4], (9, 1, 1)), facts=np.tile([1.0, 0, 0, 0], (9, 1))
+    )
     file = bench(glass=glass_of(even))
     with open_bench(file) as shown:
         assert type(shown.psf) is SampledPsf and "one PSF for all stars" in drawn_line(shown)
@@ -159,7 +186,14 @@ def test_more_components_are_nearer_to_the_whole(bench):
     errors = {name: psf_errors(psf, make(), places) for name, make in candidates(psf)}
     px = [found.px for found in errors.values()]
     assert list(errors) == [
-        *("a Gaussian", "one PSF for all stars", "Gaussians by field", "a basis of 3", "a basis of 6", "a basis of 12"),
+        *(
+            "a Gaussian",
+            "one PSF for all stars",
+            "Gaussians by field",
+            "a basis of 3",
+            "a basis of 6",
+            "a basis of 12",
+        ),
         "each star by its place and spectrum",
     ]
     assert px[2] < px[0] and px[3] > px[4] > px[5] > px[6] == 0
@@ -173,16 +207,23 @@ def test_the_virtual_tracker_takes_the_least_too(bench, caplog):
     found = tracker_psf(file.config.tracker, file.folder)
     assert 3 <= len(found.optics.basis) <= 12 and "[tracker] effort: PSF: a basis of" in caplog.text
     assert "a Gaussian would be" in caplog.text
-    loose = bench({"tracker": {"effort": "auto", "tolerance_mag": 2, "tolerance_px": 2}}).config.tracker
+    loose = bench(
+        {"tracker": {"effort": "auto", "tolerance_mag": 2, "tolerance_px": 2}}
+    ).config.tracker
     assert isinstance(tracker_psf(loose, file.folder), GaussianPsf)
     assert "a Gaussian" in caplog.text and "more would gain no more than that" in caplog.text
 
 
 def test_what_cannot_be_drawn_is_refused(bench, tmp_path):
     bench(glass=glass_of(stack(**SMALL, integrated=True)))
-    result = run_hilstar_here("frame", tmp_path / "bench.toml", "--radec", "84,-1,0", "-o", tmp_path / "x.fits")
+    result = run_hilstar_here(
+        "frame", tmp_path / "bench.toml", "--radec", "84,-1,0", "-o", tmp_path / "x.fits"
+    )
     assert (result.returncode, result.stderr.count("\n")) == (2, 1)
-    assert '[render] psf = "tracker", with psf.fits: it has the tracker\'s pixel in it (PIXINT)' in result.stderr
+    assert (
+        '[render] psf = "tracker", with psf.fits: it has the tracker\'s pixel in it (PIXINT)'
+        in result.stderr
+    )
     wide = bench({"tracker": {"psf_sigma_px": [0.5, 1.5]}, "tracker.optics": {"psf": "gaussian"}})
     camera = bench_camera(wide.config, wide.folder)
     camera = replace(camera, cam_to_image=np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]))

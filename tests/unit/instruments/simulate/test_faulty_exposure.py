@@ -71,19 +71,26 @@ def test_an_exposure_has_a_fault_s_light_for_the_part_that_it_lasts(simulator, a
     assert light_e(seen) - light_e(plain) == pytest.approx(share * 4e4, rel=1e-3)
     row = seen.truth[seen.truth["name"] == "ghost"][0]
     assert row["electrons_per_s"] == pytest.approx(share * 4e4 / EXPOSURE_S, rel=1e-6)
-    assert (row["x_px"], row["y_px"]) == (pytest.approx(480, abs=1e-3), pytest.approx(530, abs=1e-3))
+    assert (row["x_px"], row["y_px"]) == (
+        pytest.approx(480, abs=1e-3),
+        pytest.approx(530, abs=1e-3),
+    )
 
 
 def test_a_moving_false_star_leaves_a_streak_of_its_light(simulator):
     plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
-    seen, _ = exposed(simulator, GHOST.replace("[480, 530]", "[480, 530]\nrate_px_s = [300, 0]"), 1.5)
+    seen, _ = exposed(
+        simulator, GHOST.replace("[480, 530]", "[480, 530]\nrate_px_s = [300, 0]"), 1.5
+    )
     added = seen.mean_e - plain.mean_e
     assert added.sum() == pytest.approx(4e4, rel=1e-3)
     # From 1.45 to 1.55 s: 480 + 300 (0.45 to 0.55) is 615 to 645
     columns = np.average(np.arange(1024), weights=added.sum(axis=0))
     assert columns == pytest.approx(630, abs=0.05)
     width = np.sqrt(np.average((np.arange(1024) - columns) ** 2, weights=added.sum(axis=0)))
-    assert width == pytest.approx(np.hypot(30 / np.sqrt(12), np.hypot(0.55, np.sqrt(1 / 12))), abs=0.1)
+    assert width == pytest.approx(
+        np.hypot(30 / np.sqrt(12), np.hypot(0.55, np.sqrt(1 / 12))), abs=0.1
+    )
 
 
 def test_blank_freeze_and_step(simulator):
@@ -91,12 +98,18 @@ def test_blank_freeze_and_step(simulator):
     plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     assert light_e(dark) == pytest.approx(light_e(plain) / 2, rel=LIGHT_SHARE)
     turning = (0.0, 0.02, 0.0)
-    _, stuck = exposed(simulator, '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 0.9\nfor_s = 1', 1.0, turning)
+    _, stuck = exposed(
+        simulator, '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 0.9\nfor_s = 1', 1.0, turning
+    )
     (piece,) = stuck.pieces
     assert not piece.view.rate_cam_rad_s.any()
     turned_rad = angle_between_rad(piece.view.q_icrs_to_cam, np.array(ORION_Q))
     assert turned_rad == pytest.approx(0.02 * 0.1, rel=1e-6)  # as at 0.9 s
-    moved, _ = exposed(simulator, '[[fault]]\nkind = "attitude-step"\nname = "s"\nat_s = 0\nturn_arcsec = [0, 600, 0]', 1.0)
+    moved, _ = exposed(
+        simulator,
+        '[[fault]]\nkind = "attitude-step"\nname = "s"\nat_s = 0\nturn_arcsec = [0, 600, 0]',
+        1.0,
+    )
     star = plain.truth[plain.truth["hip"] == 26727][0]
     whole = moved.mean_e[: int(star["y_px"]) + 6, : int(star["x_px"]) + 40]
     y, x = np.unravel_index(np.argmax(whole), whole.shape)
@@ -132,9 +145,13 @@ def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, t
     path.write_text(SMALL_BENCH)
     scenario = parse_scenario(tmp_path / "faults.toml", ALIKE)
     with hilstar.load(path) as bench:
-        shown = bench.frame(ORION_Q, faults=faults_at(bench, scenario, round(1.25 * NS_PER_S))).truth
+        shown = bench.frame(
+            ORION_Q, faults=faults_at(bench, scenario, round(1.25 * NS_PER_S))
+        ).truth
     view = simulator.view(np.array(ORION_Q), np.zeros(3))
-    seen = simulator.expose(view, None, faults=faulty_exposure(simulator, view, scenario, round(1.25 * NS_PER_S))).truth
+    seen = simulator.expose(
+        view, None, faults=faulty_exposure(simulator, view, scenario, round(1.25 * NS_PER_S))
+    ).truth
     config = simulator.config
     monitor, tracker = bench_camera(config, tmp_path), tracker_camera(config.tracker, tmp_path)
     ours = shown[np.isin(shown["name"], ["ghost", "rays", "flare"])]
@@ -148,14 +165,19 @@ def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, t
             nearest = theirs[np.argmin(off)]
             matched += 1
             assert off.min() < PLACE_PX and nearest["name"] == row["name"]
-            assert nearest["electrons_per_s"] == pytest.approx(row["electrons_per_s"], rel=1e-5) or row["name"] == "rays"
+            assert (
+                nearest["electrons_per_s"] == pytest.approx(row["electrons_per_s"], rel=1e-5)
+                or row["name"] == "rays"
+            )
     assert matched > 2
 
 
 def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(SMALL_BENCH)
-    scenario = parse_scenario(tmp_path / "faults.toml", GHOST + '[[fault]]\nkind = "freeze"\nname = "stuck"')
+    scenario = parse_scenario(
+        tmp_path / "faults.toml", GHOST + '[[fault]]\nkind = "freeze"\nname = "stuck"'
+    )
     ghost, stuck = (Now(k, fault, 0) for k, fault in enumerate(scenario.faults, start=1))
     on = []
     with hilstar.load(path) as bench:

@@ -51,16 +51,29 @@ name = "loss"
 def verdicts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("twin")
     # What clips is no measure of a fault: white for the brightest star.
-    text = bench_text(TWIN, {"monitor": {"resolution_px": [480, 480]}, "render": {"brightest_v_mag": 0.0}})
+    text = bench_text(
+        TWIN, {"monitor": {"resolution_px": [480, 480]}, "render": {"brightest_v_mag": 0.0}}
+    )
     file = bench_file_of(folder / "bench.toml", text)
     scenario = parse_scenario(folder / "faults.toml", SCENARIO)
-    return [verify(file, 1, np.random.default_rng(3), scenario=wanted) for wanted in (None, scenario)]
+    return [
+        verify(file, 1, np.random.default_rng(3), scenario=wanted) for wanted in (None, scenario)
+    ]
 
 
 def test_the_verdict_is_that_of_the_bench_without_faults(verdicts):
     plain, faulty = verdicts
-    assert faulty.reasons == plain.reasons and summarise(faulty)["stars"] == summarise(plain)["stars"]
-    assert plain.faults == [] and [one.name for one in faulty.faults] == ["ghost", "dark", "sun", "cover", "step", "loss"]
+    assert (
+        faulty.reasons == plain.reasons and summarise(faulty)["stars"] == summarise(plain)["stars"]
+    )
+    assert plain.faults == [] and [one.name for one in faulty.faults] == [
+        "ghost",
+        "dark",
+        "sun",
+        "cover",
+        "step",
+        "loss",
+    ]
 
 
 def test_each_fault_is_measured_against_what_was_asked_for(verdicts):

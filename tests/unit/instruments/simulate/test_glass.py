@@ -37,7 +37,12 @@ from tests.support.commands import run_hilstar_here
 from tests.support.glass import SIDE_PX, WAVELENGTHS_NM, illumination, moments, stack, truth
 
 SHARES = 1e-3  # bands of 25 nm against the integral: measured 4e-4
-TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
+TRACKER = {
+    "resolution_px": [SIDE_PX, SIDE_PX],
+    "focal_length_mm": 12,
+    "exposure_s": 0.2,
+    "transmission": None,
+}
 
 
 usual_glass = cache(lambda: glass_of(stack()))
@@ -49,7 +54,11 @@ def bench(tmp_path):
 
     def make(*changes, **glass):
         write_glass(tmp_path / "psf.fits", glass_of(stack(), **glass) if glass else usual_glass())
-        tables = {"tracker": TRACKER, "tracker.optics": {"psf": "psf.fits"}, "sky": {"spectrum": "blackbody"}}
+        tables = {
+            "tracker": TRACKER,
+            "tracker.optics": {"psf": "psf.fits"},
+            "sky": {"spectrum": "blackbody"},
+        }
         (tmp_path / "bench.toml").write_text(bench_text(tables, *changes))
         return read_bench_file(tmp_path / "bench.toml")
 
@@ -65,7 +74,9 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
     nm, response = electron_response(bench_optics(file.config.tracker, file.folder))
     for temperature_k, shares in zip(stars.temperature_k[which], found, strict=True):
         light = response * blackbody_exitance_w_m2_m(nm, np.array([temperature_k])[:, None])[0]
-        assert shares == pytest.approx(light @ NodeSpline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES)
+        assert shares == pytest.approx(
+            light @ NodeSpline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES
+        )
     finer = StarGlass(file, psf, band_nm=BAND_NM / 2).shares(stars, which)
     assert found == pytest.approx(finer, abs=SHARES)
 
@@ -79,7 +90,9 @@ def test_every_model_of_spectra_makes_red_stars_redder(bench, spectrum):
     assert blue.sum() == pytest.approx(1)
     assert red.sum() == pytest.approx(1)
     assert blue[0] > red[0] + 0.1
-    added = StarGlass(file, tracker_psf(file.config.tracker, file.folder)).shares(stars, np.array([-1]))[0]
+    added = StarGlass(file, tracker_psf(file.config.tracker, file.folder)).shares(
+        stars, np.array([-1])
+    )[0]
     assert added.sum() == pytest.approx(1)
 
 
@@ -103,11 +116,15 @@ def test_the_virtual_tracker_draws_each_star_by_its_place_and_colour(bench):
         wanted = moments(truth(row["x_px"], row["y_px"], shares[int(row["hip"])], 15))
         light = row["electrons_per_s"] * TRACKER["exposure_s"]
         own = moments(part)
-        assert own[0] == pytest.approx(wanted[0] * light * illumination(row["x_px"], row["y_px"]), rel=2e-3)
+        assert own[0] == pytest.approx(
+            wanted[0] * light * illumination(row["x_px"], row["y_px"]), rel=2e-3
+        )
         assert own[1:3] == pytest.approx(wanted[1:3], abs=5e-3)
         assert column + own[1] == pytest.approx(row["x_centroid_px"], abs=5e-3)
         assert line + own[2] == pytest.approx(row["y_centroid_px"], abs=5e-3)
-        assert row["relative_illumination"] == pytest.approx(illumination(row["x_px"], row["y_px"]), abs=1e-4)
+        assert row["relative_illumination"] == pytest.approx(
+            illumination(row["x_px"], row["y_px"]), abs=1e-4
+        )
         checked += 1
     assert checked > 8
 
@@ -122,7 +139,9 @@ def test_smear_goes_along_with_it(bench):
         from hilstar.basics.rotation import propagate
 
         for k in range(64):
-            q = propagate(motion.q_icrs_to_cam, rate, ((k + 0.5) / 64 - 0.5) * TRACKER["exposure_s"])
+            q = propagate(
+                motion.q_icrs_to_cam, rate, ((k + 0.5) / 64 - 0.5) * TRACKER["exposure_s"]
+            )
             still += simulator.expose(simulator.view(q, np.zeros(3)), None).mean_e / 64
     assert np.abs(turning - still).max() < 2e-3 * turning.max()
 
@@ -132,7 +151,10 @@ def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
     is dimmed as that is.
     """
     file = bench()
-    tracker, psf = tracker_camera(file.config.tracker, file.folder), tracker_psf(file.config.tracker, file.folder)
+    tracker, psf = (
+        tracker_camera(file.config.tracker, file.folder),
+        tracker_psf(file.config.tracker, file.folder),
+    )
     monitor = monitor_camera((320, 240), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
     light = np.zeros((240, 320))
     light[200, 20] = 5e4
@@ -172,7 +194,11 @@ def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_non
     assert tracker_camera(file.config.tracker, file.folder).lens.radial == (0.05, 0.0, 0.0)
     assert bench_optics(file.config.tracker, file.folder).transmission(np.array([550.0]))[0] == 0.5
     (file.folder / "flight.toml").write_text("k1 = 1.0\n")
-    own = bench({"tracker": {"distortion": "flight.toml", "transmission": 0.7}}, lens=lens, transmission=curve)
+    own = bench(
+        {"tracker": {"distortion": "flight.toml", "transmission": 0.7}},
+        lens=lens,
+        transmission=curve,
+    )
     assert tracker_camera(own.config.tracker, own.folder).lens.radial == (1.0, 0.0, 0.0)
     assert bench_optics(own.config.tracker, own.folder).transmission(np.array([550.0]))[0] == 0.7
     assert "px from that of [tracker] distortion, which is taken" in caplog.text
@@ -180,7 +206,9 @@ def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_non
 
 
 def test_what_the_file_does_not_cover_is_said(bench, caplog):
-    wide = bench({"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}})
+    wide = bench(
+        {"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}}
+    )
     assert isinstance(tracker_psf(wide.config.tracker, wide.folder), GlassPsf)
     for words in (
         "44 px beyond the file's points",
@@ -207,7 +235,11 @@ def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
     stamps = 1e5 * told_psf(glass, pixels, 17, shares)(*offs)
 
     def off_px(told_shares, told=glass, image=stamps):
-        found = psf_places(image, told_psf(told, pixels, 17, told_shares), star_places(image, "window", told.width_px))
+        found = psf_places(
+            image,
+            told_psf(told, pixels, 17, told_shares),
+            star_places(image, "window", told.width_px),
+        )
         return np.hypot(*(np.stack(found) - np.stack(offs)))
 
     assert off_px(shares).max() < 1e-4
@@ -219,7 +251,12 @@ def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
         pixels = tuple(np.floor(places[::-1] + 0.5).astype(int))
         offs = places[0] - pixels[1], places[1] - pixels[0]
         right, white = off_px(shares, image=exact), off_px(None, image=exact)
-        assert right.max() < 6e-3 < white.mean() < off_px(None, GaussianPsf(glass.width_px), exact).mean()
+        assert (
+            right.max()
+            < 6e-3
+            < white.mean()
+            < off_px(None, GaussianPsf(glass.width_px), exact).mean()
+        )
 
 
 def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(bench):
@@ -241,7 +278,9 @@ def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(bench):
             errors = solver.solve(shot, tracker).star_errors
             bright = errors.v_mag < 6
             assert bright.sum() >= 8
-            rms[name] = float(np.sqrt(np.mean(errors.dx_px[bright] ** 2 + errors.dy_px[bright] ** 2)))
+            rms[name] = float(
+                np.sqrt(np.mean(errors.dx_px[bright] ** 2 + errors.dy_px[bright] ** 2))
+            )
     assert rms["psf"] < 0.02
     assert rms["file"] == pytest.approx(rms["psf"], abs=1e-6)
     assert rms["psf"] < rms["mean"] < rms["gaussian"]
@@ -251,7 +290,9 @@ def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(bench):
 def test_a_told_psf_without_its_centroider_is_refused(tmp_path):
     for keys in ('psf = "gaussian"', 'centroider = "psf"\npsf_focus_um = 3.0'):
         with pytest.raises(InputError, match=r"\[centroids\] psf"):
-            parse_plan(tmp_path / "plan.toml", f'bench = "b.toml"\ncases = 1\n[centroids]\n{keys}\n')
+            parse_plan(
+                tmp_path / "plan.toml", f'bench = "b.toml"\ncases = 1\n[centroids]\n{keys}\n'
+            )
 
 
 def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path):
@@ -260,12 +301,22 @@ def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path)
     """
     found = {}
     for kind in ("window", "psf"):
-        bench({"verify": {"centroider": kind, "centroid_px": 0.05, "flux_mag": 0.5}, "sky": {"faintest_v_mag": 4.5}})
-        found[kind] = json.loads(run_hilstar_here("verify", tmp_path / "bench.toml", "--fields", "1", "--json").stdout)
+        bench(
+            {
+                "verify": {"centroider": kind, "centroid_px": 0.05, "flux_mag": 0.5},
+                "sky": {"faintest_v_mag": 4.5},
+            }
+        )
+        found[kind] = json.loads(
+            run_hilstar_here("verify", tmp_path / "bench.toml", "--fields", "1", "--json").stdout
+        )
     assert found["psf"]["centroider"] == "psf"
     assert found["psf"]["centroid_error_px_by"]["psf"]["rms"] < 0.1
     said, mended = (" ".join(found[kind]["reasons"]) for kind in ("window", "psf"))
-    assert "the glass of [tracker.optics] psf has centroids" in said and '[verify] centroider = "psf" fits it' in said
+    assert (
+        "the glass of [tracker.optics] psf has centroids" in said
+        and '[verify] centroider = "psf" fits it' in said
+    )
     assert "chief rays" not in mended
 
 
@@ -278,15 +329,24 @@ def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
     warm = {"temperature_k": 303.0, "focus_um_per_k": 0.6, "focal_length_ppm_per_k": 20.0}
     cameras, psfs = [], []
     for keys in ({"focus_um": 6.0}, warm, {"focus_um": 6.0, "decentre_x_um": 26.0}):
-        tables = {"tracker": TRACKER, "tracker.optics": {"psf": "psf.fits", **keys}, "sky": {"spectrum": "blackbody"}}
+        tables = {
+            "tracker": TRACKER,
+            "tracker.optics": {"psf": "psf.fits", **keys},
+            "sky": {"spectrum": "blackbody"},
+        }
         (still.folder / "bench.toml").write_text(bench_text(tables))
         file = read_bench_file(still.folder / "bench.toml")
         cameras.append(tracker_camera(file.config.tracker, file.folder))
         psfs.append(tracker_psf(file.config.tracker, file.folder))
-    assert cameras[1].focal_length_px == pytest.approx(cameras[0].focal_length_px * (1 + 200e-6), rel=1e-12)
+    assert cameras[1].focal_length_px == pytest.approx(
+        cameras[0].focal_length_px * (1 + 200e-6), rel=1e-12
+    )
     assert cameras[2].principal_point_px[0] == cameras[0].principal_point_px[0] + 2.0
     x, y = np.array([60.0]), np.array([200.0])
-    lit = [psf.of_stars(at, y, psf.mean_shares, np.ones(1)) for psf, at in zip(psfs, (x, x, x + 2), strict=True)]
+    lit = [
+        psf.of_stars(at, y, psf.mean_shares, np.ones(1))
+        for psf, at in zip(psfs, (x, x, x + 2), strict=True)
+    ]
     assert lit[1] == pytest.approx(lit[0], abs=1e-7)
     assert lit[2] == pytest.approx(lit[0], abs=1e-4)
     with Simulator(file) as tracker:
@@ -300,6 +360,8 @@ def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
 
 def test_a_gaussian_has_no_focus_that_a_temperature_could_move(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text({"tracker.optics": {"focus_um_per_k": 1.0}}))
-    done = run_hilstar_here("simulate", tmp_path / "bench.toml", "--radec", "84,0,0", "--png", tmp_path / "a.png")
+    done = run_hilstar_here(
+        "simulate", tmp_path / "bench.toml", "--radec", "84,0,0", "--png", tmp_path / "a.png"
+    )
     assert done.returncode == 2
     assert "focus_um_per_k: a Gaussian has no focus; give psf a file" in done.stderr

@@ -22,7 +22,14 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def frame(number, lit, light, q=IDENTITY, lit_ns=None):
-    head = FrameHead(number, number * PERIOD_NS if lit_ns is None else lit_ns, 8, 8, 8, None if q is None else tuple(q))
+    head = FrameHead(
+        number,
+        number * PERIOD_NS if lit_ns is None else lit_ns,
+        8,
+        8,
+        8,
+        None if q is None else tuple(q),
+    )
     return ShownFrame(head, np.array(lit, dtype=np.uint32), np.array(light, dtype=np.uint8))
 
 
@@ -47,7 +54,9 @@ def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
 
 
 def test_a_run_that_begins_anew_forgets_the_one_before():
-    kept = watched(frame(7, [1], [1]), frame(1, [2], [2], lit_ns=800), frame(2, [2], [2], lit_ns=900))
+    kept = watched(
+        frame(7, [1], [1]), frame(1, [2], [2], lit_ns=800), frame(2, [2], [2], lit_ns=900)
+    )
     assert kept.exposed(700, 850) is None
     assert kept.exposed(800, 900).lit.tolist() == [2]
     assert kept.missing == 0
@@ -63,7 +72,9 @@ def test_its_own_clock_is_off_and_drifts_and_is_turned_back():
     clock = OwnClock(Planted(drift_ppm=50.0, offset_s=2.0), 10**12)
     assert clock.of_host(10**12) == 10**12 + 2 * 10**9
     assert clock.of_host(10**12 + 10**9) - clock.of_host(10**12) == 10**9 + 50_000
-    assert clock.to_host(clock.of_host(10**12 + 123_456_789)) == pytest.approx(10**12 + 123_456_789, abs=1)
+    assert clock.to_host(clock.of_host(10**12 + 123_456_789)) == pytest.approx(
+        10**12 + 123_456_789, abs=1
+    )
 
 
 def test_planted_errors_have_their_mean_and_their_sigma_over_a_scan(rng):
@@ -91,7 +102,16 @@ def test_wrong_answers_come_at_their_share_and_are_far_off(rng):
 
 def test_json_says_what_is_known_and_nothing_else():
     whole = Answer(
-        0, b"", 5, IDENTITY, np.zeros(3), True, "tracking", 9, 1.5, (ReportedStar(1, 2, 3.00001, 7), ReportedStar(1, 2, 3))
+        0,
+        b"",
+        5,
+        IDENTITY,
+        np.zeros(3),
+        True,
+        "tracking",
+        9,
+        1.5,
+        (ReportedStar(1, 2, 3.00001, 7), ReportedStar(1, 2, 3)),
     )
     assert json_answer(whole) == (
         b'{"t_ns":5,"valid":true,"mode":"tracking","stars":9,"q":[1.0,0.0,0.0,0.0],"rate":[0.0,0.0,0.0],"rms_arcsec":1.5,'
@@ -107,5 +127,7 @@ def test_a_packet_has_the_flags_of_its_mode_and_of_what_is_known():
     found = decode(encode(answer_packet(whole, 3)))
     flags = protocol.ANSWER_VALID + protocol.ANSWER_RATE_VALID + protocol.ANSWER_TRACKING
     assert found == AnswerPacket(3, flags, 5, (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
-    none = decode(encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4)))
+    none = decode(
+        encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4))
+    )
     assert (none.flags, none.stars) == (protocol.ANSWER_TOO_FEW_STARS, 2)

@@ -43,28 +43,47 @@ def folder(tmp_path_factory):
 
 
 def written(folder, bayer, *changes):
-    keys = {"quantum_efficiency": None, "psf_sigma_px": [SIGMA_PX, SIGMA_PX], "exposure_s": EXPOSURE_S}
-    keys |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in "rgb"} | {"resolution_px": [1024, 1024]}
-    detector = {"bits": 16, "gain_e_per_dn": GAIN, "full_well_e": 1e9, **({} if bayer is None else {"bayer": bayer})}
+    keys = {
+        "quantum_efficiency": None,
+        "psf_sigma_px": [SIGMA_PX, SIGMA_PX],
+        "exposure_s": EXPOSURE_S,
+    }
+    keys |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in "rgb"} | {
+        "resolution_px": [1024, 1024]
+    }
+    detector = {
+        "bits": 16,
+        "gain_e_per_dn": GAIN,
+        "full_well_e": 1e9,
+        **({} if bayer is None else {"bayer": bayer}),
+    }
     sky = {"faintest_v_mag": 4.5, "spectrum": "blackbody"}
     path = folder / f"{bayer}.toml"
-    path.write_text(bench_text({"tracker": keys, "tracker.detector": detector, "sky": sky}, *changes))
+    path.write_text(
+        bench_text({"tracker": keys, "tracker.detector": detector, "sky": sky}, *changes)
+    )
     return path
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("bayer", PATTERNS)
-def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(folder, tmp_path, bayer):
+def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(
+    folder, tmp_path, bayer
+):
     """Photometry of each plane by `sep`, found by the keywords that other programs read."""
     out = tmp_path / "raw.fits"
-    run = run_hilstar_here("simulate", written(folder, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out)
+    run = run_hilstar_here(
+        "simulate", written(folder, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out
+    )
     assert run.returncode == 0, run.stderr
     with fits.open(out) as (image, table):
         header, dn, truth = image.header, image.data.astype(np.float64), table.data
         assert (header["XBAYROFF"], header["YBAYROFF"], header["ROWORDER"]) == (0, 0, "TOP-DOWN")
         pattern, truth = header["BAYERPAT"].lower(), truth.copy()
     assert pattern == bayer
-    inside = [row for row in truth if 20 < row["x_px"] < 1003 and 20 < row["y_px"] < 1003][:BRIGHTEST]
+    inside = [row for row in truth if 20 < row["x_px"] < 1003 and 20 < row["y_px"] < 1003][
+        :BRIGHTEST
+    ]
     # Betelgeuse among blue stars
     assert len(inside) == BRIGHTEST and np.ptp([row["bv"] for row in inside]) > 1.5
     for star in inside:
@@ -82,15 +101,25 @@ def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(f
 
 @pytest.mark.gpu
 def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(folder):
-    sky = {"background": {"zodiacal_v_mag_arcsec2": 20.0}, "tracker.detector": {"read_noise_e": 5.0}}
+    sky = {
+        "background": {"zodiacal_v_mag_arcsec2": 20.0},
+        "tracker.detector": {"read_noise_e": 5.0},
+    }
     with Simulator(read_bench_file(written(folder, "rggb", sky))) as simulator:
         view = simulator.view(np.array(ORION_Q), np.zeros(3))
         exposure = simulator.expose(view, np.random.default_rng(3))
-        levels = [float(np.median(simulator.background_e[k // 2 :: 2, k % 2 :: 2])) for k in range(4)]
+        levels = [
+            float(np.median(simulator.background_e[k // 2 :: 2, k % 2 :: 2])) for k in range(4)
+        ]
         assert levels[1] == pytest.approx(levels[2], rel=1e-9)
         assert len({round(level, 6) for level in levels}) == 3
         for k, level in enumerate(levels):
-            noise_dn = np.median(np.abs(exposure.dn[k // 2 :: 2, k % 2 :: 2] - np.median(exposure.dn[k // 2 :: 2, k % 2 :: 2])))
+            noise_dn = np.median(
+                np.abs(
+                    exposure.dn[k // 2 :: 2, k % 2 :: 2]
+                    - np.median(exposure.dn[k // 2 :: 2, k % 2 :: 2])
+                )
+            )
             # a median of whole DN
             assert noise_dn * 1.4826 == pytest.approx(np.sqrt(level + 25.0) / GAIN, rel=0.35)
         given = given_image(exposure, simulator)
@@ -99,12 +128,24 @@ def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(f
 
 
 def before_display(folder, colour, **sky):
-    power = [np.exp(-(((NM - peak) / width) ** 2)) for peak, width in ((625, 40), (530, 45), (460, 30))]
-    lines = "".join(f"{nm:g},{r:.6g},{g:.6g},{b:.6g}\n" for nm, r, g, b in zip(NM, *power, strict=True))
+    power = [
+        np.exp(-(((NM - peak) / width) ** 2)) for peak, width in ((625, 40), (530, 45), (460, 30))
+    ]
+    lines = "".join(
+        f"{nm:g},{r:.6g},{g:.6g},{b:.6g}\n" for nm, r, g, b in zip(NM, *power, strict=True)
+    )
     (folder / "oled.csv").write_text(f"wavelength_nm,r,g,b\n{lines}")
-    tracker = {"focal_length_mm": 25, "resolution_px": [400, 400], "transmission": None, "psf_sigma_px": [1.3, 1.3]}
+    tracker = {
+        "focal_length_mm": 25,
+        "resolution_px": [400, 400],
+        "transmission": None,
+        "psf_sigma_px": [1.3, 1.3],
+    }
     tables = {"tracker": tracker, "monitor.primaries": {"file": "oled.csv", "layout": "rgb-stripe"}}
-    tables |= {"monitor": {"resolution_px": [640, 480], "bits": 10}, "collimator": {"focal_length_mm": 120}}
+    tables |= {
+        "monitor": {"resolution_px": [640, 480], "bits": 10},
+        "collimator": {"focal_length_mm": 120},
+    }
     tables |= {"render": {"colour": colour, "quantisation": "exact", "brightest_v_mag": 0.0}}
     return read_bench_file(written(folder, "rggb", tables, {"sky": sky}))
 
@@ -123,7 +164,10 @@ def test_a_mosaic_before_the_display_has_each_stars_own_channels_or_whites(folde
         x, y = round(star["x_px"]), round(star["y_px"])
         rows, columns = np.mgrid[y - 6 : y + 7, x - 6 : x + 7]
         found = [exposure.mean_e[rows, columns][wanted(rows, columns)].sum() for wanted in PLANES]
-        off.append(np.array(found) * [4, 2, 4] / EXPOSURE_S / [star[f"electrons_{c}_per_s"] for c in "rgb"] - 1)
+        off.append(
+            np.array(found) * [4, 2, 4] / EXPOSURE_S / [star[f"electrons_{c}_per_s"] for c in "rgb"]
+            - 1
+        )
     assert (np.abs(off).max() < SHOWN) == (colour == "star")
     assert np.abs(off).max() < SHOWN or np.abs(off).max() > 0.2  # Betelgeuse in white
 
@@ -136,7 +180,9 @@ def test_the_live_tracker_before_a_coloured_display_finds_its_attitude_in_superp
         codes = bench.frame(q).codes.reshape(-1, 3)
         lit = np.flatnonzero(codes.any(axis=1)).astype(np.uint32)
         for number, lit_ns in enumerate((0, 10**9)):
-            tracker.take(ShownFrame(FrameHead(number, lit_ns, 640, 480, 10, tuple(q), 3), lit, codes[lit]))
+            tracker.take(
+                ShownFrame(FrameHead(number, lit_ns, 640, 480, 10, tuple(q), 3), lit, codes[lit])
+            )
         exposed = tracker.frames.exposed(0, round(EXPOSURE_S * 1e9))
         solved = tracker.solve(exposed)
     assert solved.mode == TRACKING and len(solved.identified.star) >= 8
@@ -144,7 +190,11 @@ def test_the_live_tracker_before_a_coloured_display_finds_its_attitude_in_superp
     assert np.linalg.norm(off[:2]) < 0.1 * 13e-3 / 25  # a tenth of a pixel
 
 
-PLANES = (lambda y, x: (y % 2 == 0) & (x % 2 == 0), lambda y, x: y % 2 != x % 2, lambda y, x: (y % 2 == 1) & (x % 2 == 1))
+PLANES = (
+    lambda y, x: (y % 2 == 0) & (x % 2 == 0),
+    lambda y, x: y % 2 != x % 2,
+    lambda y, x: (y % 2 == 1) & (x % 2 == 1),
+)
 
 
 def display_view(ra_deg, dec_deg):
@@ -158,14 +208,22 @@ def test_a_superpixel_has_no_pattern_keeps_all_light_and_every_place():
     point[3, 5] = 16.0
     spread = luminance(point)
     y, x = np.indices(point.shape)
-    assert (spread.sum(), (spread * x).sum() / 16, (spread * y).sum() / 16) == pytest.approx((16, 5, 3))
+    assert (spread.sum(), (spread * x).sum() / 16, (spread * y).sum() / 16) == pytest.approx(
+        (16, 5, 3)
+    )
 
 
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ({"tracker.detector": {"bayer": "rggb"}}, 'bayer = "rggb" has three colours of pixels, and [tracker] one'),
-        ({"tracker.detector": {"bayer": "rgbg"}}, '[tracker.detector] bayer = "rgbg"; did you mean rggb?'),
+        (
+            {"tracker.detector": {"bayer": "rggb"}},
+            'bayer = "rggb" has three colours of pixels, and [tracker] one',
+        ),
+        (
+            {"tracker.detector": {"bayer": "rgbg"}},
+            '[tracker.detector] bayer = "rgbg"; did you mean rggb?',
+        ),
     ],
 )
 def test_a_mosaic_without_three_channels_is_refused_in_one_line(tmp_path, tables, words):
@@ -181,9 +239,9 @@ def test_three_channels_without_a_mosaic_are_added_up_with_a_line(folder, caplog
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     assert "without a mosaic: each pixel adds them up" in caplog.text
     row = exposure.truth[0]
-    assert row["electrons_r_per_s"] + row["electrons_g_per_s"] + row["electrons_b_per_s"] == pytest.approx(
-        row["electrons_per_s"]
-    )
+    assert row["electrons_r_per_s"] + row["electrons_g_per_s"] + row[
+        "electrons_b_per_s"
+    ] == pytest.approx(row["electrons_per_s"])
 
 
 def test_a_detector_in_python_takes_the_same_patterns():

@@ -40,7 +40,13 @@ from tests.support.psfs import gaussian as gaussian_light
 
 QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # rounding: 0.0075 e-^2
 NOISY = DetectorSettings(
-    gain_e_per_dn=1.0, bits=16, offset_dn=200.0, read_noise_e=8.0, dark_e_per_s=60.0, dsnu_e_per_s=6.0, prnu=0.01
+    gain_e_per_dn=1.0,
+    bits=16,
+    offset_dn=200.0,
+    read_noise_e=8.0,
+    dark_e_per_s=60.0,
+    dsnu_e_per_s=6.0,
+    prnu=0.01,
 )
 # A Gaussian integrated over pixels is nearly one of variance sigma^2 + 1/12 (a square is no
 # Gaussian): 1e-3 at 2 px and more.
@@ -50,7 +56,9 @@ ERROR = 1 / math.sqrt(2 * 2 * STARS)  # of an rms of x and y of so many stars
 REACHED = 1.05
 
 
-def one(star: NoisyStar, star_e: float, sky_e: float = 0.0, finder: CentroidSettings | None = None) -> Table:
+def one(
+    star: NoisyStar, star_e: float, sky_e: float = 0.0, finder: CentroidSettings | None = None
+) -> Table:
     return star.noise(np.array([star_e]), np.array([sky_e]), finder or CentroidSettings())
 
 
@@ -73,8 +81,12 @@ def test_the_background_s_limit_is_that_of_a_gaussian_in_even_noise(sigma_px):
     # of King 1983.
     found = one(gaussian(sigma_px), 100.0, 10_000.0)
     wide2, variance = sigma_px**2 + 1 / 12, 10_000 + 0.3**2 / 12
-    assert found["bound_px"][0] == pytest.approx(math.sqrt(8 * math.pi * variance) * wide2 / 100, rel=CLOSED_FORM)
-    assert found["total_e"][0] == pytest.approx(math.sqrt(4 * math.pi * wide2 * variance), rel=CLOSED_FORM)
+    assert found["bound_px"][0] == pytest.approx(
+        math.sqrt(8 * math.pi * variance) * wide2 / 100, rel=CLOSED_FORM
+    )
+    assert found["total_e"][0] == pytest.approx(
+        math.sqrt(4 * math.pi * wide2 * variance), rel=CLOSED_FORM
+    )
     assert found["effective_px"][0] == pytest.approx(4 * math.pi * wide2, rel=CLOSED_FORM)
 
 
@@ -82,18 +94,32 @@ def test_the_sources_add_up_to_the_total_each_as_table_4_1_has_it():
     star = gaussian(0.85, NOISY)
     found = one(star, 3000.0, 40.0)
     pixels = found["effective_px"]
-    for name, e2 in (("background_e", 40), ("dark_e", 60), ("read_e", 64), ("quantisation_e", 1 / 12), ("dsnu_e", 36)):
+    for name, e2 in (
+        ("background_e", 40),
+        ("dark_e", 60),
+        ("read_e", 64),
+        ("quantisation_e", 1 / 12),
+        ("dsnu_e", 36),
+    ):
         np.testing.assert_allclose(found[name], np.sqrt(pixels * e2), rtol=1e-12)
     # Shot noise is between that of all photons and, under the weights of even noise, sqrt(4/3) as
     # much.
     assert math.sqrt(3000) < found["shot_e"][0] < math.sqrt(4 / 3 * 3000)
     names = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
-    np.testing.assert_allclose(sum(found[f"{name}_e"] ** 2 for name in names), found["total_e"] ** 2, rtol=1e-12)
+    np.testing.assert_allclose(
+        sum(found[f"{name}_e"] ** 2 for name in names), found["total_e"] ** 2, rtol=1e-12
+    )
     np.testing.assert_allclose(found["snr"], 3000 / found["total_e"])
-    assert found["total_e"][0] <= found["bound_flux_e"][0] * (1 + 1e-12) <= found["bound_flux_sky_e"][0]
+    assert (
+        found["total_e"][0]
+        <= found["bound_flux_e"][0] * (1 + 1e-12)
+        <= found["bound_flux_sky_e"][0]
+    )
 
 
-def exposed(star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def exposed(
+    star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """Frames [e-] of single stars (n, side, side) through the detector, and their places (2, n)
     from the middle.
     """
@@ -106,7 +132,9 @@ def exposed(star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generat
     return seen.reshape(count, side, count, side).swapaxes(1, 2).reshape(-1, side, side), place
 
 
-def most_likely(star: NoisyStar, seen: FloatArray, start: FloatArray, star_e: float, sky_e: float) -> FloatArray:
+def most_likely(
+    star: NoisyStar, seen: FloatArray, start: FloatArray, star_e: float, sky_e: float
+) -> FloatArray:
     """Places (2, n) by Fisher's scoring for x, y and flux, from the true place: the fit that the
     bound is of.
     """
@@ -127,7 +155,9 @@ def most_likely(star: NoisyStar, seen: FloatArray, start: FloatArray, star_e: fl
     return np.stack([x, y])
 
 
-def beyond_bound(sigma_px: float, star_e: float, detector: DetectorSettings = NOISY, sky_e: float = 20.0) -> float:
+def beyond_bound(
+    sigma_px: float, star_e: float, detector: DetectorSettings = NOISY, sky_e: float = 20.0
+) -> float:
     """The rms of most likely places over the bound."""
     star = gaussian(sigma_px, detector, 16)
     seen, place = exposed(star, star_e, sky_e, np.random.default_rng(5))
@@ -135,7 +165,9 @@ def beyond_bound(sigma_px: float, star_e: float, detector: DetectorSettings = NO
     return float(np.sqrt(np.mean(off**2)) / one(star, star_e, sky_e)["bound_px"][0])
 
 
-@pytest.mark.parametrize(("sigma_px", "star_e"), [(0.5, 2000.0), (0.55, 20_000.0), (0.85, 4000.0), (1.2, 20_000.0)])
+@pytest.mark.parametrize(
+    ("sigma_px", "star_e"), [(0.5, 2000.0), (0.55, 20_000.0), (0.85, 4000.0), (1.2, 20_000.0)]
+)
 def test_the_most_likely_place_reaches_the_bound_and_nothing_beats_it(sigma_px, star_e):
     ratio = beyond_bound(sigma_px, star_e)
     assert 1 - 4 * ERROR < ratio < REACHED
@@ -162,20 +194,33 @@ def test_the_variance_alone_tells_what_counts_do_but_for_single_electrons():
             [poisson.pmf(count, mean_e), poisson.pmf(count, mean_e) * (count / mean_e - 1)], axis=-1
         )
         kept = share[:, 0] > 1e-300
-        return float((share[kept, 1] ** 2 / share[kept, 0]).sum() * read_e / 12 * (mean_e + read_e**2))
+        return float(
+            (share[kept, 1] ** 2 / share[kept, 0]).sum() * read_e / 12 * (mean_e + read_e**2)
+        )
 
-    assert all(1 - 1e-6 < ratio(mean_e, read_e) < 1.025 for mean_e, read_e in ((3, 0.3), (3, 2), (0.1, 5), (30, 1)))
+    assert all(
+        1 - 1e-6 < ratio(mean_e, read_e) < 1.025
+        for mean_e, read_e in ((3, 0.3), (3, 2), (0.1, 5), (30, 1))
+    )
     assert ratio(0.1, 0.3) > 1.5
 
 
 def test_a_star_whose_pixels_all_clip_has_no_bound_and_one_that_clips_in_part_has_that_of_the_rest():
     star = gaussian(0.55, replace(QUIET, full_well_e=1e4))
     part, whole = one(star, 2e5), one(star, 1e28)
-    narrow = gaussian(0.05, replace(QUIET, full_well_e=1e4)).noise(10.0 ** np.arange(9), np.zeros(9), CentroidSettings())
+    narrow = gaussian(0.05, replace(QUIET, full_well_e=1e4)).noise(
+        10.0 ** np.arange(9), np.zeros(9), CentroidSettings()
+    )
     assert not (narrow["bound_px"] < 1e3).any()
     assert 0 < part["clipped_px"][0] < 9 < whole["clipped_px"][0]
-    assert np.isnan([whole["total_e"], whole["snr"], whole["bound_px"]]).all() and whole["detection"][0] == 1
-    assert part["bound_px"][0] > 1.3 * one(gaussian(0.55, replace(QUIET, gain_e_per_dn=9.0)), 2e5)["bound_px"][0]
+    assert (
+        np.isnan([whole["total_e"], whole["snr"], whole["bound_px"]]).all()
+        and whole["detection"][0] == 1
+    )
+    assert (
+        part["bound_px"][0]
+        > 1.3 * one(gaussian(0.55, replace(QUIET, gain_e_per_dn=9.0)), 2e5)["bound_px"][0]
+    )
 
 
 TILE_PX, TILES = 40, 30
@@ -183,8 +228,12 @@ SAMPLED = 5e-3  # the table of a sampled PSF is linear between its steps
 SHARE_ERROR = 4 * 0.5 / TILES  # of a share of TILES^2 stars, to four of its sigmas
 
 
-@pytest.mark.parametrize(("sigma_px", "gain_e_per_dn", "pixels"), [(0.55, 24.0, 1), (0.85, 1.0, 1), (0.85, 24.0, 3)])
-def test_the_tracker_finds_as_many_simulated_stars_as_the_threshold_s_model_says(sigma_px, gain_e_per_dn, pixels):
+@pytest.mark.parametrize(
+    ("sigma_px", "gain_e_per_dn", "pixels"), [(0.55, 24.0, 1), (0.85, 1.0, 1), (0.85, 24.0, 3)]
+)
+def test_the_tracker_finds_as_many_simulated_stars_as_the_threshold_s_model_says(
+    sigma_px, gain_e_per_dn, pixels
+):
     star = gaussian(sigma_px, replace(NOISY, gain_e_per_dn=gain_e_per_dn))
     finder = CentroidSettings(minimum_pixels=pixels)
     offered = np.geomspace(50.0, 5000.0, 200)
@@ -205,7 +254,9 @@ def test_stars_between_rows_have_the_bounds_of_their_own():
     star = gaussian(0.85, NOISY)
     grid = np.geomspace(1e6, 200.0, 94)  # a tenth of a magnitude apart
     off = np.sqrt(grid[:-1] * grid[1:])
-    coarse, exact = (star.noise(one, np.full(len(one), 20.0), CentroidSettings()) for one in (grid, off))
+    coarse, exact = (
+        star.noise(one, np.full(len(one), 20.0), CentroidSettings()) for one in (grid, off)
+    )
     x, _, seen = between(coarse, off)
     fine = exact["clipped_px"] == 0  # the bound steps by some per cent where a pixel begins to clip
     np.testing.assert_allclose(x[fine], exact["bound_x_px"][fine], rtol=2e-3)
@@ -248,7 +299,9 @@ def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
     turns = turns_of(camera, *place)
     across, about = nea_arcsec(turns, np.stack([sigma_px] * 2), np.ones(count))
     x, y, z = 206264.806 * np.std(turned, axis=0)
-    assert across[-1] == pytest.approx(math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials))
+    assert across[-1] == pytest.approx(
+        math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials)
+    )
     assert about[-1] == pytest.approx(z, rel=4 / math.sqrt(2 * trials))
     lost = np.stack([np.where(np.arange(count) < 2, (np.nan, 1e6) * (count // 2), sigma_px)] * 2)
     # stars without a place are none
@@ -258,23 +311,54 @@ def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
     assert np.isinf([across[0], about[0]]).all() and (np.diff(across[1:]) < 0).all()
 
 
-CONTRACT = ["v_mag", "shot_e", "background_e", "dark_e", "read_e", "reset_e", "quantisation_e", "prnu_e", "dsnu_e"]
+CONTRACT = [
+    "v_mag",
+    "shot_e",
+    "background_e",
+    "dark_e",
+    "read_e",
+    "reset_e",
+    "quantisation_e",
+    "prnu_e",
+    "dsnu_e",
+]
 CONTRACT += ["total_e", "snr", "detection", "bound_px"]
 
 
 @pytest.fixture
 def bench_file(tmp_path):
     path = tmp_path / "bench.toml"
-    detector = {"read_noise_e": 12, "dark_e_per_s": 50, "dsnu_e_per_s": 5, "prnu": 0.01, "offset_dn": 20}
-    changes = {"tracker.detector": detector, "background": {"electrons_per_px": 30}, "sky": {"faintest_v_mag": 6.5}}
+    detector = {
+        "read_noise_e": 12,
+        "dark_e_per_s": 50,
+        "dsnu_e_per_s": 5,
+        "prnu": 0.01,
+        "offset_dn": 20,
+    }
+    changes = {
+        "tracker.detector": detector,
+        "background": {"electrons_per_px": 30},
+        "sky": {"faintest_v_mag": 6.5},
+    }
     path.write_text(bench_text(changes))
     return path
 
 
-def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_field(bench_file, tmp_path, monkeypatch):
+def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_field(
+    bench_file, tmp_path, monkeypatch
+):
     drawn = []
     monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
-    ran = run_hilstar_here("budget", bench_file, "--noise", "--radec", "84.057,-1.2,0", "-o", tmp_path / "out", "--json")
+    ran = run_hilstar_here(
+        "budget",
+        bench_file,
+        "--noise",
+        "--radec",
+        "84.057,-1.2,0",
+        "-o",
+        tmp_path / "out",
+        "--json",
+    )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
     tables = {}
@@ -284,16 +368,32 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
     assert list(tables["noise"][0])[: len(CONTRACT)] == CONTRACT
     assert list(tables["stars"][0])[:5] == ["hip", "name", "x_px", "y_px", "v_mag"]
     for name, rows in (("noise", found["rows"]), ("stars", found["stars"]), ("nea", found["nea"])):
-        written = [[float(value or "nan") for key, value in row.items() if key != "name"] for row in tables[name]]
-        told = [[math.nan if v is None else v for key, v in row.items() if key != "name"] for row in rows]
+        written = [
+            [float(value or "nan") for key, value in row.items() if key != "name"]
+            for row in tables[name]
+        ]
+        told = [
+            [math.nan if v is None else v for key, v in row.items() if key != "name"]
+            for row in rows
+        ]
         np.testing.assert_allclose(written, told, rtol=1e-12)
     v_mag = [row["v_mag"] for row in found["rows"]]
-    assert v_mag == (v_mag[0] + 0.5 * np.arange(len(v_mag))).tolist() and found["stars"][0]["v_mag"] >= v_mag[0]
-    assert found["rows"][0]["detection"] == 1 and found["rows"][-1]["detection"] < 0.01 < found["rows"][-2]["detection"]
+    assert (
+        v_mag == (v_mag[0] + 0.5 * np.arange(len(v_mag))).tolist()
+        and found["stars"][0]["v_mag"] >= v_mag[0]
+    )
+    assert (
+        found["rows"][0]["detection"] == 1
+        and found["rows"][-1]["detection"] < 0.01 < found["rows"][-2]["detection"]
+    )
     usual = [row for row in found["rows"] if row["clipped_px"] == 0 and row["snr"] > 30]
-    assert len(usual) >= 4 and all(row[f"{kind}_px"] > 0.9 * row["bound_px"] for row in usual for kind in ("fit", "window"))
+    assert len(usual) >= 4 and all(
+        row[f"{kind}_px"] > 0.9 * row["bound_px"] for row in usual for kind in ("fit", "window")
+    )
     limit = found["nea_arcsec"].pop("limit")
-    assert all(one[way] > limit[way] for one in found["nea_arcsec"].values() for way in ("across", "about"))
+    assert all(
+        one[way] > limit[way] for one in found["nea_arcsec"].values() for way in ("across", "about")
+    )
     assert found["nea"][-1]["stars"] == len(found["stars"]) and found["fields"] == 1
     for figure in drawn:
         assert_legible(figure)
@@ -302,7 +402,11 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
 
 def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(bench_file):
     spoken = run_hilstar_here("budget", bench_file, "--noise")
-    assert spoken.returncode == 0 and "NEA, limit" in spoken.stdout and "1 px above 5 sigma" in spoken.stdout
+    assert (
+        spoken.returncode == 0
+        and "NEA, limit" in spoken.stdout
+        and "1 px above 5 sigma" in spoken.stdout
+    )
     assert spoken.stdout == run_hilstar_here("budget", bench_file, "--noise").stdout
 
 
@@ -314,39 +418,71 @@ def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_t
     for name, peak in peaks.items():
         rows = "".join(f"{at:g},{math.exp(-(((at - peak) / 60) ** 2)):.6f}\n" for at in nm)
         (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
-    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks}
-    detector = {"bayer": "rggb", "read_noise_e": 9, "dark_e_per_s": 50, "offset_dn": 20, "gain_e_per_dn": 1.0}
+    keys = {"quantum_efficiency": None} | {
+        f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks
+    }
+    detector = {
+        "bayer": "rggb",
+        "read_noise_e": 9,
+        "dark_e_per_s": 50,
+        "offset_dn": 20,
+        "gain_e_per_dn": 1.0,
+    }
     changes = {
         "tracker": keys | {"psf_sigma_px": [1.0, 1.0]},
         "tracker.detector": detector,
         "background": {"electrons_per_px": 30},
     }
     (tmp_path / "bench.toml").write_text(bench_text(changes, {"sky": {"faintest_v_mag": 5.0}}))
-    found = json.loads(run_hilstar_here("budget", tmp_path / "bench.toml", "--noise", "--radec", "84,-1,0", "--json").stdout)
+    found = json.loads(
+        run_hilstar_here(
+            "budget", tmp_path / "bench.toml", "--noise", "--radec", "84,-1,0", "--json"
+        ).stdout
+    )
     assert any("SNR r   SNR g   SNR b" in line for line in noise_lines(NoiseBudget(**found)))
     assert sum(one["star_share"] for one in found["channels"].values()) == pytest.approx(1)
     assert {one["background_e_per_px"] for one in found["channels"].values()} == {30.0}
     for row in found["rows"][4:]:
-        assert sum(row[f"snr_{name}"] ** 2 for name in peaks) == pytest.approx(row["snr"] ** 2, rel=0.02)
+        assert sum(row[f"snr_{name}"] ** 2 for name in peaks) == pytest.approx(
+            row["snr"] ** 2, rel=0.02
+        )
     row = next(one for one in found["rows"] if one["detection"] < 0.97)
     star = noisy_star(read_bench_file(tmp_path / "bench.toml"), np.full((4, 4), 30.0))
     place, side = np.random.default_rng(1).uniform(-0.5, 0.5, (2, TILES**2)), star.side_px
     image = np.zeros((TILES, TILE_PX + 1, TILES, TILE_PX + 1))
-    image[:, :side, :, :side] = (row["star_e"] * star.stamps(*place)).reshape(TILES, TILES, side, side).swapaxes(1, 2)
+    image[:, :side, :, :side] = (
+        (row["star_e"] * star.stamps(*place)).reshape(TILES, TILES, side, side).swapaxes(1, 2)
+    )
     image = image.reshape(TILES * (TILE_PX + 1), -1)
-    light = 30.0 + in_pixels([image * one["star_share"] for one in found["channels"].values()], "rggb")
-    dn = Detector(star.detector, image.shape).expose(light, star.exposure_s, np.random.default_rng(2))
-    assert len(find_stars(luminance(dn), CentroidSettings())) / TILES**2 == pytest.approx(row["detection"], abs=0.1)
+    light = 30.0 + in_pixels(
+        [image * one["star_share"] for one in found["channels"].values()], "rggb"
+    )
+    dn = Detector(star.detector, image.shape).expose(
+        light, star.exposure_s, np.random.default_rng(2)
+    )
+    assert len(find_stars(luminance(dn), CentroidSettings())) / TILES**2 == pytest.approx(
+        row["detection"], abs=0.1
+    )
 
 
 def test_a_field_without_stars_says_so(bench_file, tmp_path):
-    bench_file.write_text(bench_file.read_text().replace("faintest_v_mag = 6.5", "faintest_v_mag = 1.0"))
-    ran = run_hilstar_here("budget", bench_file, "--noise", "--radec", "190,27,0", "-o", tmp_path / "out")
+    bench_file.write_text(
+        bench_file.read_text().replace("faintest_v_mag = 6.5", "faintest_v_mag = 1.0")
+    )
+    ran = run_hilstar_here(
+        "budget", bench_file, "--noise", "--radec", "190,27,0", "-o", tmp_path / "out"
+    )
     assert ran.returncode == 0 and "none: fewer than 2 stars with a place" in ran.stdout
     assert (tmp_path / "out" / "nea.csv").exists() and not (tmp_path / "out" / "nea.png").exists()
 
 
 def test_what_budget_has_no_use_for_is_refused(bench_file):
-    assert_refused(run_hilstar_here("budget", bench_file, "--radec", "84,-1,0"), 2, "--radec", "add --noise")
-    assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--centroider", "fit"), 2, "leave out --centroider")
+    assert_refused(
+        run_hilstar_here("budget", bench_file, "--radec", "84,-1,0"), 2, "--radec", "add --noise"
+    )
+    assert_refused(
+        run_hilstar_here("budget", bench_file, "--noise", "--centroider", "fit"),
+        2,
+        "leave out --centroider",
+    )
     assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--radec", "84"), 2, "--radec")

@@ -39,7 +39,9 @@ def geometry():
     """A monitor of 0.9 tracker pixels a pixel, turned by 7 degrees and tilted by 0.2 and 0.1."""
     tracker = monitor_camera(TRACKER_PX, 13.0, 25.0, np.array([1.0, 0.0, 0.0, 0.0]))
     angles = np.radians([0.2, -0.1, 7.0]) / 2
-    monitor = monitor_camera((64, 48), 57.65, 120.0, np.array([1.0, *angles]) / math.hypot(1.0, *angles), (30.0, 25.0))
+    monitor = monitor_camera(
+        (64, 48), 57.65, 120.0, np.array([1.0, *angles]) / math.hypot(1.0, *angles), (30.0, 25.0)
+    )
     return BenchGeometry(monitor, tracker)
 
 
@@ -57,7 +59,10 @@ def oracle(geometry: BenchGeometry, light: np.ndarray) -> np.ndarray:
         ray = np.stack([(x - cx) / f_mon, (y - cy) / f_mon, np.ones_like(x)]).T @ turn
         at_x, at_y = (f_trk * ray[:, k] / ray[:, 2] + (TRACKER_PX[k] - 1) / 2 for k in (0, 1))
         shares = []
-        for place, size, sigma in ((at_x, TRACKER_PX[0], PSF_PX[0]), (at_y, TRACKER_PX[1], PSF_PX[1])):
+        for place, size, sigma in (
+            (at_x, TRACKER_PX[0], PSF_PX[0]),
+            (at_y, TRACKER_PX[1], PSF_PX[1]),
+        ):
             edges = np.arange(size + 1) - 0.5 - place[:, None]
             shares.append(np.diff(ndtr(edges / sigma), axis=1))
         image += light[row, column] / SIDE**2 * shares[1].T @ shares[0]
@@ -119,7 +124,9 @@ def test_a_mirror_is_about_the_middle_of_the_screen_and_its_own_inverse(geometry
 
 
 def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geometry):
-    small = replace(geometry, monitor=monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0])))
+    small = replace(
+        geometry, monitor=monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    )
     black = table_response(8, gamma_response(8).light, black=1e-3)
     with TwinOptics(small, GaussianPsf(PSF_PX)) as optics:
         glow = optics.glow_e_per_s(Panel(black, 1e6))
@@ -135,7 +142,9 @@ def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geo
 def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     """A tracker that sees far past a screen, whose lens is known as far as its corners."""
     small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
-    bent = replace(geometry, monitor=bounded(replace(small, lens=Lens(radial=(0.3, 0.0, 0.0))), 0.0))
+    bent = replace(
+        geometry, monitor=bounded(replace(small, lens=Lens(radial=(0.3, 0.0, 0.0))), 0.0)
+    )
     black = table_response(8, gamma_response(8).light, black=1e-3)
     with TwinOptics(bent, GaussianPsf(PSF_PX)) as optics:
         glow = optics.glow_e_per_s(Panel(black, 1e6))
@@ -158,7 +167,9 @@ def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
     """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the
     integral over its square.
     """
-    wide = replace(geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0])))
+    wide = replace(
+        geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    )
     x_px, y_px = (part.ravel() for part in np.meshgrid(np.arange(64.0), np.arange(48.0)))
     seen_x, seen_y = wide.to_tracker(x_px, y_px)
     beside = int(np.argmin(np.hypot(seen_x + 4.0, seen_y - 25.0)))
@@ -168,7 +179,10 @@ def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
         image = optics.image_e_per_s(light)
     side = (576.5e-3 / 120) / (13e-3 / 25)
     shares = []
-    for at, sigma, count in ((seen_x[beside], PSF_PX[0], TRACKER_PX[0]), (seen_y[beside], PSF_PX[1], TRACKER_PX[1])):
+    for at, sigma, count in (
+        (seen_x[beside], PSF_PX[0], TRACKER_PX[0]),
+        (seen_y[beside], PSF_PX[1], TRACKER_PX[1]),
+    ):
         edges = at + side * (np.arange(SIDE * 8) + 0.5) / (SIDE * 8) - side / 2
         pixels = np.arange(count)[:, None]
         inside = ndtr((pixels + 0.5 - edges) / sigma) - ndtr((pixels - 0.5 - edges) / sigma)

@@ -45,11 +45,17 @@ def star(x, y, z=CAMERA.focal_length_px):
 
 
 def drawn(stars, rate, direction=1):
-    view = View(IDENTITY, rate, scan=Scan((0, direction), SIZE[1] * ROW_S, EXPOSURE_S), exposed=True)
-    return linear_image(light_of(Canvas(CAMERA, PSF), [StarLayer(Canvas(CAMERA, PSF))], stars, view), SIZE, PSF)
+    view = View(
+        IDENTITY, rate, scan=Scan((0, direction), SIZE[1] * ROW_S, EXPOSURE_S), exposed=True
+    )
+    return linear_image(
+        light_of(Canvas(CAMERA, PSF), [StarLayer(Canvas(CAMERA, PSF))], stars, view), SIZE, PSF
+    )
 
 
-@pytest.mark.parametrize(("rate_deg_s", "direction"), [((1.0, 0, 0), 1), ((-2.0, 0.5, 0), 1), ((1.0, -1.0, 20.0), -1)])
+@pytest.mark.parametrize(
+    ("rate_deg_s", "direction"), [((1.0, 0, 0), 1), ((-2.0, 0.5, 0), 1), ((1.0, -1.0, 20.0), -1)]
+)
 def test_each_row_has_its_own_exposure(rate_deg_s, direction):
     """Row by row the mean of instants of that row's own time: light, and places along both axes."""
     rate, stars = np.radians(np.array(rate_deg_s)), star(60.3, 30.6)
@@ -67,7 +73,9 @@ def test_each_row_has_its_own_exposure(rate_deg_s, direction):
     assert found.sum() == pytest.approx(exact.sum(), rel=2e-5)
     y, x = np.indices(found.shape)
     for place in (x, y):
-        assert (found * place).sum() / found.sum() == pytest.approx((exact * place).sum() / exact.sum(), abs=5e-4)
+        assert (found * place).sum() / found.sum() == pytest.approx(
+            (exact * place).sum() / exact.sum(), abs=5e-4
+        )
     # A PSF is not sheared by the rows that it covers: 0.04 px a row here.
     assert np.abs(found - exact).max() < 0.02 * exact.max()
 
@@ -88,22 +96,29 @@ def test_a_star_that_runs_with_the_rows_is_exposed_for_longer():
 
 def drawn_y(seconds):
     """Where the star of the middle is after a time."""
-    turned = CAMERA.cam_to_image @ to_matrix(propagate(IDENTITY, np.radians(np.array([2.0, 0, 0])), seconds))
+    turned = CAMERA.cam_to_image @ to_matrix(
+        propagate(IDENTITY, np.radians(np.array([2.0, 0, 0])), seconds)
+    )
     return CAMERA.project(star(79.5, 59.5).vectors @ turned.T)[1][0]
 
 
 def test_a_rolling_truth_is_where_the_light_is_and_a_still_one_is_global_bit_for_bit(tmp_path):
     shots = {}
     for name, tables in (("global", {}), ("rolling", ROLLING)):
-        (tmp_path / f"{name}.toml").write_text(bench_text({"tracker": {"resolution_px": [128, 512]}, **tables}))
+        (tmp_path / f"{name}.toml").write_text(
+            bench_text({"tracker": {"resolution_px": [128, 512]}, **tables})
+        )
         with Simulator(read_bench_file(tmp_path / f"{name}.toml")) as tracker:
             still, turning = (
-                tracker.view(np.array(ORION_Q), np.radians(rate)) for rate in (np.zeros(3), np.array([2.0, 0, 0]))
+                tracker.view(np.array(ORION_Q), np.radians(rate))
+                for rate in (np.zeros(3), np.array([2.0, 0, 0]))
             )
             shots[name] = [tracker.expose(view, None) for view in (still, turning)]
     assert (shots["global"][0].mean_e == shots["rolling"][0].mean_e).all()
     shot = shots["rolling"][1]
-    inside = shot.truth[(np.abs(shot.truth["x_px"] - 64) < 50) & (np.abs(shot.truth["y_px"] - 256) < 225)]
+    inside = shot.truth[
+        (np.abs(shot.truth["x_px"] - 64) < 50) & (np.abs(shot.truth["y_px"] - 256) < 225)
+    ]
     row = inside[0]
     x, y = round(float(row["x_px"])), round(float(row["y_px"]))
     light = shot.mean_e[y - 22 : y + 23, x - 8 : x + 9]
@@ -112,7 +127,9 @@ def test_a_rolling_truth_is_where_the_light_is_and_a_still_one_is_global_bit_for
     assert centre == pytest.approx(float(row["y_px"]), abs=0.1)
     before = shots["global"][1].truth
     moved = row["y_px"] - before[before["name"] == row["name"]]["y_px"][0]
-    assert abs(moved) == pytest.approx(abs(row["y_px"] - 255.5) * 2.0 * np.pi / 180 * 5385 * 40e-6, rel=0.05)
+    assert abs(moved) == pytest.approx(
+        abs(row["y_px"] - 255.5) * 2.0 * np.pi / 180 * 5385 * 40e-6, rel=0.05
+    )
 
 
 def test_a_scanning_display_makes_the_stripes_of_the_closed_form(tmp_path):
@@ -165,7 +182,9 @@ def test_a_moving_star_behind_a_rolling_shutter_sees_the_frames_of_its_own_rows(
     display = DisplayTracker(file)
     with Simulator(file) as sky:
         for tracker in (sky, display):
-            shot = tracker.expose(sky.view(np.array(ORION_Q), np.radians(np.array([1.0, 0, 0]))), None)
+            shot = tracker.expose(
+                sky.view(np.array(ORION_Q), np.radians(np.array([1.0, 0, 0]))), None
+            )
             light = shot.mean_e - np.median(shot.mean_e)
             light[light < 0.003 * light.max()] = 0
             sums.append(light.sum())
@@ -176,7 +195,9 @@ def test_a_moving_star_behind_a_rolling_shutter_sees_the_frames_of_its_own_rows(
 
 
 def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
-    settings = DetectorSettings(shutter="frame-transfer", row_shift_us=2.0, gain_e_per_dn=1.0, bits=16)
+    settings = DetectorSettings(
+        shutter="frame-transfer", row_shift_us=2.0, gain_e_per_dn=1.0, bits=16
+    )
     light = np.zeros((50, 40))
     light[20, 7], light[3, 9] = 60_000.0, 20_000.0
     seen = Detector(settings, (40, 50)).expose_noiseless(light, 0.01)
@@ -202,7 +223,10 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"shutter": "rolling"}, 'row_time_us = 0 with shutter = "rolling"; write row_time_us above 0'),
+        (
+            {"shutter": "rolling"},
+            'row_time_us = 0 with shutter = "rolling"; write row_time_us above 0',
+        ),
         (
             {"row_shift_us": 2.0},
             'row_shift_us = 2 with shutter = "global"; write row_shift_us = 0, or shutter = "frame-transfer"',
@@ -214,7 +238,14 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
 def test_a_wrong_shutter_is_one_line(tmp_path, keys, said):
     (tmp_path / "bench.toml").write_text(bench_text({"tracker.detector": keys}))
     done = run_hilstar_here(
-        "simulate", tmp_path / "bench.toml", "--radec", "84,0,0", "--rate", "2,0,0", "--png", tmp_path / "a.png"
+        "simulate",
+        tmp_path / "bench.toml",
+        "--radec",
+        "84,0,0",
+        "--rate",
+        "2,0,0",
+        "--png",
+        tmp_path / "a.png",
     )
     assert done.returncode == 2
     assert said in done.stderr

@@ -24,7 +24,9 @@ def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
     """
     place = [100.0, 104.5, 200.0, 207.5, 300.0, 307.5, np.nan]
     flux = [1.0, 1.0, 1.0, 1.0, 1.0, 1000.0, 1.0]
-    assert crowded(np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))).tolist() == [
+    assert crowded(
+        np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))
+    ).tolist() == [
         True,
         True,
         False,
@@ -38,7 +40,9 @@ def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
 def test_two_stars_that_are_found_as_one_are_no_two():
     assert shared(np.array([-1, 0, 1, 1, -1])).tolist() == [False, False, True, True, False]
     nothing = np.empty(0)
-    found = Centroids(nothing, nothing, nothing, nothing, np.empty(0, dtype=np.intp), np.empty(0, dtype=np.bool_))
+    found = Centroids(
+        nothing, nothing, nothing, nothing, np.empty(0, dtype=np.intp), np.empty(0, dtype=np.bool_)
+    )
     assert nearest(found, np.array([1.0, np.nan]), np.array([2.0, 2.0])).tolist() == [-1, -1]
 
 
@@ -52,7 +56,12 @@ def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(
     """One star where it should be, one 2 px aside, one cut by the image's edge; nothing at the
     fourth place.
     """
-    finder = StarFinder(CentroidSettings(window_sigma_px=1.0), GaussianPsf((1.0, 1.0)), LocalBackground(0.0, 0.01), kind)
+    finder = StarFinder(
+        CentroidSettings(window_sigma_px=1.0),
+        GaussianPsf((1.0, 1.0)),
+        LocalBackground(0.0, 0.01),
+        kind,
+    )
     x_px, y_px = np.array([20.3, 42.1, 0.4, 60.0]), np.array([21.8, 40.0, 30.2, 15.0])
     places = [(20.3, 21.8), (40.1, 40.0), (0.4, 30.2)]
     share = [[np.diff(ndtr(np.arange(65) - 0.5 - at)) for at in place] for place in places]

@@ -24,10 +24,21 @@ LENS_PX = 0.02
 
 def bench_file(directory: Path, verify_lines: str = "", **changes: object) -> Path:
     """A bench of the twin with other exposure, monitor, bits, calibration or quantisation."""
-    values = {"exposure_s": 0.1, "monitor_px": [480, 400], "bits": 10, "calibration": "srgb", "method": "exact", **changes}
+    values = {
+        "exposure_s": 0.1,
+        "monitor_px": [480, 400],
+        "bits": 10,
+        "calibration": "srgb",
+        "method": "exact",
+        **changes,
+    }
     tables = {
         "tracker": {"resolution_px": [300, 300], "exposure_s": values["exposure_s"]},
-        "monitor": {"resolution_px": values["monitor_px"], "bits": values["bits"], "calibration": values["calibration"]},
+        "monitor": {
+            "resolution_px": values["monitor_px"],
+            "bits": values["bits"],
+            "calibration": values["calibration"],
+        },
         "render": {"quantisation": values["method"]},
     }
     path = directory / "bench.toml"
@@ -42,7 +53,10 @@ def verified(path: Path, fields: int, rng: np.random.Generator) -> tuple[Verdict
 
 def test_levels_of_another_monitor_s_primaries_stand_where_the_assumed_ones_do():
     grey = srgb_response(8)
-    assumed, true = (bit_stealing_response((grey,) * 3, weights) for weights in ((0.2126, 0.7152, 0.0722), (0.4, 0.35, 0.25)))
+    assumed, true = (
+        bit_stealing_response((grey,) * 3, weights)
+        for weights in ((0.2126, 0.7152, 0.0722), (0.4, 0.35, 0.25))
+    )
     seen = levels_of(assumed, true)
     light = grey.light[assumed.rgb] @ np.array([0.4, 0.35, 0.25])
     known = {tuple(triple) for triple in true.rgb.tolist()}
@@ -92,11 +106,15 @@ def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
 def test_the_codes_alone_do_not_depend_on_what_the_monitor_really_is(tmp_path):
     """Wherever the same stars are measured, the codes on the assumed monitor cost them the same."""
     right, _ = verified(bench_file(tmp_path), 4, np.random.default_rng(4))
-    wrong, _ = verified(bench_file(tmp_path, 'true_calibration = "gamma2.2"\n'), 4, np.random.default_rng(4))
+    wrong, _ = verified(
+        bench_file(tmp_path, 'true_calibration = "gamma2.2"\n'), 4, np.random.default_rng(4)
+    )
     assert not wrong.passed
     alone = {(s.hip, s.x_px): s.codes_px for s in right.errors.stars}
     assert len(wrong.errors.stars) > 5
-    assert all(s.codes_px == pytest.approx(alone[s.hip, s.x_px], abs=1e-9) for s in wrong.errors.stars)
+    assert all(
+        s.codes_px == pytest.approx(alone[s.hip, s.x_px], abs=1e-9) for s in wrong.errors.stars
+    )
 
 
 def test_a_field_without_stars_passes_nothing(tmp_path):
@@ -128,7 +146,9 @@ def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
         "q_cam_to_mon = [0.99999, 0, 0, 0.00447]\nk1 = 0.6\np1 = 0.001\ntilt_deg = [0.8, -0.5]\n"
     )
     path = bench_file(tmp_path)
-    path.write_text(path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"'))
+    path.write_text(
+        path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"')
+    )
     verdict, summary = verified(path, 6, np.random.default_rng(2))
     assert verdict.passed, verdict.reasons
     assert summary["stars"] > 10
@@ -136,12 +156,18 @@ def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
 
 
 def test_only_what_is_said_to_be_true_makes_a_twin_differ(tmp_path):
-    assert changed_keys(read_config(bench_file(tmp_path, "flux_mag = 0.2\n")).verify) == ["flux_mag"]
-    assert changed_keys(read_config(bench_file(tmp_path, 'true_mirror = "x"\n')).verify) == ["true_mirror"]
+    assert changed_keys(read_config(bench_file(tmp_path, "flux_mag = 0.2\n")).verify) == [
+        "flux_mag"
+    ]
+    assert changed_keys(read_config(bench_file(tmp_path, 'true_mirror = "x"\n')).verify) == [
+        "true_mirror"
+    ]
 
 
 @pytest.mark.parametrize(("columns", "stealing"), [("w", False), ("r,g,b", True)])
-def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(tmp_path, columns, stealing):
+def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(
+    tmp_path, columns, stealing
+):
     """Grey alone does not say how the tracker sees the primaries: its file refuses bit stealing."""
     light = gamma_response(8).light
     share = 1 / (columns.count(",") + 1)
@@ -152,7 +178,9 @@ def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(tmp_pat
     (tmp_path / "monitor.csv").write_text("\n".join([f"code,{columns}", *rows]))
     head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
-    path = bench_file(tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml")
+    path = bench_file(
+        tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml"
+    )
     verdict, _ = verified(path, 2, np.random.default_rng(1))
     (proposal,) = [reason for reason in verdict.reasons if reason.startswith("the codes alone")]
     assert ("bit_stealing" in proposal) == stealing
@@ -179,7 +207,10 @@ def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp
 
 
 def test_a_field_without_a_star_says_how_many_the_catalogue_has_there(tmp_path):
-    narrow = {"tracker": {"focal_length_mm": 150, "resolution_px": [128, 128]}, "collimator": {"focal_length_mm": 720}}
+    narrow = {
+        "tracker": {"focal_length_mm": 150, "resolution_px": [128, 128]},
+        "collimator": {"focal_length_mm": 720},
+    }
     path = tmp_path / "bench.toml"
     path.write_text(bench_text(TWIN, narrow))
     verdict = verify(read_bench_file(path), 2, np.random.default_rng(3))

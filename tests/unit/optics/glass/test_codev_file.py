@@ -48,7 +48,10 @@ def test_no_unit_is_mm_and_said():
 
 def test_curvatures_are_curvatures():
     """With RDM N, and without any RDM, which is CODE V's rule; that is said."""
-    surfaces = [(1 / radius, thickness, glass) for radius, thickness, glass in ((61.47, 6.0, "N-BK7"), (-44.64, 2.5, "N-SF5"))]
+    surfaces = [
+        (1 / radius, thickness, glass)
+        for radius, thickness, glass in ((61.47, 6.0, "N-BK7"), (-44.64, 2.5, "N-SF5"))
+    ]
     surfaces += [(-1 / 129.94, 95.952, "")]
     stated = read_codev(seq("RDM N;LEN", surfaces=surfaces))
     silent = read_codev(seq("RDM N", surfaces=surfaces).replace(b"RDM N\n", b""))
@@ -65,7 +68,9 @@ def test_radii_without_rdm_are_refused():
         read_codev(seq("RDM").replace(b"RDM\n", b""))
 
 
-@pytest.mark.parametrize(("terms", "rms_um"), [([], 55.8), (["ASP", "A -7e-07; B 0.0; C 0.0"], 15.8)])
+@pytest.mark.parametrize(
+    ("terms", "rms_um"), [([], 55.8), (["ASP", "A -7e-07; B 0.0; C 0.0"], 15.8)]
+)
 def test_a_is_the_coefficient_of_the_fourth_power(terms, rms_um):
     """The singlet's spot by an own ray trace: 55.8 um as a sphere, 15.8 um with A; A on r^2
     would leave 55.3 um.
@@ -77,7 +82,9 @@ def test_a_is_the_coefficient_of_the_fourth_power(terms, rms_um):
 def test_coefficients_go_up_to_the_twentieth_power():
     terms = "; ".join(f"{term} {number}e-9" for number, term in enumerate("ABCDEFGHJ", 1))
     polynomial = read_codev(seq(more={1: ["ASP", terms]})).surfaces[0].polynomial
-    assert [polynomial[power - 1] for power in range(4, 21, 2)] == pytest.approx([n * 1e-9 for n in range(1, 10)])
+    assert [polynomial[power - 1] for power in range(4, 21, 2)] == pytest.approx(
+        [n * 1e-9 for n in range(1, 10)]
+    )
     assert not any(polynomial[::2]) and polynomial[1] == 0
 
 
@@ -166,13 +173,17 @@ def test_what_a_system_line_says_is_used_or_refused(line, words):
 )
 def test_codes_of_glasses_keep_their_digits(code, index_d, abbe):
     glass = read_codev(seq().replace(b"NBK7_SCHOTT", code.encode())).surfaces[0].glass
-    assert glass.index_d == pytest.approx(index_d, abs=1e-9) and glass.abbe == pytest.approx(abbe, abs=1e-9)
+    assert glass.index_d == pytest.approx(index_d, abs=1e-9) and glass.abbe == pytest.approx(
+        abbe, abs=1e-9
+    )
 
 
 def test_a_private_glass_is_refused_where_it_is_used():
     private = "PRV\nPWL 656.3 587.6 486.1\n'E48' 1.5284 1.5311 1.537\nEND"
     assert focal_length_mm(read_codev(seq(private))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
-    with pytest.raises(InputError, match=r"surface 1 \(line \d+\) has the private glass E48 \(line 3\)"):
+    with pytest.raises(
+        InputError, match=r"surface 1 \(line \d+\) has the private glass E48 \(line 3\)"
+    ):
         read_codev(seq(private).replace(b"NBK7_SCHOTT", b"'E48'"))
 
 
@@ -184,7 +195,11 @@ def test_vignetting_is_shift_and_compression():
 
 
 def test_lines_go_on_and_comments_end_them():
-    text = seq().replace(b"EPD 20.0", b"EPD & ! the pupil\n  20.0 ! mm; not inches").replace(b"GO", b"GO ! FNO 3")
+    text = (
+        seq()
+        .replace(b"EPD 20.0", b"EPD & ! the pupil\n  20.0 ! mm; not inches")
+        .replace(b"GO", b"GO ! FNO 3")
+    )
     text = text.replace(b"EPD & ! the pupil", b"EPD &")
     assert read_codev(text).pupil == 20
     assert read_codev(seq("TITLE 'a; b ! c'")).pupil == 20
@@ -211,7 +226,9 @@ def test_a_fold_mirror_bends_the_axis():
     ray = real_rays(lens, np.array([[0.0], [0.0], [-10.0]]), np.array([[0.0], [0.0], [1.0]]))
     assert ray[0][:, 0] == pytest.approx([0, 0, 0], abs=1e-9)
     assert np.abs(ray[1][:, 0]) == pytest.approx([0, 0, 1], abs=1e-9)
-    assert np.linalg.norm(lens.surfaces[-1].origin_mm - lens.surfaces[1].origin_mm) == pytest.approx(30)
+    assert np.linalg.norm(
+        lens.surfaces[-1].origin_mm - lens.surfaces[1].origin_mm
+    ) == pytest.approx(30)
     assert lens.surfaces[-1].origin_mm[2] == pytest.approx(50, abs=1e-9)
 
 
@@ -234,4 +251,6 @@ def test_a_decentre_with_return_leaves_the_axis():
         np.array([[1.0, -3.0], [2.0, -4.0], [-150.0, -150.0]]),
         np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]]),
     )
-    assert real_rays(lens, at, along)[0][:2] == pytest.approx(np.array([[0, 0], [40, 40]]), abs=1e-9)
+    assert real_rays(lens, at, along)[0][:2] == pytest.approx(
+        np.array([[0, 0], [40, 40]]), abs=1e-9
+    )

@@ -52,14 +52,18 @@ def test_stars_have_their_flux_place_and_width_over_field_colour_and_focus(glass
 
 def test_a_pixel_integrated_map_gives_the_same_stars(rng):
     psf = glass_psf(glass_of(stack(integrated=True)), 0.0, MEAN)
-    flux, centroid_px, second = errors(psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20))
+    flux, centroid_px, second = errors(
+        psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20)
+    )
     assert (flux, centroid_px, second) < (FLUX, CENTROID_PX, SECOND)
     assert centroid_px < CENTROID_PX
     assert second < SECOND
 
 
 def test_scattered_points_are_interpolated_too(rng):
-    places = np.concatenate([rng.uniform(0, SIDE_PX - 1, (60, 2)), [(0, 0), (255, 0), (0, 255), (255, 255)]])
+    places = np.concatenate(
+        [rng.uniform(0, SIDE_PX - 1, (60, 2)), [(0, 0), (255, 0), (0, 255), (255, 255)]]
+    )
     at = np.arange(-HALF_PX * 4, HALF_PX * 4 + 1) / 4
     images = np.array([profile(x, y, 550.0)(at[None], at[:, None]) for x, y in places])
     points = np.column_stack([places, np.full(len(places), 550.0), np.zeros(len(places))])
@@ -104,15 +108,21 @@ def test_beyond_the_field_the_nearest_point_is_taken(glass):
     assert beyond.sum() == pytest.approx(edge.sum(), rel=1e-6)
 
 
-@pytest.mark.parametrize("places", [[(100, 100)], [(0, 100), (200, 100)], [(0, 0), (100, 100), (200, 200)]])
+@pytest.mark.parametrize(
+    "places", [[(100, 100)], [(0, 100), (200, 100)], [(0, 0), (100, 100), (200, 200)]]
+)
 def test_few_points_and_points_on_a_line_will_do(places):
     at = np.arange(-HALF_PX * 4, HALF_PX * 4 + 1) / 4
     images = np.array([profile(x, y, 550.0)(at[None], at[:, None]) for x, y in places])
     points = np.column_stack([places, np.full(len(places), np.nan), np.zeros(len(places))])
     psf = glass_psf(glass_of(Stack(images, points, facts_of(len(places)), 4)), 0.0, np.ones(1))
     x, y = places[-1]
-    light = psf.of_stars(np.array([float(x), x + 40]), np.array([float(y), y]), np.ones(1), np.ones(2))
-    assert moments(light[0])[1:] == pytest.approx(moments(truth(x, y, [1.0], 15, wavelengths_nm=(550.0,)))[1:], abs=5e-3)
+    light = psf.of_stars(
+        np.array([float(x), x + 40]), np.array([float(y), y]), np.ones(1), np.ones(2)
+    )
+    assert moments(light[0])[1:] == pytest.approx(
+        moments(truth(x, y, [1.0], 15, wavelengths_nm=(550.0,)))[1:], abs=5e-3
+    )
     assert light[1].sum() == pytest.approx(1, abs=1e-6)
 
 
@@ -122,10 +132,15 @@ def test_lateral_colour_of_the_table_moves_the_light(glass):
     shifted = glass_psf(replace(glass, lateral_px=moved), 0.0, MEAN)
     place = np.array([120.0]), np.array([130.0])
     red, blue = (
-        [psf.centroids_px(*place, share) for psf in (shifted, glass_psf(glass, 0.0, MEAN))] for share in np.eye(4)[[3, 0]]
+        [psf.centroids_px(*place, share) for psf in (shifted, glass_psf(glass, 0.0, MEAN))]
+        for share in np.eye(4)[[3, 0]]
     )
-    assert [float(a[0] - b[0]) for a, b in zip(*red, strict=True)] == pytest.approx([0.4, -0.2, 0.0], abs=2e-3)
-    assert [float(a[0] - b[0]) for a, b in zip(*blue, strict=True)] == pytest.approx([0.0, 0.0, 0.0], abs=2e-3)
+    assert [float(a[0] - b[0]) for a, b in zip(*red, strict=True)] == pytest.approx(
+        [0.4, -0.2, 0.0], abs=2e-3
+    )
+    assert [float(a[0] - b[0]) for a, b in zip(*blue, strict=True)] == pytest.approx(
+        [0.0, 0.0, 0.0], abs=2e-3
+    )
 
 
 def test_light_outside_the_stamps_is_missing_from_a_star(glass):
@@ -152,7 +167,10 @@ def test_a_corner_that_is_vignetted_whole_is_dark(glass):
 
 def test_a_field_without_stars_has_no_light(glass):
     nowhere = np.empty(0)
-    assert glass_psf(glass, 0.0, MEAN).of_stars(nowhere, nowhere, np.empty((0, 4)), nowhere).shape[0] == 0
+    assert (
+        glass_psf(glass, 0.0, MEAN).of_stars(nowhere, nowhere, np.empty((0, 4)), nowhere).shape[0]
+        == 0
+    )
 
 
 def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
@@ -162,7 +180,9 @@ def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
     plain = stack(integrated=True, per_px=1)
     noisy = replace(plain, images=plain.images + rng.normal(0, 1e-4, plain.images.shape))
     psf = glass_psf(glass_of(noisy), 0.0, MEAN)
-    flux, centroid_px, _ = errors(psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20))
+    flux, centroid_px, _ = errors(
+        psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20)
+    )
     assert centroid_px < 3 * 6.5e-3 + CENTROID_PX
     assert flux < FLUX
 
@@ -179,6 +199,8 @@ def test_a_psf_narrower_than_its_samples_is_refused():
 def test_a_wider_glass_is_its_basis_blurred(glass):
     psf = glass_psf(glass, 0.0, MEAN)
     at = np.array([200.0]), np.array([40.0])
-    before, after = (moments(one.of_stars(*at, MEAN, np.ones(1))[0]) for one in (psf, psf.blurred(0.7)))
+    before, after = (
+        moments(one.of_stars(*at, MEAN, np.ones(1))[0]) for one in (psf, psf.blurred(0.7))
+    )
     assert after[3:] - before[3:] == pytest.approx([0.49, 0.49], abs=5e-3)
     assert after[:3] == pytest.approx(before[:3], abs=5e-4)

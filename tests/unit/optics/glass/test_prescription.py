@@ -68,7 +68,9 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
 
     lens = CookeTriplet()
     save_optiland_file(lens, str(tmp_path / "lens.json"))
-    result = made(tmp_path, "--pitch-um", PITCH_UM, "--resolution", SIZE, "--half-px", 5, "--oversampling", 8)
+    result = made(
+        tmp_path, "--pitch-um", PITCH_UM, "--resolution", SIZE, "--half-px", 5, "--oversampling", 8
+    )
     assert result.returncode == 0, result.stderr
     # of its chief rays: its image plane is not the paraxial one
     assert "focal_length_mm = 49.79" in result.stdout
@@ -82,7 +84,9 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
             place = (glass.places_px[point] - [50, 40]) * PITCH_UM * 1e-3
             # over so small a field angles are tangents
             field = np.rad2deg(np.arctan(place / 50)) / 20
-            rays = lens.trace_generic(np.full(len(x), field[0]), np.full(len(x), field[1]), x, y, um)
+            rays = lens.trace_generic(
+                np.full(len(x), field[0]), np.full(len(x), field[1]), x, y, um
+            )
             chief = lens.trace_generic(field[0], field[1], 0.0, 0.0, um)
             image = glass.images[point, number, 0]
             for axis, got, middle in ((0, rays.x, chief.x[0]), (1, rays.y, chief.y[0])):
@@ -112,10 +116,20 @@ def zemax(folder: Path) -> Path:
     for number, part in enumerate(TILTED, 1):
         lines += [f"SURF {number}", *(["  STOP"] if number == 1 else [])]
         if len(part) == 7:
-            lines += ["  TYPE COORDBRK", *(f"  PARM {k} {value}" for k, value in enumerate(part[:6], 1)), f"  DISZ {part[6]}"]
+            lines += [
+                "  TYPE COORDBRK",
+                *(f"  PARM {k} {value}" for k, value in enumerate(part[:6], 1)),
+                f"  DISZ {part[6]}",
+            ]
         else:
             radius, thickness, glass, conic, fourth = part
-            lines += ["  TYPE EVENASPH", f"  CURV {1 / radius}", f"  CONI {conic}", f"  PARM 2 {fourth}", f"  DISZ {thickness}"]
+            lines += [
+                "  TYPE EVENASPH",
+                f"  CURV {1 / radius}",
+                f"  CONI {conic}",
+                f"  PARM 2 {fourth}",
+                f"  DISZ {thickness}",
+            ]
             lines += [f"  GLAS {glass} 0 0 1.5 60" if glass else ""]
     (folder / "tilted.zmx").write_text("\n".join(lines) + "\n")
     return folder / "tilted.zmx"
@@ -180,14 +194,29 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     monkeypatch.setattr(prescription, "POINTS", 3)
     monkeypatch.setattr(prescription, "GEOMETRIC_RAYS", 120)
-    options = ["--pitch-um", 10, "--resolution", "401,301", "--half-px", 60, "--oversampling", 2, "--focuses-um", "-40,40"]
-    result = run_hilstar_here("optics", "lens", zemax(tmp_path), "-o", tmp_path / "psf.fits", *options)
+    options = [
+        "--pitch-um",
+        10,
+        "--resolution",
+        "401,301",
+        "--half-px",
+        60,
+        "--oversampling",
+        2,
+        "--focuses-um",
+        "-40,40",
+    ]
+    result = run_hilstar_here(
+        "optics", "lens", zemax(tmp_path), "-o", tmp_path / "psf.fits", *options
+    )
     assert result.returncode == 0, result.stderr
     glass = read_glass(tmp_path / "psf.fits")
     focal_mm = float(" ".join(glass.history).split("focal length ")[1].split()[0])
     grid = np.array(np.meshgrid(*[(np.arange(120) + 0.5) / 60 - 1] * 2)).reshape(2, -1)
     # the chief ray first
-    pupil = np.concatenate([np.zeros((2, 1)), grid[:, (grid**2).sum(axis=0) <= 1]], axis=1) * EPD_MM / 2
+    pupil = (
+        np.concatenate([np.zeros((2, 1)), grid[:, (grid**2).sum(axis=0) <= 1]], axis=1) * EPD_MM / 2
+    )
     start = np.concatenate([pupil, np.zeros((1, pupil.shape[1]))])
     zero = snell(start[:, :1], np.array([[0.0], [0.0], [1.0]]), 0.55)[0][:2]
     at = (np.arange(glass.basis.shape[1]) - glass.basis.shape[1] // 2) / glass.per_px
@@ -195,28 +224,40 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
         place_px = glass.places_px[point] - [200, 150]
         tangent = place_px * 0.01 / focal_mm
         for _ in range(20):
-            tangent = tangent + place_px * 0.01 / focal_mm - np.concatenate(glass.lens.bent(*tangent[:, None]))
+            tangent = (
+                tangent
+                + place_px * 0.01 / focal_mm
+                - np.concatenate(glass.lens.bent(*tangent[:, None]))
+            )
         way = np.array([*tangent, 1.0]) / np.linalg.norm([*tangent, 1.0])
         for colour, um in enumerate(WAVES_UM):
             places, along = snell(start, np.repeat(way[:, None], pupil.shape[1], axis=1), um)
             for focus, defocus_um in enumerate((-40, 40)):
-                off_px = ((places + along / along[2] * defocus_um * 1e-3)[:2] - zero) / 0.01 - place_px[:, None]
+                off_px = (
+                    (places + along / along[2] * defocus_um * 1e-3)[:2] - zero
+                ) / 0.01 - place_px[:, None]
                 lateral = glass.lateral_px[point, colour, focus]
                 assert lateral == pytest.approx(off_px[:, 0], abs=CHIEF_PX)
                 image = glass.images[point, colour, focus]
                 for axis in (0, 1):
                     line, rays = image.sum(axis=axis), off_px[axis, 1:]
-                    assert line @ at + lateral[axis] == pytest.approx(rays.mean(), abs=RAY_CENTROID_PX)
+                    assert line @ at + lateral[axis] == pytest.approx(
+                        rays.mean(), abs=RAY_CENTROID_PX
+                    )
                     # by the samples among which a ray is shared out
                     shared = rays.var() + 1 / 8 / glass.per_px**2
-                    assert line @ at**2 - (line @ at) ** 2 == pytest.approx(shared, rel=RMS, abs=0.02)
+                    assert line @ at**2 - (line @ at) ** 2 == pytest.approx(
+                        shared, rel=RMS, abs=0.02
+                    )
 
 
 def traced_here(folder: Path, name: str, data: bytes, *options: object):
     """The command's answer for a lens file, and the glass that it wrote."""
     (folder / name).write_bytes(data)
     plate = ["--pitch-um", 6, "--resolution", "64,64", "--half-px", 8]
-    return run_hilstar_here("optics", "lens", folder / name, "-o", folder / "psf.fits", *plate, *options)
+    return run_hilstar_here(
+        "optics", "lens", folder / name, "-o", folder / "psf.fits", *plate, *options
+    )
 
 
 @pytest.mark.parametrize(
@@ -253,7 +294,9 @@ def test_the_pupil_of_an_obstructed_lens_is_lit_in_part(tmp_path, name, data):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     (tmp_path / name).write_bytes(data)
     lens = prescription._read(tmp_path / name)
-    rays = prescription._LensRays(lens.optic, lens.fields).bundle(np.zeros(2), 0.5875618, prescription.MIN_RAYS)
+    rays = prescription._LensRays(lens.optic, lens.fields).bundle(
+        np.zeros(2), 0.5875618, prescription.MIN_RAYS
+    )
     reader = {".zmx": read_zemax, ".seq": read_codev}[Path(name).suffix]
     lit = float((rays.light > 0).sum() / (prescription._filled(prescription.MIN_RAYS) > 0).sum())
     assert lit == pytest.approx(lit_share(reader(data)), abs=LIT_TOLERANCE)
@@ -269,10 +312,14 @@ def test_the_pupil_of_an_obstructed_lens_is_lit_in_part(tmp_path, name, data):
 )
 def test_a_glass_that_no_catalogue_has_is_refused_by_name(tmp_path, glass, words):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
-    result = traced_here(tmp_path, "lens.zmx", zmx().replace(b"GLAS N-SF5", f"GLAS {glass}".encode()))
+    result = traced_here(
+        tmp_path, "lens.zmx", zmx().replace(b"GLAS N-SF5", f"GLAS {glass}".encode())
+    )
     assert result.returncode == 2
     assert re.search(words, result.stderr), result.stderr
-    other = traced_here(tmp_path, "lens.seq", seq().replace(b"NSF5_SCHOTT", f"{glass}_MAKER".encode()))
+    other = traced_here(
+        tmp_path, "lens.seq", seq().replace(b"NSF5_SCHOTT", f"{glass}_MAKER".encode())
+    )
     assert other.returncode == 2 and f"the glass {glass}" in other.stderr
 
 
@@ -298,12 +345,17 @@ def test_what_a_file_leaves_open_is_said(tmp_path):
     assert result.returncode == 0 and "no DIM: its lengths are taken as mm" in result.stderr
 
 
-@pytest.mark.parametrize(("curvature", "second"), [(0.0, 0.5 / 51.68), (1 / 51.68, 1e-3), (1 / 40.0, -2e-3)])
+@pytest.mark.parametrize(
+    ("curvature", "second"), [(0.0, 0.5 / 51.68), (1 / 51.68, 1e-3), (1 / 40.0, -2e-3)]
+)
 def test_a_term_in_r_squared_bends_paraxial_rays(tmp_path, curvature, second):
     """PARM 1: focal length and spot are those of the own trace of the surface as it is stated."""
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     surfaces = [(51.68, 4.0, "N-BK7"), (1e12, 97.363, "")]
-    data = zmx(surfaces=surfaces, more={1: [f"  CURV {curvature!r}", "  CONI -0.4", f"  PARM 1 {second!r}"]})
+    data = zmx(
+        surfaces=surfaces,
+        more={1: [f"  CURV {curvature!r}", "  CONI -0.4", f"  PARM 1 {second!r}"]},
+    )
     (tmp_path / "lens.zmx").write_bytes(data.replace(b"TYPE STANDARD", b"TYPE EVENASPH"))
     stated = read_zemax((tmp_path / "lens.zmx").read_bytes())
     lens = prescription._read(tmp_path / "lens.zmx")

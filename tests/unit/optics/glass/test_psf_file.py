@@ -23,7 +23,10 @@ FLOAT32 = 1e-6  # of the largest sample: the basis is float32
 
 @pytest.fixture(scope="module")
 def glass():
-    lens, curve = Lens((0.01, -0.002, 0.0), (1e-4, 0.0)), Curve(np.array([400.0, 700.0]), np.array([0.8, 0.9]))
+    lens, curve = (
+        Lens((0.01, -0.002, 0.0), (1e-4, 0.0)),
+        Curve(np.array([400.0, 700.0]), np.array([0.8, 0.9])),
+    )
     return glass_of(stack(3, (450.0, 650.0), (0.0, 5.0)), 1e-3, lens, curve, ("made by a test",))
 
 
@@ -31,9 +34,23 @@ def test_what_is_written_is_read(glass, tmp_path):
     write_glass(tmp_path / "psf.fits", glass)
     found = read_glass(tmp_path / "psf.fits")
     assert isinstance(found, Glass)
-    for name in ("places_px", "wavelengths_nm", "focuses_um", "basis", "weights", "illumination", "outside", "lateral_px"):
+    for name in (
+        "places_px",
+        "wavelengths_nm",
+        "focuses_um",
+        "basis",
+        "weights",
+        "illumination",
+        "outside",
+        "lateral_px",
+    ):
         assert (getattr(found, name) == getattr(glass, name)).all(), name
-    assert (found.lens, found.per_px, found.pixel_integrated, found.history) == (glass.lens, 4, False, glass.history)
+    assert (found.lens, found.per_px, found.pixel_integrated, found.history) == (
+        glass.lens,
+        4,
+        False,
+        glass.history,
+    )
     assert found.transmission is not None
     assert (found.transmission.value == [0.8, 0.9]).all()
     assert read_glass(tmp_path / "psf.fits") is found  # again without reading it anew
@@ -51,7 +68,9 @@ def test_the_basis_keeps_each_psf_to_its_tolerance_and_its_moments_exactly(toler
     assert found.residual <= max(tolerance, 1e-6)
     y, x = (np.indices(images.shape[1:]) - images.shape[1] // 2) / 4
     for term in (x * 0 + 1, x, y, x * x, x * y, y * y):
-        assert (kept * term).sum(axis=(1, 2)) == pytest.approx((images * term).sum(axis=(1, 2)), abs=1e-5)
+        assert (kept * term).sum(axis=(1, 2)) == pytest.approx(
+            (images * term).sum(axis=(1, 2)), abs=1e-5
+        )
 
 
 def test_a_looser_tolerance_needs_fewer_components():
@@ -68,7 +87,9 @@ def test_one_image_is_what_it_was(tmp_path):
 
 
 def spoilt(**changes):
-    return lambda given: replace(given, **{name: change(getattr(given, name).copy()) for name, change in changes.items()})
+    return lambda given: replace(
+        given, **{name: change(getattr(given, name).copy()) for name, change in changes.items()}
+    )
 
 
 def put(place, value):
@@ -82,7 +103,10 @@ def put(place, value):
 @pytest.mark.parametrize(
     ("change", "advice"),
     [
-        (lambda s: replace(s, images=s.images[:, :-1]), "write images (n, height, width) of odd sides"),
+        (
+            lambda s: replace(s, images=s.images[:, :-1]),
+            "write images (n, height, width) of odd sides",
+        ),
         (spoilt(images=put((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
         (spoilt(images=put(1, 0.0)), "image 2 has samples that are not finite, or no light"),
         (lambda s: replace(s, at=s.at[:-1]), "write one point for each image"),
@@ -117,8 +141,16 @@ def test_a_file_that_another_program_spoilt_is_one_line(tmp_path, header, table,
     write_glass(tmp_path / "psf.fits", glass_of(stack(2, (450.0, 650.0))))
     with fits.open(tmp_path / "psf.fits") as hdus:
         hdus[0].header.update(header)
-        columns = [fits.Column(c.name, c.format, array=hdus[1].data[c.name]) for c in hdus[1].columns if c.name not in table]
-        columns += [fits.Column(name, f"{value[0].size}D", array=value) for name, value in table.items() if value is not None]
+        columns = [
+            fits.Column(c.name, c.format, array=hdus[1].data[c.name])
+            for c in hdus[1].columns
+            if c.name not in table
+        ]
+        columns += [
+            fits.Column(name, f"{value[0].size}D", array=value)
+            for name, value in table.items()
+            if value is not None
+        ]
         spoilt_table = fits.BinTableHDU.from_columns(columns, name="POINTS")
         fits.HDUList([hdus[0], spoilt_table]).writeto(tmp_path / "bad.fits")
     with pytest.raises(InputError) as said:

@@ -27,13 +27,17 @@ def test_the_doublet_has_its_focal_length():
     assert not lens.notes
 
 
-@pytest.mark.parametrize(("unit", "mm"), [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("in", 25.4)])
+@pytest.mark.parametrize(
+    ("unit", "mm"), [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("in", 25.4)]
+)
 def test_units_are_scaled(unit, mm):
     """Lengths, curvatures, asphere terms and apertures of one lens are the same in every unit."""
     more = {1: [f"  PARM 1 {1e-3 * mm!r}", f"  PARM 2 {-7e-7 * mm**3!r}", f"  CLAP 0 {8 / mm!r} 0"]}
     text = zmx(unit=unit, mm=mm, more=more).replace(b"TYPE STANDARD", b"TYPE EVENASPH")
     lens = read_zemax(text)
-    assert focal_length_mm(read_zemax(zmx(unit=unit, mm=mm))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+    assert focal_length_mm(read_zemax(zmx(unit=unit, mm=mm))) == pytest.approx(
+        FOCAL_MM, abs=TOLERANCE_MM
+    )
     assert lens.pupil == pytest.approx(20)
     assert lens.surfaces[0].polynomial[1] == pytest.approx(1e-3)
     assert lens.surfaces[0].polynomial[3] == pytest.approx(-7e-7)
@@ -167,7 +171,9 @@ def test_the_editors_lists_behind_the_lens_are_passed_over():
         "MNUM 1 1",
         'MOFF   0   1 "" 0 0 0',
     ]
-    assert focal_length_mm(read_zemax(zmx(behind=behind))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+    assert focal_length_mm(read_zemax(zmx(behind=behind))) == pytest.approx(
+        FOCAL_MM, abs=TOLERANCE_MM
+    )
     with pytest.raises(InputError, match="MNUM says 3 configurations"):
         read_zemax(zmx(behind=["MNUM 3 1"]))
 
@@ -208,7 +214,9 @@ def test_vignetting_factors_shift_and_compress():
 
 
 def test_utf_16_and_bytes_that_are_no_text_are_read_or_refused():
-    assert focal_length_mm(read_zemax(zmx().decode().encode("utf-16"))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+    assert focal_length_mm(read_zemax(zmx().decode().encode("utf-16"))) == pytest.approx(
+        FOCAL_MM, abs=TOLERANCE_MM
+    )
     with pytest.raises(InputError):
         read_zemax(bytes(range(256)) * 20)
 

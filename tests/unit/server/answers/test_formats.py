@@ -29,7 +29,10 @@ ROUNDED_RAD = 4 * SCALE  # a quaternion of int32
 FIELDS: list[dict[str, Any]] = [
     {"name": "t_s", "at": 4, "type": "u32be"},
     {"name": "t_sub", "at": 8, "type": "u16be", "scale": 2.0**-16},
-    *({"name": name, "at": 10 + 4 * k, "type": "i32be", "scale": SCALE} for k, name in enumerate(("qx", "qy", "qz", "qw"))),
+    *(
+        {"name": name, "at": 10 + 4 * k, "type": "i32be", "scale": SCALE}
+        for k, name in enumerate(("qx", "qy", "qz", "qw"))
+    ),
     {"name": "valid", "at": 26, "type": "u8", "mask": 1},
     {"name": "mode", "at": 26, "type": "u8", "mask": 0x30},
     {"name": "stars", "at": 27, "type": "u8"},
@@ -39,11 +42,19 @@ FIELDS: list[dict[str, Any]] = [
 ]
 BODY_BYTES = 37
 # The check values of 123456789 in the catalogue of parametrised CRC algorithms, and by hand.
-CHECKS = {"crc16-ccitt-false": 0x29B1, "crc16-xmodem": 0x31C3, "crc32": 0xCBF43926, "sum8": 0xDD, "xor8": 0x31}
+CHECKS = {
+    "crc16-ccitt-false": 0x29B1,
+    "crc16-xmodem": 0x31C3,
+    "crc32": 0xCBF43926,
+    "sum8": 0xDD,
+    "xor8": 0x31,
+}
 
 
 def settings_of(**keys: Any) -> AnswersSettings:
-    settings = msgspec.convert({"source": "udp", "format": "frame", "fields": FIELDS, **keys}, AnswersSettings)
+    settings = msgspec.convert(
+        {"source": "udp", "format": "frame", "fields": FIELDS, **keys}, AnswersSettings
+    )
     check_answers(settings)
     return settings
 
@@ -64,7 +75,13 @@ def crc16(data: bytes, value: int = 0xFFFF) -> int:
 def body_of(q: np.ndarray = Q, seconds: int = 1000, valid: int = 1) -> bytes:
     numbers = struct.pack(">4i", *(round(part / SCALE) for part in (*q[1:], q[0])))
     rates = b"".join(int(rate).to_bytes(3, "big", signed=True) for rate in (1, -2, 300_000))
-    return b"\x1a\xcf\x21\x27" + struct.pack(">IH", seconds, 0x8000) + numbers + bytes([valid | 0x20, 12]) + rates
+    return (
+        b"\x1a\xcf\x21\x27"
+        + struct.pack(">IH", seconds, 0x8000)
+        + numbers
+        + bytes([valid | 0x20, 12])
+        + rates
+    )
 
 
 def sealed(body: bytes) -> bytes:
@@ -80,13 +97,24 @@ def ccsds(body: bytes) -> bytes:
     return packet + struct.pack(">H", crc16(packet))
 
 
-SYNC = {"framing": "sync", "sync_hex": "1A CF", "length": {"at": 3, "type": "u8"}, "checksum": "crc16-ccitt-false"}
+SYNC = {
+    "framing": "sync",
+    "sync_hex": "1A CF",
+    "length": {"at": 3, "type": "u8"},
+    "checksum": "crc16-ccitt-false",
+}
 CCSDS_FIELDS = [{**field, "at": field["at"] + 6} for field in FIELDS]
 FRAMINGS: dict[str, tuple[dict[str, Any], Any]] = {
     "sync": (SYNC, sealed),
     "slip": ({"framing": "slip", "checksum": "crc16-ccitt-false"}, lambda body: slip(sealed(body))),
-    "cobs": ({"framing": "cobs", "checksum": "crc16-ccitt-false"}, lambda body: cobs.encode(sealed(body)) + b"\0"),
-    "fixed": ({"framing": "fixed", "length": BODY_BYTES + 2, "checksum": "crc16-ccitt-false"}, sealed),
+    "cobs": (
+        {"framing": "cobs", "checksum": "crc16-ccitt-false"},
+        lambda body: cobs.encode(sealed(body)) + b"\0",
+    ),
+    "fixed": (
+        {"framing": "fixed", "length": BODY_BYTES + 2, "checksum": "crc16-ccitt-false"},
+        sealed,
+    ),
     "ccsds": ({"framing": "ccsds", "checksum": "crc16-ccitt-false", "fields": CCSDS_FIELDS}, ccsds),
 }
 
@@ -103,7 +131,13 @@ def test_a_declared_frame_gives_every_field(name):
     assert found.rate_cam_rad_s is not None
     assert angle_between_rad(found.q_icrs_to_cam, Q) < ROUNDED_RAD
     assert found.rate_cam_rad_s == pytest.approx([1e-6, -2e-6, 0.3], rel=1e-12)
-    assert (found.host_ns, found.t_ns, found.valid, found.mode, found.star_count) == (5, 1_000_500_000_000, True, "2", 12)
+    assert (found.host_ns, found.t_ns, found.valid, found.mode, found.star_count) == (
+        5,
+        1_000_500_000_000,
+        True,
+        "2",
+        12,
+    )
 
 
 @pytest.mark.parametrize("name", FRAMINGS)
@@ -168,12 +202,18 @@ def test_conventions_are_undone():
                 sent = sent if scalar == "first" else np.roll(sent, -1)
                 convention = {"scalar": scalar, "direction": direction, "frame": frame}
                 decoder = AnswerDecoder(
-                    settings_of(format="json", fields=[], convention=convention), tuple(body_to_cam.tolist()), True
+                    settings_of(format="json", fields=[], convention=convention),
+                    tuple(body_to_cam.tolist()),
+                    True,
                 )
-                (found,) = answers(decoder.feed(0, msgspec.json.encode({"t_ns": 1, "q": sent.tolist()})))
+                (found,) = answers(
+                    decoder.feed(0, msgspec.json.encode({"t_ns": 1, "q": sent.tolist()}))
+                )
                 assert found.q_icrs_to_cam is not None
                 assert angle_between_rad(found.q_icrs_to_cam, Q) < 1e-7
-                marked = [each.convention for each in under_conventions(found, decoder, Q) if each.matches]
+                marked = [
+                    each.convention for each in under_conventions(found, decoder, Q) if each.matches
+                ]
                 assert [msgspec.to_builtins(each) for each in marked] == [convention]
 
 
@@ -181,8 +221,13 @@ def test_a_wrong_convention_is_named_with_what_to_write():
     decoder = decoder_of(format="json", fields=[])
     (found,) = decoder.feed(0, msgspec.json.encode({"q": np.roll(Q, -1).tolist()}) + b"\n")
     said = "\n".join(lines_of(found, decoder, Q))
-    assert 'write [answers] convention = { scalar = "last", direction = "icrs_to_cam", frame = "cam" }' in said
-    assert "no convention matches" in "\n".join(lines_of(found, decoder, from_radec_roll_deg(10.0, 80.0, 5.0)))
+    assert (
+        'write [answers] convention = { scalar = "last", direction = "icrs_to_cam", frame = "cam" }'
+        in said
+    )
+    assert "no convention matches" in "\n".join(
+        lines_of(found, decoder, from_radec_roll_deg(10.0, 80.0, 5.0))
+    )
 
 
 def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
@@ -191,7 +236,9 @@ def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
         (found,) = answers(decoder_of(messages=messages, format="packet", fields=[]).feed(0, sent))
         assert (found.t_ns, found.star_count, found.mode, found.valid) == (42, 9, "tracking", True)
     (lost,) = answers(
-        decoder_of(messages=True, format="packet", fields=[]).feed(0, encode(AnswerPacket(8, 4, 43, (0.0, 0.0, 0.0, 0.0))))
+        decoder_of(messages=True, format="packet", fields=[]).feed(
+            0, encode(AnswerPacket(8, 4, 43, (0.0, 0.0, 0.0, 0.0)))
+        )
     )
     assert (lost.valid, lost.q_icrs_to_cam, lost.mode) == (False, None, "lost in space")
 
@@ -216,7 +263,10 @@ def test_a_wrong_json_answer_is_refused_with_its_reason(line):
 def test_centroids_that_are_none_are_left_out():
     said = b'{"q":[1,0,0,0],"centroids":[[1.5,2.5,300,11767],[null,1],[3],[4,5]]}\n'
     (found,) = answers(decoder_of(format="json", fields=[]).feed(0, said))
-    assert [tuple(star) for star in found.centroids] == [(1.5, 2.5, 300.0, 11767), (4.0, 5.0, None, None)]
+    assert [tuple(star) for star in found.centroids] == [
+        (1.5, 2.5, 300.0, 11767),
+        (4.0, 5.0, None, None),
+    ]
 
 
 def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
@@ -227,7 +277,9 @@ def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
         "    yield {'t_ns': len(data), 'q': [0, 1, 0, 0], 'stars': 4}\n"
         "    yield {'q': 'none'}\n"
     )
-    decoder = AnswerDecoder(settings_of(format="python:my_tracker:decode", fields=[]), None, False, tmp_path)
+    decoder = AnswerDecoder(
+        settings_of(format="python:my_tracker:decode", fields=[]), None, False, tmp_path
+    )
     good, bad = decoder.feed(0, b"abc")
     assert isinstance(good, Answer)
     assert (good.t_ns, good.star_count) == (3, 4)
@@ -235,11 +287,18 @@ def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
     assert [getattr(each, "reason", "") for each in (bad, raised)] == ["format", "python"]
     sys.modules.pop("my_tracker")
     with pytest.raises(InputError, match="name a module beside the bench file"):
-        AnswerDecoder(settings_of(format="python:no_such_module:decode", fields=[]), None, False, tmp_path)
+        AnswerDecoder(
+            settings_of(format="python:no_such_module:decode", fields=[]), None, False, tmp_path
+        )
 
 
-@pytest.mark.parametrize("name", ["os:system", "subprocess:run", "numpy:load", "os.path:join", "json:loads", "builtins:exec"])
-def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(tmp_path: Path, name: str):
+@pytest.mark.parametrize(
+    "name",
+    ["os:system", "subprocess:run", "numpy:load", "os.path:join", "json:loads", "builtins:exec"],
+)
+def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(
+    tmp_path: Path, name: str
+):
     module, _, _ = name.partition(":")
     with pytest.raises(InputError, match="stands in"):
         AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
@@ -250,17 +309,25 @@ def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(tmp
 
 
 def test_a_package_that_is_trusted_may_be_named_and_only_that(tmp_path: Path):
-    AnswerDecoder(settings_of(format="python:json:loads", fields=[], trust=["json"]), None, False, tmp_path)
+    AnswerDecoder(
+        settings_of(format="python:json:loads", fields=[], trust=["json"]), None, False, tmp_path
+    )
     with pytest.raises(InputError, match="stands in"):
-        AnswerDecoder(settings_of(format="python:os:system", fields=[], trust=["json"]), None, False, tmp_path)
+        AnswerDecoder(
+            settings_of(format="python:os:system", fields=[], trust=["json"]), None, False, tmp_path
+        )
 
 
 def test_modules_of_one_name_in_two_folders_are_two(tmp_path: Path):
     for k in range(2):
         (folder := tmp_path / str(k)).mkdir()
-        (folder / "same_name.py").write_text("import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]")
+        (folder / "same_name.py").write_text(
+            "import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]"
+        )
         (folder / "beside.py").write_text("T = 7")
-        decoder = AnswerDecoder(settings_of(format="python:same_name:decode", fields=[]), None, False, folder)
+        decoder = AnswerDecoder(
+            settings_of(format="python:same_name:decode", fields=[]), None, False, folder
+        )
         assert [each.t_ns for each in decoder.feed(0, b"")] == [7]
 
 
@@ -272,7 +339,12 @@ WRONG = {
     "lacks qw": {"framing": "slip", "fields": [{"name": "qx", "at": 0, "type": "f32"}]},
     "twice": {"framing": "slip", "fields": [*FIELDS, FIELDS[0]]},
     "u8, i8, u16": {"framing": "slip", "fields": [{**FIELDS[0], "type": "f16"}, *FIELDS[1:]]},
-    'port is for source = "serial" or "udp"': {"framing": "slip", "source": "file", "port": "/dev/x", "path": "x"},
+    'port is for source = "serial" or "udp"': {
+        "framing": "slip",
+        "source": "file",
+        "port": "/dev/x",
+        "path": "x",
+    },
     "needs connect": {"framing": "slip", "poll_hex": "00"},
     "one of them": {"framing": "slip", "source": "tcp"},
     'is for format = "frame"': {"format": "json"},

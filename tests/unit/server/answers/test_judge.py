@@ -14,7 +14,13 @@ from hilstar.basics.rotation import from_rotation_vector, multiply, propagate
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.server.answers import judge as judge_module
 from hilstar.server.answers.answer import Answer
-from hilstar.server.answers.judge import VERDICTS, AnswerJudge, AnswerRules, AnswerTimes, fitted_delay
+from hilstar.server.answers.judge import (
+    VERDICTS,
+    AnswerJudge,
+    AnswerRules,
+    AnswerTimes,
+    fitted_delay,
+)
 from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
 
 PERIOD_NS = NS_PER_S // 60
@@ -31,14 +37,23 @@ def attitude(t_s: float) -> np.ndarray:
 def lit_until(t_s: float, **keys) -> LitFrames:
     frames = LitFrames(PERIOD_NS, **keys)
     for k in range(int(t_s * 60)):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude(k * PERIOD_NS / NS_PER_S)))
+        frames.add(
+            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude(k * PERIOD_NS / NS_PER_S))
+        )
     return frames
 
 
 def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn():
     frames, rate = LitFrames(PERIOD_NS), np.radians([0.2, -0.4, 1.0])
     for k in range(120):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+        frames.add(
+            LitFrame(
+                k,
+                k * PERIOD_NS,
+                k * PERIOD_NS + 7,
+                propagate(START, rate, k * PERIOD_NS / NS_PER_S),
+            )
+        )
     lit = frames.over(round(1.0 * NS_PER_S), round(1.2 * NS_PER_S))
     truth = propagate(START, rate, 1.1)
     # Frames stand for the time about their moment, and ends of the exposure cut two of them: within
@@ -52,15 +67,30 @@ def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn
 def test_a_screen_that_holds_still_frames_shows_them_half_a_frame_late():
     frames, rate = LitFrames(PERIOD_NS, centred=False), np.radians([0.0, 1.0, 0.0])
     for k in range(120):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+        frames.add(
+            LitFrame(
+                k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S)
+            )
+        )
     lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
-    assert np.abs(residual_arcsec(propagate(START, rate, 1.1 - 0.5 / 60), lit.q)).max() < 0.01 * 3600 / 60
+    assert (
+        np.abs(residual_arcsec(propagate(START, rate, 1.1 - 0.5 / 60), lit.q)).max()
+        < 0.01 * 3600 / 60
+    )
 
 
 def test_frames_drawn_in_motion_have_the_attitude_of_the_middle_of_their_light():
     frames, rate = LitFrames(PERIOD_NS, hold_s=1 / 60, centred=True), np.radians([0.0, 1.0, 0.0])
     for k in range(120):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S), rate))
+        frames.add(
+            LitFrame(
+                k,
+                k * PERIOD_NS,
+                k * PERIOD_NS,
+                propagate(START, rate, k * PERIOD_NS / NS_PER_S),
+                rate,
+            )
+        )
     lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
     assert np.abs(residual_arcsec(propagate(START, rate, 1.1), lit.q)).max() < 0.01 * 3600 / 60
 
@@ -70,7 +100,9 @@ def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
     away = from_rotation_vector(np.radians([0.0, 30.0, 0.0]))
     for k in range(60):
         dark.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
-        jumping.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START if k < 30 else multiply(away, START)))
+        jumping.add(
+            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START if k < 30 else multiply(away, START))
+        )
     assert dark.over(0, NS_PER_S // 4) is not None
     assert dark.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is None
     assert dark.dark_ns == 28 * PERIOD_NS
@@ -83,7 +115,9 @@ BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20
 LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
 
 
-def judged(clock: str, seconds: float = 60.0, wild: float = 0.01, **rules) -> tuple[AnswerJudge, list]:
+def judged(
+    clock: str, seconds: float = 60.0, wild: float = 0.01, **rules
+) -> tuple[AnswerJudge, list]:
     """A minute of a planted tracker: bias, noise, a clock that runs fast, late by LATENCY_S and
     more, and wild answers.
     """
@@ -95,7 +129,9 @@ def judged(clock: str, seconds: float = 60.0, wild: float = 0.01, **rules) -> tu
         middle_s = 0.2 + i / ANSWER_HZ
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
-            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            frames.add(
+                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S))
+            )
             k += 1
         error = (BIAS_ARCSEC + NOISE_ARCSEC * rng.standard_normal(3)) / ARCSEC_PER_RAD
         if rng.random() < wild:
@@ -119,12 +155,16 @@ def test_the_last_minutes_residual_is_the_planted_error(clock):
     sigma = 4 * NOISE_ARCSEC / np.sqrt(600) + 1080 * 0.002
     assert np.abs(np.array(figures.mean_arcsec) - BIAS_ARCSEC).max() < sigma.max()
     assert np.array(figures.sigma3_arcsec) == pytest.approx(3 * NOISE_ARCSEC, rel=0.2)
-    assert figures.latency_ms / 1e3 == pytest.approx(LATENCY_S, abs=0.02 if clock == "own" else 4 * JITTER_S)
+    assert figures.latency_ms / 1e3 == pytest.approx(
+        LATENCY_S, abs=0.02 if clock == "own" else 4 * JITTER_S
+    )
     assert figures.availability == pytest.approx(1 - sum(wild) / len(wild), abs=0.004)
     assert figures.rate_hz == pytest.approx(ANSWER_HZ, rel=0.01)
     assert figures.refused == {"checksum": 3}
     assert figures.silent == ""
-    assert judge.figures(found[-1][0].answer.host_ns + 3 * NS_PER_S, {}).silent.endswith("has not answered for 3.0 s")
+    assert judge.figures(found[-1][0].answer.host_ns + 3 * NS_PER_S, {}).silent.endswith(
+        "has not answered for 3.0 s"
+    )
 
 
 def test_a_stated_latency_is_taken_and_not_fitted():
@@ -167,9 +207,14 @@ def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
 
 
 def test_unix_stamps_are_taken_with_the_hosts_stated_error():
-    times = AnswerTimes(AnswerRules(EXPOSURE_S, "end", "unix"), lambda: UnixOffset(-(10**18), 3_000_000))
+    times = AnswerTimes(
+        AnswerRules(EXPOSURE_S, "end", "unix"), lambda: UnixOffset(-(10**18), 3_000_000)
+    )
     # The stamp is the exposure's end: its middle is half an exposure earlier.
-    assert times.middle(Answer(7 * NS_PER_S, b"", 10**18 + 5 * NS_PER_S)) == (5 * NS_PER_S - NS_PER_S // 20, 0.003)
+    assert times.middle(Answer(7 * NS_PER_S, b"", 10**18 + 5 * NS_PER_S)) == (
+        5 * NS_PER_S - NS_PER_S // 20,
+        0.003,
+    )
 
 
 def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
@@ -181,7 +226,9 @@ def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
             frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
             k += 1
         set_ns = 10**18 if 60 <= i < 120 else 0  # forward by thirty years, and back
-        verdicts.append(judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict)
+        verdicts.append(
+            judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict
+        )
     assert verdicts.count("right") >= 197 and "wrong" not in verdicts
     assert set(verdicts[:120] + verdicts[124:]) == {"right"}
 
@@ -202,7 +249,9 @@ def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
         middle_s = 0.2 + i / ANSWER_HZ
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
-            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            frames.add(
+                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S))
+            )
             k += 1
         error_arcsec = CROSS_ARCSEC * rng.standard_normal(3) * [1.0, 1.0, ROLL_RATIO]
         if kind == "early outlier" and i == 4:
@@ -228,8 +277,19 @@ def test_a_noisy_roll_and_odd_answers_leave_every_answer_judged_and_the_delay_fo
 
 def all_finite(judge: AnswerJudge, now_ns: int) -> bool:
     figures = judge.figures(now_ns, {})
-    lists = [figures.residual_arcsec, figures.mean_arcsec, figures.rms_arcsec, figures.sigma3_arcsec]
-    numbers = [figures.latency_ms, figures.latency_sigma_ms, figures.age_s, figures.availability, figures.rate_hz]
+    lists = [
+        figures.residual_arcsec,
+        figures.mean_arcsec,
+        figures.rms_arcsec,
+        figures.sigma3_arcsec,
+    ]
+    numbers = [
+        figures.latency_ms,
+        figures.latency_sigma_ms,
+        figures.age_s,
+        figures.availability,
+        figures.rate_hz,
+    ]
     numbers += [judge.times.delay_s, judge.times.sigma_s]
     for each in lists:
         numbers += each or []
@@ -262,7 +322,9 @@ def test_no_finite_answers_in_any_order_end_the_judging(clock, many, seed):
         if len(error) == 3:
             q = multiply(from_rotation_vector(q / ARCSEC_PER_RAD), attitude(at_s - 0.15))
         t_ns = round((at_s - 0.15) * NS_PER_S) + odd_ns
-        answer = Answer(round(at_s * NS_PER_S), b"", t_ns if stamped else None, q / np.linalg.norm(q))
+        answer = Answer(
+            round(at_s * NS_PER_S), b"", t_ns if stamped else None, q / np.linalg.norm(q)
+        )
         judged_one = judge.judge(answer)
         assert judged_one.verdict in VERDICTS and judged_one.verdict != "unjudged"
         assert all_finite(judge, answer.host_ns)
@@ -291,10 +353,14 @@ def test_a_delay_under_which_no_answer_is_right_is_given_up():
         at_ns = host_ns + k * NS_PER_S // 10
         for number in range(6):
             lit_ns = at_ns - NS_PER_S // 10 + number * PERIOD_NS
-            judge._frames.add(LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude(lit_ns / NS_PER_S)))
+            judge._frames.add(
+                LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude(lit_ns / NS_PER_S))
+            )
         middle_ns = at_ns - round(LATENCY_S * NS_PER_S)
         own_ns = round(middle_ns * (1 + DRIFT)) + EPOCH_NS
-        again.append(judge.judge(Answer(at_ns, b"", own_ns, attitude(middle_ns / NS_PER_S))).verdict)
+        again.append(
+            judge.judge(Answer(at_ns, b"", own_ns, attitude(middle_ns / NS_PER_S))).verdict
+        )
     assert again[0] == "wrong" and set(again[-100:]) == {"right"}
     assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
 

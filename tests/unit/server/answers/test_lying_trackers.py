@@ -15,9 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.explain import lines_of
-from hilstar.server.answers.formats import MAX_KEPT_BYTES, MAX_MODE_CHARACTERS, AnswerDecoder, RefusedAnswer
+from hilstar.server.answers.formats import (
+    MAX_KEPT_BYTES,
+    MAX_MODE_CHARACTERS,
+    AnswerDecoder,
+    RefusedAnswer,
+)
 from hilstar.server.answers.reader import PIECE_BYTES, HandedOver, hand_over, handed_over
-from tests.unit.server.answers.test_formats import CCSDS_FIELDS, FRAMINGS, Q, answers, body_of, decoder_of, settings_of
+from tests.unit.server.answers.test_formats import (
+    CCSDS_FIELDS,
+    FRAMINGS,
+    Q,
+    answers,
+    body_of,
+    decoder_of,
+    settings_of,
+)
 
 BODY_TO_CAM = (0.5, 0.5, -0.5, 0.5)
 
@@ -52,7 +65,9 @@ def test_whatever_json_says_can_be_handed_over(text):
 
 def test_whatever_numbers_a_frame_has_can_be_handed_over(rng):
     names = ("qw", "qx", "qy", "qz", "t_s", "t_sub", "valid", "mode", "stars", "wx", "wy", "wz")
-    fields = [{"name": name, "at": 8 * k, "type": "f64be", "scale": 1e9} for k, name in enumerate(names)]
+    fields = [
+        {"name": name, "at": 8 * k, "type": "f64be", "scale": 1e9} for k, name in enumerate(names)
+    ]
     decoder = decoder_of(framing="fixed", length=8 * len(names), fields=fields, messages=True)
     odd = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-9, 0.0, 5e-324])
     given = [rng.choice(odd, len(names)) for _ in range(1000)]
@@ -73,7 +88,9 @@ def test_noise_is_refused_explained_and_not_kept(name, rng):
     )
     decoder = decoder_of(**keys)
     noise = rng.integers(0, 256, 12_000, dtype=np.uint8)
-    noise[rng.random(len(noise)) < 0.1] = rng.choice(np.frombuffer(b"\0\1\xc0\xdb\n{\x1a\xcf\x08", np.uint8))
+    noise[rng.random(len(noise)) < 0.1] = rng.choice(
+        np.frombuffer(b"\0\1\xc0\xdb\n{\x1a\xcf\x08", np.uint8)
+    )
     for k, chunk in enumerate(np.array_split(noise, 150)):
         handed(decoder.feed(k * 10**8 * (k % 7 == 0), chunk.tobytes()), decoder)
 
@@ -95,7 +112,10 @@ def test_memory_is_flat_under_babble(name, rng):
     base = tracemalloc.get_traced_memory()[0]
     for k in range(5):  # twice what may be kept
         decoder.feed(k, rng.bytes(PIECE_BYTES) + good)
-    peak, grown = tracemalloc.get_traced_memory()[1] - base, tracemalloc.get_traced_memory()[0] - base
+    peak, grown = (
+        tracemalloc.get_traced_memory()[1] - base,
+        tracemalloc.get_traced_memory()[0] - base,
+    )
     tracemalloc.stop()
     assert grown < 4 * MAX_KEPT_BYTES
     assert peak < 16 * MAX_KEPT_BYTES  # one chunk's refusals, each with its bytes
@@ -115,8 +135,12 @@ def test_attitude_and_rate_are_the_camera_s_under_each_convention(scalar, direct
     q = sent.as_quat() if scalar == "last" else np.roll(sent.as_quat(), 1)
     rate = mounting.inv().apply(rate_cam) if held == "body" else rate_cam
     convention = {"scalar": scalar, "direction": direction, "frame": held}
-    decoder = AnswerDecoder(settings_of(format="json", fields=[], convention=convention), BODY_TO_CAM, True)
-    (found,) = answers(decoder.feed(0, json.dumps({"q": q.tolist(), "rate": rate.tolist()}).encode()))
+    decoder = AnswerDecoder(
+        settings_of(format="json", fields=[], convention=convention), BODY_TO_CAM, True
+    )
+    (found,) = answers(
+        decoder.feed(0, json.dumps({"q": q.tolist(), "rate": rate.tolist()}).encode())
+    )
     off = Rotation.from_quat(np.roll(found.q_icrs_to_cam, -1)) * icrs_to_cam.inv()
     assert off.magnitude() < 1e-14
     assert np.abs(found.rate_cam_rad_s - rate_cam).max() < 1e-15

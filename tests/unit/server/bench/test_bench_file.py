@@ -27,11 +27,17 @@ brightest_v_mag = -1
 """
 opened: list[str] = []
 sys.addaudithook(
-    lambda event, told: opened.append(str(told[0])) if event == "open" and str(told[0]).endswith("bench.toml") else None
+    lambda event, told: (
+        opened.append(str(told[0]))
+        if event == "open" and str(told[0]).endswith("bench.toml")
+        else None
+    )
 )
 
 
-def test_a_file_that_is_replaced_after_it_was_read_changes_nothing_of_the_run(small_bench_file, tmp_path):
+def test_a_file_that_is_replaced_after_it_was_read_changes_nothing_of_the_run(
+    small_bench_file, tmp_path
+):
     file = read_bench_file(small_bench_file)
     small_bench_file.write_text(OTHER_BENCH)
     with open_bench(file) as bench, Ledger(tmp_path / "run.mcap", bench):

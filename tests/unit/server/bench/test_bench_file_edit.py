@@ -22,7 +22,11 @@ def test_one_key_of_a_bench_file_is_set_and_nothing_else_changes(before, after):
 
 
 @pytest.mark.parametrize(
-    ("value", "written"), [("exact", 'key = "exact"'), (True, "key = true"), (2.5, "key = 2.5"), (8, "key = 8")]
+    ("value", "written"),
+    [("exact", 'key = "exact"'), (True, "key = true"), (2.5, "key = 2.5"), (8, "key = 8")],
 )
 def test_a_key_is_written_as_toml_writes_it(value, written):
-    assert with_key('[monitor]\nkey = "round"  # ours\n', "monitor", "key", value) == f"[monitor]\n{written}  # ours\n"
+    assert (
+        with_key('[monitor]\nkey = "round"  # ours\n', "monitor", "key", value)
+        == f"[monitor]\n{written}  # ours\n"
+    )

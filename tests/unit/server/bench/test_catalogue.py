@@ -16,7 +16,12 @@ from numpy.polynomial.polynomial import polyval
 from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import bench_optics, star_kinds, star_rates
-from hilstar.server.bench.catalogue import bench_catalogue, nearest_neighbours, sigma_instrument_mag, write_catalogue
+from hilstar.server.bench.catalogue import (
+    bench_catalogue,
+    nearest_neighbours,
+    sigma_instrument_mag,
+    write_catalogue,
+)
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry
 from hilstar.sky.facts import errors_of, sigma_v_mag
@@ -53,9 +58,14 @@ def test_gaia_s_g_follows_the_published_relation(bench, spectrum):
     stars = load_catalog().brighter_than(5.0)
     kind = star_kinds(bench.config, stars)
     bp_rp = np.linspace(*GAIA_RANGE_MAG, 2000)
-    g_less_v, v_less_i = polyval(bp_rp, G_LESS_V), polyval(bp_rp, G_LESS_I) - polyval(bp_rp, G_LESS_V)
+    g_less_v, v_less_i = (
+        polyval(bp_rp, G_LESS_V),
+        polyval(bp_rp, G_LESS_I) - polyval(bp_rp, G_LESS_V),
+    )
     kept = (stars.vi_mag > 0) & (stars.vi_mag < 2.5)
-    found = colours(spectrum, "ballesteros2012", Photometry())["g"](stars.bv_mag, stars.vi_mag, kind)
+    found = colours(spectrum, "ballesteros2012", Photometry())["g"](
+        stars.bv_mag, stars.vi_mag, kind
+    )
     off = np.abs(found - np.interp(stars.vi_mag, v_less_i, g_less_v))[kept]
     assert np.median(off) < G_MEDIAN_MAG
     assert np.percentile(off, 95) < G_P95_MAG
@@ -76,7 +86,9 @@ def test_the_nearest_neighbour_is_that_of_all_distances():
     rows = np.arange(0, len(stars), 7)
     found, arcsec = nearest_neighbours(stars, rows, 2026.0)
     vectors = unit_vectors_icrs(stars, 2026.0)
-    angle = np.arctan2(np.linalg.norm(np.cross(vectors[rows, None], vectors), axis=2), vectors[rows] @ vectors.T)
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(vectors[rows, None], vectors), axis=2), vectors[rows] @ vectors.T
+    )
     angle[np.arange(len(rows)), rows] = np.inf
     angle[stars.v_mag >= stars.v_mag[rows, None] + 3.0] = np.inf
     assert found.tolist() == angle.argmin(axis=1).tolist()
@@ -91,10 +103,17 @@ def test_the_error_of_an_instrument_magnitude_is_that_of_small_steps(bench, spec
 
     config = replace(bench.config, sky=replace(bench.config.sky, spectrum=spectrum))
     stars = load_catalog().brighter_than(3.0)
-    facts, rates, kind = errors_of(stars), star_rates(config, bench.folder), star_kinds(config, stars)
+    facts, rates, kind = (
+        errors_of(stars),
+        star_rates(config, bench.folder),
+        star_kinds(config, stars),
+    )
     v, bv, vi = stars.v_mag, stars.bv_mag, stars.vi_mag
     base, variance = rates(v, bv, vi, kind), sigma_v_mag(facts, bv) ** 2
-    for name, changed in (("sigma_bv_mag", (bv + STEP_MAG, vi)), ("sigma_vi_mag", (bv, vi + STEP_MAG))):
+    for name, changed in (
+        ("sigma_bv_mag", (bv + STEP_MAG, vi)),
+        ("sigma_vi_mag", (bv, vi + STEP_MAG)),
+    ):
         slope = magnitude(rates(v, *changed, kind) / base) / STEP_MAG
         variance = variance + np.where(slope == 0, 0, slope * facts[name]) ** 2
     known = np.isfinite(variance)
@@ -112,7 +131,10 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
     if ending == "parquet":
         read = pyarrow.parquet.read_table(path)
         values = {name: np.array(read[name].to_pylist()) for name in read.column_names}
-        meta = {field.name: {k.decode(): v.decode() for k, v in field.metadata.items()} for field in read.schema}
+        meta = {
+            field.name: {k.decode(): v.decode() for k, v in field.metadata.items()}
+            for field in read.schema
+        }
         units = {name: (found["unit"], found["ucd"]) for name, found in meta.items()}
     elif ending == "vot":
         votable = parse_single_table(path)
@@ -123,7 +145,10 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
             data, header = hdus[1].data, hdus[1].header
             values = {name: np.array(data[name]) for name in data.names}
             places = {name: k for k, name in enumerate(data.names, start=1)}
-            units = {name: (_unit(header.get(f"TUNIT{k}")), header[f"TUCD{k}"]) for name, k in places.items()}
+            units = {
+                name: (_unit(header.get(f"TUNIT{k}")), header[f"TUCD{k}"])
+                for name, k in places.items()
+            }
             assert header["EPOCH"] == 2030.0
     else:
         with path.open(newline="") as file:
@@ -135,9 +160,13 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
     assert {name: (_unit(unit), ucd) for name, (unit, ucd) in units.items()} == described
     for name, column in bright.columns.items():
         if column.values.dtype.kind == "f":
-            assert values[name].astype(float) == pytest.approx(column.values, rel=1e-5, nan_ok=True), name
+            assert values[name].astype(float) == pytest.approx(
+                column.values, rel=1e-5, nan_ok=True
+            ), name
         else:
-            assert [str(v).strip() for v in values[name]] == [str(v).strip() for v in column.values], name
+            assert [str(v).strip() for v in values[name]] == [
+                str(v).strip() for v in column.values
+            ], name
 
 
 def test_a_type_with_a_comma_stays_in_its_field(bench, tmp_path):
@@ -156,7 +185,10 @@ def _unit(unit):
     return "" if not unit else units.Unit(str(unit)).to_string()
 
 
-OTHER_SENSORS = ({"aperture_mm": 12, "quantum_efficiency": "kai-4021"}, {"aperture_mm": 85, "quantum_efficiency": "qe.csv"})
+OTHER_SENSORS = (
+    {"aperture_mm": 12, "quantum_efficiency": "kai-4021"},
+    {"aperture_mm": 85, "quantum_efficiency": "qe.csv"},
+)
 
 
 @pytest.mark.parametrize("tracker", OTHER_SENSORS, ids=["kai-4021", "own curve"])
@@ -171,19 +203,39 @@ def test_instrument_magnitudes_are_those_of_own_quadrature(tmp_path, tracker):
     optics, made = bench_optics(file.config.tracker, file.folder), bench_catalogue(file, 2.0, None)
     low, high = optics.range_nm
     nm = np.linspace(low, high, round((high - low) * 100) + 1)
-    response = optics.quantum_efficiency(nm) * optics.transmission(nm) * np.pi / 4 * (tracker["aperture_mm"] * 1e-3) ** 2
+    response = (
+        optics.quantum_efficiency(nm)
+        * optics.transmission(nm)
+        * np.pi
+        / 4
+        * (tracker["aperture_mm"] * 1e-3) ** 2
+    )
     h, c = 6.62607015e-34, 299_792_458.0
     ab0 = np.trapezoid(response * 3.631e-23 / (h * nm * 1e-9), nm * 1e-9)
-    vega_nm, vega = np.loadtxt(_data("vega.csv"), delimiter=",", comments="#", skiprows=_header("vega.csv"), unpack=True)
-    v_nm, v = np.loadtxt(_data("johnson-v.csv"), delimiter=",", comments="#", skiprows=_header("johnson-v.csv"), unpack=True)
+    vega_nm, vega = np.loadtxt(
+        _data("vega.csv"), delimiter=",", comments="#", skiprows=_header("vega.csv"), unpack=True
+    )
+    v_nm, v = np.loadtxt(
+        _data("johnson-v.csv"),
+        delimiter=",",
+        comments="#",
+        skiprows=_header("johnson-v.csv"),
+        unpack=True,
+    )
     fine = np.linspace(v_nm[0], v_nm[-1], 40_001)
     passband = np.interp(fine, v_nm, v)
-    mean = np.trapezoid(passband * np.interp(fine, vega_nm, vega), fine) / np.trapezoid(passband, fine)
+    mean = np.trapezoid(passband * np.interp(fine, vega_nm, vega), fine) / np.trapezoid(
+        passband, fine
+    )
     flux = np.interp(nm, vega_nm, vega) / mean * 3.631e-2 * 10 ** (-0.4 * 0.03)
     vega_e = np.trapezoid(response * flux * nm * 1e-9 / (h * c), nm * 1e-9)
     rate = made.columns["electrons_per_s"].values
-    assert made.columns["instrument_mag_ab"].values == pytest.approx(-2.5 * np.log10(rate / ab0), abs=1e-4)
-    assert made.columns["instrument_mag_vega"].values == pytest.approx(0.03 - 2.5 * np.log10(rate / vega_e), abs=1e-4)
+    assert made.columns["instrument_mag_ab"].values == pytest.approx(
+        -2.5 * np.log10(rate / ab0), abs=1e-4
+    )
+    assert made.columns["instrument_mag_vega"].values == pytest.approx(
+        0.03 - 2.5 * np.log10(rate / vega_e), abs=1e-4
+    )
 
 
 def _data(name):
@@ -213,23 +265,51 @@ def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(bench, tm
 
     stars = load_catalog().brighter_than(2.5)
     facts = errors_of(stars)
-    columns = {"ra": stars.ra_deg, "dec": stars.dec_deg, "pmra": stars.pm_ra_cosdec_mas_yr, "pmdec": stars.pm_dec_mas_yr}
-    columns |= {"Vmag": stars.v_mag, "B-V": stars.bv_mag, "V-I": stars.vi_mag, "Plx": stars.parallax_mas}
-    columns |= {name: facts[role] for role, name in TABLE_NAMES.items()} | {"e_Vmag": sigma_v_mag(facts, stars.bv_mag)}
+    columns = {
+        "ra": stars.ra_deg,
+        "dec": stars.dec_deg,
+        "pmra": stars.pm_ra_cosdec_mas_yr,
+        "pmdec": stars.pm_dec_mas_yr,
+    }
+    columns |= {
+        "Vmag": stars.v_mag,
+        "B-V": stars.bv_mag,
+        "V-I": stars.vi_mag,
+        "Plx": stars.parallax_mas,
+    }
+    columns |= {name: facts[role] for role, name in TABLE_NAMES.items()} | {
+        "e_Vmag": sigma_v_mag(facts, stars.bv_mag)
+    }
     table = Table(columns | {"SpType": facts["spectral_type"].astype(str)})
     table["ra_error"].unit = "mas"
-    forms = {"csv": {"format": "ascii.csv"}, "fits": {"format": "fits"}, "vot": {"format": "votable"}}
+    forms = {
+        "csv": {"format": "ascii.csv"},
+        "fits": {"format": "fits"},
+        "vot": {"format": "votable"},
+    }
     table.write(tmp_path / f"own.{ending}", overwrite=True, **forms[ending])
     sky = {"spectrum": "mk", "catalogue": f"own.{ending}", "catalogue_epoch_jyear": 1991.25}
-    (tmp_path / "bench.toml").write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": sky}))
+    (tmp_path / "bench.toml").write_text(
+        bench_text({"collimator": {"focal_length_mm": 350}, "sky": sky})
+    )
     own = read_bench_file(tmp_path / "bench.toml")
-    found, wanted = bench_catalogue(own, 2.5, 2030.0).columns, bench_catalogue(bench, 2.5, 2030.0).columns
-    order, theirs = (np.lexsort((one["dec_deg"].values, one["v_mag"].values)) for one in (found, wanted))
+    found, wanted = (
+        bench_catalogue(own, 2.5, 2030.0).columns,
+        bench_catalogue(bench, 2.5, 2030.0).columns,
+    )
+    order, theirs = (
+        np.lexsort((one["dec_deg"].values, one["v_mag"].values)) for one in (found, wanted)
+    )
     names = [name for name in wanted if name.startswith("sigma_") or name.endswith("correlation")]
     assert len(names) == 10
     for name in names:
         # by colour: a table's stars have no type that draws them
         if name != "sigma_instrument_mag":
-            assert found[name].values[order] == pytest.approx(wanted[name].values[theirs], rel=1e-6, nan_ok=True), name
-    assert found["spectral_type"].values[order].tolist() == wanted["spectral_type"].values[theirs].tolist()
+            assert found[name].values[order] == pytest.approx(
+                wanted[name].values[theirs], rel=1e-6, nan_ok=True
+            ), name
+    assert (
+        found["spectral_type"].values[order].tolist()
+        == wanted["spectral_type"].values[theirs].tolist()
+    )
     assert set(found["v_source"].values.tolist()) == {"U"}

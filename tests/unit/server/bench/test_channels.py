@@ -51,7 +51,11 @@ def curves(tmp_path_factory):
 
 
 def written(curves, channels, *changes):
-    keys = {"quantum_efficiency": f"{channels}.csv"} if len(channels) == 1 else {"quantum_efficiency": None}
+    keys = (
+        {"quantum_efficiency": f"{channels}.csv"}
+        if len(channels) == 1
+        else {"quantum_efficiency": None}
+    )
     if len(channels) > 1:
         keys |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in channels}
     white = {"render": {"flux_at_white_e_per_s": 1e6, "quantisation": "round"}}
@@ -77,7 +81,9 @@ def test_three_channels_are_three_trackers_of_one_channel_each(curves, spectrum)
     alone = np.concatenate([light_of(curves, name, sky).light for name in "rgb"])
     assert frame.light.shape == (3, 240, 320) and frame.light.dtype == np.float32
     np.testing.assert_allclose(frame.light, alone, rtol=0, atol=FLOAT32_STEPS * alone.max())
-    np.testing.assert_allclose(frame.linear, alone.sum(axis=0), rtol=0, atol=FLOAT32_STEPS * alone.max())
+    np.testing.assert_allclose(
+        frame.linear, alone.sum(axis=0), rtol=0, atol=FLOAT32_STEPS * alone.max()
+    )
     blue_share = frame.light[2][frame.linear > 1e3] / frame.linear[frame.linear > 1e3]
     assert blue_share.max() > 1.5 * blue_share.min()  # stars differ in colour
 
@@ -89,14 +95,21 @@ def test_bodies_have_colours_of_their_own_as_points_and_as_discs(curves):
         "sky.bodies": {"moon": True, "planets": True},
     }
     with ExitStack() as stack:
-        bench, *mono = (stack.enter_context(bench_with(curves, channels, tables)) for channels in ("rgb", *"rgb"))
+        bench, *mono = (
+            stack.enter_context(bench_with(curves, channels, tables))
+            for channels in ("rgb", *"rgb")
+        )
         for name in ("Moon", "Mars"):
-            vector = bench.stars.vectors[len(bench.stars) - len(bench.stars.bodies) + bench.stars.bodies.index(name)]
+            vector = bench.stars.vectors[
+                len(bench.stars) - len(bench.stars.bodies) + bench.stars.bodies.index(name)
+            ]
             ra_deg, dec_deg = np.degrees([np.arctan2(vector[1], vector[0]), np.arcsin(vector[2])])
             q = from_radec_roll_deg(ra_deg, dec_deg, 0.0)
             assert (name == "Moon") == bool(bench.light(bench.view(q)).discs)
             alone = np.concatenate([one.frame(q).light for one in mono])
-            np.testing.assert_allclose(bench.frame(q).light, alone, rtol=0, atol=FLOAT32_STEPS * alone.max())
+            np.testing.assert_allclose(
+                bench.frame(q).light, alone, rtol=0, atol=FLOAT32_STEPS * alone.max()
+            )
 
 
 @pytest.mark.gpu
@@ -105,7 +118,10 @@ def test_light_that_is_no_stars_has_the_colour_of_its_own_bv(curves):
     with bench_with(curves, "rgb", {"sky": {"faintest_v_mag": 5.0}}) as bench:
         sprites, file = bench.sprites(np.array(ORION_Q)), bench.file
         one = np.ones(1)
-        red, sun = (star_flux(file.config, file.folder)(0 * one, bv * one, np.nan * one)[0] for bv in (1.5, 0.65))
+        red, sun = (
+            star_flux(file.config, file.folder)(0 * one, bv * one, np.nan * one)[0]
+            for bv in (1.5, 0.65)
+        )
         glow = GlowLight(np.array([0.0, 0, 1]), 10.0, 0.1, 2.0, bench.camera, 0.65)
         spread = LightMap(np.ones((9, 9), np.float32), (20, 20), bv_mag=1.5)
         none, of_all = sprites.data[:0], bench.stars.electrons_per_s @ bench.stars.colours
@@ -113,9 +129,18 @@ def test_light_that_is_no_stars_has_the_colour_of_its_own_bv(curves):
             ({"star": np.full(len(sprites), -1), "added": (AddedLight("", 2.0, 1.5, 1e4),)}, red),
             ({"data": none, "star": sprites.star[:0], "extended": (glow,)}, sun),
             ({"data": none, "star": sprites.star[:0], "extended": (spread,)}, red),
-            ({"data": none, "star": sprites.star[:0], "extended": (replace(spread, bv_mag=None),)}, of_all),
+            (
+                {
+                    "data": none,
+                    "star": sprites.star[:0],
+                    "extended": (replace(spread, bv_mag=None),),
+                },
+                of_all,
+            ),
         ):
-            light = linear_light(bench.renderer, replace(sprites, **lights), bench.stars).sum(axis=(1, 2), dtype=np.float64)
+            light = linear_light(bench.renderer, replace(sprites, **lights), bench.stars).sum(
+                axis=(1, 2), dtype=np.float64
+            )
             np.testing.assert_allclose(light / light.sum(), wanted / wanted.sum(), rtol=2e-4)
 
 
@@ -123,9 +148,13 @@ def test_a_stars_electrons_by_channel_are_those_of_a_quadrature(curves):
     """Planck's law from its formula by trapezia of 0.5 nm: stars from 3000 to 20 000 K."""
     sky = {"sky": {"spectrum": "blackbody", "brightness": "dgs", "faintest_v_mag": 4.0}}
     stars = bench_stars(read_bench_file(written(curves, "rgb", sky)).config, curves)
-    assert len(stars) > 400 and stars.temperature_k.min() < 3700 and stars.temperature_k.max() > 15_000
+    assert (
+        len(stars) > 400 and stars.temperature_k.min() < 3700 and stars.temperature_k.max() > 15_000
+    )
     found = stars.electrons_per_s[:, None] * stars.colours
-    wanted = np.array([integrals(t) for t in stars.temperature_k]) * 10 ** (-0.4 * stars.v_mag[:, None])
+    wanted = np.array([integrals(t) for t in stars.temperature_k]) * 10 ** (
+        -0.4 * stars.v_mag[:, None]
+    )
     np.testing.assert_allclose(found, wanted, rtol=QUADRATURE)
     np.testing.assert_allclose(stars.colours.sum(axis=1), 1, rtol=1e-12)
 
@@ -139,7 +168,9 @@ def integrals(temperature_k):
     glass, v = (load_curve(name, name)(nm) for name in ("n-bk7-10mm", "johnson-v"))
     w_m2_m = 3.631e-2 * power / (trapezoid(power * v, nm) / trapezoid(v, nm))
     photons = np.pi / 4 * 0.03**2 * w_m2_m * glass * nm * 1e-9 / 1.98644586e-25
-    efficiencies = (np.interp(nm, NM, value.round(6), left=0, right=0) for value in PASSBANDS.values())
+    efficiencies = (
+        np.interp(nm, NM, value.round(6), left=0, right=0) for value in PASSBANDS.values()
+    )
     return [trapezoid(photons * one, nm * 1e-9) for one in efficiencies]
 
 
@@ -159,11 +190,15 @@ def test_the_fits_of_three_channels_is_a_cube_with_the_skys_own_axes(curves, tmp
         write_frame_fits(tmp_path / "cube.fits", bench, frame)
     with fits.open(tmp_path / "cube.fits") as (hdu,):
         assert np.array_equal(hdu.data, frame.light)
-        assert hdu.header["CTYPE3"] == "CHANNEL" and hdu.header["CHANNEL2"] == "quantum_efficiency_g"
+        assert (
+            hdu.header["CTYPE3"] == "CHANNEL" and hdu.header["CHANNEL2"] == "quantum_efficiency_g"
+        )
         cube = WCS(hdu.header)
     first = frame.truth[0]
     ra_deg, dec_deg, channel = cube.all_pix2world(first["x_px"], first["y_px"], 1, 0)
-    np.testing.assert_allclose(direction_of(ra_deg, dec_deg), bench.stars.vectors[frame.star[0]], atol=1e-7)
+    np.testing.assert_allclose(
+        direction_of(ra_deg, dec_deg), bench.stars.vectors[frame.star[0]], atol=1e-7
+    )
     assert channel == 2
     # `compare` sees what the sum of the channels does not have: red light that has become blue.
     both = [tmp_path / "cube.fits", tmp_path / "bluer.fits"]
@@ -172,19 +207,39 @@ def test_the_fits_of_three_channels_is_a_cube_with_the_skys_own_axes(curves, tmp
     with fits.open(both[0]) as (hdu,):
         fits.PrimaryHDU(bluer, hdu.header).writeto(both[1])
     found = [json.loads(run_hilstar_here("compare", one, both[0], "--json").stdout) for one in both]
-    assert [one["same"] for one in found] == [True, False] and found[1]["flux_error_mag"]["max"] < 1e-3
-    off = {name: (one["flux_error_mag"]["rms"], one["same"]) for name, one in found[1]["channels"].items()}
-    assert off["g"] == (pytest.approx(0, abs=1e-6), True) and off["r"] == (pytest.approx(0.1144, abs=1e-3), False)
+    assert [one["same"] for one in found] == [True, False] and found[1]["flux_error_mag"][
+        "max"
+    ] < 1e-3
+    off = {
+        name: (one["flux_error_mag"]["rms"], one["same"])
+        for name, one in found[1]["channels"].items()
+    }
+    assert off["g"] == (pytest.approx(0, abs=1e-6), True) and off["r"] == (
+        pytest.approx(0.1144, abs=1e-3),
+        False,
+    )
     said = run_hilstar_here("compare", both[1], both[0])
-    assert said.returncode == 1 and "flux error, r       0.11" in said.stdout and "star at" in said.stdout
-    assert compare(frame, frame.linear).same and compare(frame, both[0]).channels["b"].star_count > 10
+    assert (
+        said.returncode == 1
+        and "flux error, r       0.11" in said.stdout
+        and "star at" in said.stdout
+    )
+    assert (
+        compare(frame, frame.linear).same and compare(frame, both[0]).channels["b"].star_count > 10
+    )
 
 
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"quantum_efficiency_r": 0.5}, "has quantum_efficiency and quantum_efficiency_r; write one for all light"),
-        ({"quantum_efficiency": None, "quantum_efficiency_r": 0.5}, "the key quantum_efficiency_g is missing; add it"),
+        (
+            {"quantum_efficiency_r": 0.5},
+            "has quantum_efficiency and quantum_efficiency_r; write one for all light",
+        ),
+        (
+            {"quantum_efficiency": None, "quantum_efficiency_r": 0.5},
+            "the key quantum_efficiency_g is missing; add it",
+        ),
     ],
 )
 def test_a_tracker_has_one_quantum_efficiency_or_three(tmp_path, keys, words):

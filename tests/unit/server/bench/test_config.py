@@ -95,7 +95,11 @@ def test_geometry_aperture_and_quantum_efficiency_are_all_that_a_bench_must_give
     path = tmp_path / "bench.toml"
     path.write_text(SMALL_BENCH)
     config = read_config(path)
-    assert (config.sky.faintest_v_mag, config.monitor.refresh_hz, config.attitude.on_stale) == (7.5, 60, "hold")
+    assert (config.sky.faintest_v_mag, config.monitor.refresh_hz, config.attitude.on_stale) == (
+        7.5,
+        60,
+        "hold",
+    )
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.toml")))
@@ -121,19 +125,51 @@ def test_a_missing_key_is_named(tmp_path, key, table):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("aperture_mm = 30", "aperture = 30", "[tracker] unknown key aperture; did you mean aperture_mm?"),
-        ("aperture_mm = 30", "aperture_mm = -30", "[tracker] aperture_mm = -30; number >= 1e-06 is wanted"),
-        ("aperture_mm = 30", 'aperture_mm = "30"', '[tracker] aperture_mm = "30"; number is wanted'),
-        ("aperture_mm = 30", "aperture_mm = 1e200", "[tracker] aperture_mm = 1e200; number <= 1000000000000.0 is wanted"),
-        ("aperture_mm = 30", "aperture_mm = true", "[tracker] aperture_mm = true; number is wanted"),
-        ("aperture_mm = 30", "aperture_mm = nan", "tracker.aperture_mm = nan; a finite number is wanted"),
+        (
+            "aperture_mm = 30",
+            "aperture = 30",
+            "[tracker] unknown key aperture; did you mean aperture_mm?",
+        ),
+        (
+            "aperture_mm = 30",
+            "aperture_mm = -30",
+            "[tracker] aperture_mm = -30; number >= 1e-06 is wanted",
+        ),
+        (
+            "aperture_mm = 30",
+            'aperture_mm = "30"',
+            '[tracker] aperture_mm = "30"; number is wanted',
+        ),
+        (
+            "aperture_mm = 30",
+            "aperture_mm = 1e200",
+            "[tracker] aperture_mm = 1e200; number <= 1000000000000.0 is wanted",
+        ),
+        (
+            "aperture_mm = 30",
+            "aperture_mm = true",
+            "[tracker] aperture_mm = true; number is wanted",
+        ),
+        (
+            "aperture_mm = 30",
+            "aperture_mm = nan",
+            "tracker.aperture_mm = nan; a finite number is wanted",
+        ),
         ("[320, 240]", "[320]", "[monitor] resolution_px = [320]; array of length 2 is wanted"),
-        ("[320, 240]", "[320, 240.5]", "[monitor] resolution_px = [320,240.5]; whole number is wanted"),
+        (
+            "[320, 240]",
+            "[320, 240.5]",
+            "[monitor] resolution_px = [320,240.5]; whole number is wanted",
+        ),
         ("[320, 240]", "[320, inf]", "monitor.resolution_px = inf; a finite number is wanted"),
         ("[collimator]", "[colimator]", "unknown key colimator; did you mean collimator?"),
         ("[tracker]", "x = 1\n[tracker]", "unknown key x; known are tracker, monitor"),
         ("[tracker]", "[tracker", "not TOML"),
-        ("focal_length_mm = 60", "focal_length_mm = 60\nq_cam_to_mon = [1,1,0,0]", "q_cam_to_mon: its norm is 1.41421"),
+        (
+            "focal_length_mm = 60",
+            "focal_length_mm = 60\nq_cam_to_mon = [1,1,0,0]",
+            "q_cam_to_mon: its norm is 1.41421",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_with_what_to_write(tmp_path, old, new, words):
@@ -143,10 +179,16 @@ def test_what_is_wrong_is_said_with_what_to_write(tmp_path, old, new, words):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ('[sky]\ntemperature = "hot"\n', '[sky] temperature = "hot"; "ballesteros2012" or "wang2021" is wanted'),
+        (
+            '[sky]\ntemperature = "hot"\n',
+            '[sky] temperature = "hot"; "ballesteros2012" or "wang2021" is wanted',
+        ),
         ("[sky]\nobserver_velocity_km_s = [3e5, 0, 0]\n", "not slower than light"),
         ("[background]\nelectrons_per_px = 1\nzodiacal_v_mag_arcsec2 = 22\n", "write one of them"),
-        ('[verify]\ncentroider = "centre"\n', '[verify] centroider = "centre"; "window" or "wide" or "moment" or "fit" or'),
+        (
+            '[verify]\ncentroider = "centre"\n',
+            '[verify] centroider = "centre"; "window" or "wide" or "moment" or "fit" or',
+        ),
         ("[verify]\ncentroider = 3\n", '[verify] centroider = 3; "window" or "wide"'),
         ('[render]\nquantisation = "exactly"\n', '"exact" or "auto" is wanted'),
         ("[render]\ncycle_frames = 0\n", "cycle_frames"),
@@ -160,7 +202,10 @@ def test_further_tables_are_checked_too(tmp_path, more, words):
     assert words in refusal(tmp_path, SMALL_BENCH + more)
 
 
-@pytest.mark.parametrize("text", ["x = " + "[" * 5000, "x = " + "[" * 900 + "]" * 900, "[" + ".".join(["a"] * 2000) + "]"])
+@pytest.mark.parametrize(
+    "text",
+    ["x = " + "[" * 5000, "x = " + "[" * 900 + "]" * 900, "[" + ".".join(["a"] * 2000) + "]"],
+)
 def test_tables_without_end_are_refused(tmp_path, text):
     assert refusal(tmp_path, text)
 

@@ -18,9 +18,24 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
-from hilstar.server.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms, turning_of
+from hilstar.server.bench.build import (
+    TIMED_EXACT_S,
+    load,
+    measured_cost,
+    open_bench,
+    timed_frame_ms,
+    turning_of,
+)
 from hilstar.server.bench.config import RenderSettings
-from hilstar.server.bench.effort import Effort, FieldCost, Light, _combinations, cut_px, exact_in_time, plan_effort
+from hilstar.server.bench.effort import (
+    Effort,
+    FieldCost,
+    Light,
+    _combinations,
+    cut_px,
+    exact_in_time,
+    plan_effort,
+)
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
 from hilstar.tracker.centroiders import FAMILY
@@ -52,8 +67,14 @@ def part(effort: Effort, name: str):
 
 
 def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
-    assert planned(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).quantisation == "round"
-    assert planned(settings(tolerance_mag=0.05, tolerance_px=0.08), light(8, 6.0)).quantisation == "exact"
+    assert (
+        planned(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).quantisation
+        == "round"
+    )
+    assert (
+        planned(settings(tolerance_mag=0.05, tolerance_px=0.08), light(8, 6.0)).quantisation
+        == "exact"
+    )
     over = planned(settings(tolerance_mag=1e-4), light(8, 6.0))
     assert over.quantisation == "exact" and not over.within and over.error_mag > 1e-4
 
@@ -63,7 +84,9 @@ def test_no_part_owns_a_share_of_the_tolerance():
     each for edges and motion.
     """
     sky = light(10, 6.0)
-    alone = planned(settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky)
+    alone = planned(
+        settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky
+    )
     tight = {"tolerance_mag": 1.05 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
     taken = planned(settings(**tight), sky)
     assert taken.quantisation == "round" and taken.within
@@ -138,13 +161,22 @@ def test_the_worst_error_is_of_all_magnitudes_that_the_catalogue_has():
 def test_auto_leaves_exact_where_numpy_would_be_late():
     """Some 1000 stars in view at 60 Hz: 3 ms by shaders, 50 ms where OpenGL has none."""
     asked = settings(tolerance_mag=0.02, tolerance_px=0.04)
-    bright = replace(light(8, 6.0), rates_e_per_s=np.repeat(light(8, 6.0).rates_e_per_s, 200), sky_share=0.1)
+    bright = replace(
+        light(8, 6.0), rates_e_per_s=np.repeat(light(8, 6.0).rates_e_per_s, 200), sky_share=0.1
+    )
     by_shader, by_numpy = (
-        planned(asked, replace(bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))))
+        planned(
+            asked,
+            replace(
+                bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))
+            ),
+        )
         for version in (430, 330)
     )
     assert (by_shader.quantisation, by_numpy.quantisation) == ("exact", "round")
-    assert "in NumPy" in part(by_numpy, "codes").note and "OpenGL 4.3" in part(by_numpy, "codes").note
+    assert (
+        "in NumPy" in part(by_numpy, "codes").note and "OpenGL 4.3" in part(by_numpy, "codes").note
+    )
 
 
 def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
@@ -153,12 +185,17 @@ def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
     of_fit, of_all = planned(asked, replace(sky, centroider="fit")), planned(asked, sky)
     assert (of_fit.quantisation, of_all.quantisation) == ("round", "exact")
     assert part(of_fit, "codes").note == "as `fit` finds stars"
-    assert f"as `{of_all.codes.centroider}` finds stars, the worst of 6 centroiders" in part(of_all, "codes").note
+    assert (
+        f"as `{of_all.codes.centroider}` finds stars, the worst of 6 centroiders"
+        in part(of_all, "codes").note
+    )
     rounded = {}
     for kind in FAMILY:
         for pixel_px in (0.5, 1.0, 2.0):
             seen = Seen(0.55 * pixel_px, pixel_px)
-            effort = planned(settings(quantisation="round"), replace(sky, centroider=kind, seen=seen))
+            effort = planned(
+                settings(quantisation="round"), replace(sky, centroider=kind, seen=seen)
+            )
             rounded[kind, pixel_px] = effort.codes
     narrow, even, wide = (rounded["box3", pixel_px].place_px for pixel_px in (0.5, 1.0, 2.0))
     assert narrow < even / 2 < wide / 4
@@ -166,12 +203,19 @@ def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
 
 
 def test_what_the_file_asks_for_is_not_overruled():
-    assert planned(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).quantisation == "round"
+    assert (
+        planned(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).quantisation
+        == "round"
+    )
 
 
 def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
-    wide = planned(settings(quantisation="exact", tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0))
-    narrow = planned(settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0))
+    wide = planned(
+        settings(quantisation="exact", tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0)
+    )
+    narrow = planned(
+        settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0)
+    )
     full = GaussianPsf(SIGMA).footprint_px
     assert (wide.sides[0].below_e_per_s, wide.sides[0].side_px) == (pytest.approx(3e38), full)
     assert narrow.sides[0].side_px < full and narrow.within
@@ -185,7 +229,12 @@ def test_the_light_outside_a_sprite_is_no_more_than_said(size):
     worst = moved = 0.0
     for x in phases:
         offsets = np.arange(-20, 21) - x
-        shares = np.array([0.5 * (math.erf((d + 0.5) / 1.2020815) - math.erf((d - 0.5) / 1.2020815)) for d in offsets])
+        shares = np.array(
+            [
+                0.5 * (math.erf((d + 0.5) / 1.2020815) - math.erf((d - 0.5) / 1.2020815))
+                for d in offsets
+            ]
+        )
         inside = (np.arange(-20, 21) >= first) & (np.arange(-20, 21) < first + size)
         middle = math.erf(0.5 / 1.2020815)
         worst = max(worst, shares[~inside].max() * middle)
@@ -220,7 +269,9 @@ def test_the_linear_image_is_whole_all_the_same(bench_with):
 
 
 def test_the_parts_add_up():
-    effort = planned(settings(tolerance_mag=0.1, tolerance_px=0.1), replace(light(12, 6.0), turning=0.5))
+    effort = planned(
+        settings(tolerance_mag=0.1, tolerance_px=0.1), replace(light(12, 6.0), turning=0.5)
+    )
     assert [choice.part for choice in effort.choices] == ["codes", "sprites", "paths", "depth"]
     assert effort.error_mag == pytest.approx(sum(choice.error_mag for choice in effort.choices))
     assert effort.error_px == pytest.approx(sum(choice.error_px for choice in effort.choices))
@@ -231,7 +282,13 @@ def test_a_table_says_what_was_chosen(bench_with):
     bench = bench_with('[render]\neffort = "auto"\n[verify]\ncentroider = "box5"\n')
     lines = effort_lines(bench)
     assert lines[0].split() == ["part", "choice", "error", "of", "the", "tolerance", "saves"]
-    assert [line.split()[0] for line in lines[1:6]] == ["codes", "sprites", "paths", "depth", "together"]
+    assert [line.split()[0] for line in lines[1:6]] == [
+        "codes",
+        "sprites",
+        "paths",
+        "depth",
+        "together",
+    ]
     assert "within 0.05 mag, 0.1 px" in lines[5]
     assert any(line.startswith("codes: as `box5` finds stars") for line in lines)
     assert not any("would do" in line for line in lines)
@@ -251,7 +308,11 @@ def test_what_would_do_does(bits, tmp_path):
     """Each key that is told is written to the file, whose own plan then has the errors that were
     told.
     """
-    limit = {"tolerance_mag": 0.01, "tolerance_px": 0.05} if bits == 8 else {"tolerance_mag": 0.005, "tolerance_px": 0.02}
+    limit = (
+        {"tolerance_mag": 0.01, "tolerance_px": 0.05}
+        if bits == 8
+        else {"tolerance_mag": 0.005, "tolerance_px": 0.02}
+    )
     tables = {"monitor": {"bits": bits}, "render": limit}
     path = tmp_path / "bench.toml"
     path.write_text(bench_text(tables))
@@ -270,37 +331,65 @@ def test_what_would_do_does(bits, tmp_path):
 
 
 def test_stars_that_show_nothing_are_null_in_json(bench_with):
-    bench = bench_with('[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -2\nquantisation = "round"\n')
+    bench = bench_with(
+        '[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -2\nquantisation = "round"\n'
+    )
     keys = effort_keys(bench)
-    assert keys["error_mag"] is None and keys["choices"][0]["error_px"] is None and not keys["within"]
+    assert (
+        keys["error_mag"] is None and keys["choices"][0]["error_px"] is None and not keys["within"]
+    )
     assert any("a star shows nothing" in line for line in effort_lines(bench))
     json.dumps(keys, allow_nan=False)
 
 
 def test_explain_has_the_effort_in_its_json(tmp_path, small_bench_file):
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
-    words = ("frame", small_bench_file, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--json")
+    words = (
+        "frame",
+        small_bench_file,
+        "--radec",
+        "84,-1,0",
+        "--truth",
+        tmp_path / "t.csv",
+        "--json",
+    )
     result = run_hilstar_here(*words, "--explain")
     assert result.returncode == 0, result.stderr
     assert "part " in result.stderr and "together" in result.stderr
     effort = json.loads(result.stdout)["effort"]
     assert set(effort) == {
-        *("within", "quantisation", "error_mag", "error_px", "tolerance_mag", "tolerance_px", "choices", "would_do"),
+        *(
+            "within",
+            "quantisation",
+            "error_mag",
+            "error_px",
+            "tolerance_mag",
+            "tolerance_px",
+            "choices",
+            "would_do",
+        ),
     }
-    assert all(set(choice) == {"part", "choice", "error_mag", "error_px", "ms"} for choice in effort["choices"])
+    assert all(
+        set(choice) == {"part", "choice", "error_mag", "error_px", "ms"}
+        for choice in effort["choices"]
+    )
     assert "effort" not in json.loads(run_hilstar_here(*words).stdout)
 
 
 def test_a_run_has_the_effort_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,0.5,0.5,-0.5,0.5\n0.1,0.5,0.5,-0.5,0.5\n")
-    result = run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
+    result = run_hilstar_here(
+        "replay", small_bench_file, log, "--headless", "--speed", "max", "--json"
+    )
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["effort"]["quantisation"] == "exact"
     assert result.stdout.count('"effort"') == 1
 
 
-def test_a_fixed_bench_keeps_its_hash_and_one_left_to_the_default_does_not(tmp_path, small_bench_file):
+def test_a_fixed_bench_keeps_its_hash_and_one_left_to_the_default_does_not(
+    tmp_path, small_bench_file
+):
     """The default of the tolerance was 0.02 mag and 0.02 px; no frame of a fixed bench changed
     with it.
     """
@@ -312,11 +401,15 @@ def test_a_fixed_bench_keeps_its_hash_and_one_left_to_the_default_does_not(tmp_p
     stated = "tolerance_mag = 0.02\ntolerance_px = 0.02\n"
     assert hashed('quantisation = "exact"\n') == hashed(f'quantisation = "exact"\n{stated}')
     assert hashed("") != hashed(stated)
-    assert hashed('quantisation = "exact"\neffort = "auto"\n') != hashed(f'quantisation = "exact"\neffort = "auto"\n{stated}')
+    assert hashed('quantisation = "exact"\neffort = "auto"\n') != hashed(
+        f'quantisation = "exact"\neffort = "auto"\n{stated}'
+    )
 
 
 def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):
-    small_bench_file.write_text(small_bench_file.read_text() + '[render]\nquantisation = "auto"\ntolerance_mag = 0.001\n')
+    small_bench_file.write_text(
+        small_bench_file.read_text() + '[render]\nquantisation = "auto"\ntolerance_mag = 0.001\n'
+    )
     with load(small_bench_file) as bench:
         assert bench.config.render.quantisation == bench.renderer.target.quantisation == "exact"
         assert bench.renderer.target.sides == ()
@@ -325,7 +418,9 @@ def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):
 def test_a_file_that_says_nothing_gets_the_codes_that_its_tolerance_needs(small_bench_file):
     with load(small_bench_file) as bench:
         assert bench.config.render.quantisation == "exact"
-    small_bench_file.write_text(small_bench_file.read_text().replace("[monitor]", "[monitor]\nbits = 16"))
+    small_bench_file.write_text(
+        small_bench_file.read_text().replace("[monitor]", "[monitor]\nbits = 16")
+    )
     with load(small_bench_file) as bench:
         assert bench.config.render.quantisation == "round"
 
@@ -345,7 +440,10 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     assert "9 ms of 16.7" in part(planned(settings(quantisation="exact"), crowded), "codes").note
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
     wide = replace(few, psf=GaussianPsf((2.5, 2.5)))
-    assert (planned(settings(), few).quantisation, planned(settings(), wide).quantisation) == ("exact", "round")
+    assert (planned(settings(), few).quantisation, planned(settings(), wide).quantisation) == (
+        "exact",
+        "round",
+    )
 
 
 def cost(cheap_ms: float, best_ms: float) -> FieldCost:
@@ -369,7 +467,9 @@ IN_TIME, LATE = cost(1.0, 2.0), cost(1.0, 20.0)  # by the table, of a limit of 8
         (cost(16.1, 40.0), True, True),
     ],
 )
-def test_a_measured_cost_overrules_the_table_only_where_it_is_clear_of_the_limit(measured, of_table_in_time, of_table_late):
+def test_a_measured_cost_overrules_the_table_only_where_it_is_clear_of_the_limit(
+    measured, of_table_in_time, of_table_late
+):
     assert exact_in_time(IN_TIME, measured, 8.0) is of_table_in_time
     assert exact_in_time(LATE, measured, 8.0) is of_table_late
 
@@ -383,9 +483,15 @@ def test_a_machine_that_holds_exact_takes_it_where_the_table_would_not():
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
     slow = planned(settings(), replace(few, measured=cost(2.0, 25.0)))
     assert slow.quantisation == "round"
-    assert "takes 25 ms of 16.7 (round 2) for an average field at 1 deg/s here" in part(slow, "codes").note
+    assert (
+        "takes 25 ms of 16.7 (round 2) for an average field at 1 deg/s here"
+        in part(slow, "codes").note
+    )
     assert planned(settings(codes_ms=(2.0, 25.0)), few).quantisation == "round"
-    assert "by [render] codes_ms" in part(planned(settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
+    assert (
+        "by [render] codes_ms"
+        in part(planned(settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
+    )
     # `round` is within the tolerance, whatever it costs
     assert not planned(settings(), light(16, 6.0)).by_cost
     assert not planned(settings(quantisation="exact"), few).by_cost
@@ -401,7 +507,9 @@ def test_round_is_timed_only_where_exact_may_be_late():
     fast = measured_cost(frame_ms, cost(2.0, 3.0), 16.0)
     assert (fast.cheap_ms, fast.best_ms) == (6.08, 9.12) and timed == [("exact", TIMED_EXACT_S)]
     slow = measured_cost(frame_ms, cost(2.0, 3.0), 8.0)
-    assert (slow.cheap_ms, slow.best_ms) == (4.57, 9.12) and [method for method, _ in timed[1:]] == ["exact", "round"]
+    assert (slow.cheap_ms, slow.best_ms) == (4.57, 9.12) and [
+        method for method, _ in timed[1:]
+    ] == ["exact", "round"]
     assert "[render] codes_ms = [4.57, 9.12]" in slow.where
 
 
@@ -427,20 +535,32 @@ def test_a_timed_bench_has_measured_codes_and_any_other_has_not(small_bench_file
         assert min(cheap_ms, best_ms) > 0
         measured = f"measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)"
         assert measured in part(timed.effort, "codes").note
-        assert untimed.config.render.codes_ms is None and "without a GPU" in part(untimed.effort, "codes").note
+        assert (
+            untimed.config.render.codes_ms is None
+            and "without a GPU" in part(untimed.effort, "codes").note
+        )
         assert timed.file.sha256 == untimed.file.sha256
     small_bench_file.write_text(small_bench_file.read_text() + "[render]\ncodes_ms = [2, 500]\n")
     with open_bench(read_bench_file(small_bench_file), timed=True) as fixed:
-        assert fixed.config.render.codes_ms == (2, 500) and fixed.renderer.target.quantisation == "round"
+        assert (
+            fixed.config.render.codes_ms == (2, 500)
+            and fixed.renderer.target.quantisation == "round"
+        )
 
 
 def test_a_timed_bench_takes_the_codes_that_its_machine_holds(small_bench_file, monkeypatch):
     """Whatever the table says: the bench is drawn anew with the others."""
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
     monkeypatch.setattr(
-        "hilstar.server.bench.build.timed_frame_ms", lambda bench, for_s: 500.0 if "exact" in bench.quantiser.shader else 1.0
+        "hilstar.server.bench.build.timed_frame_ms",
+        lambda bench, for_s: 500.0 if "exact" in bench.quantiser.shader else 1.0,
     )
     with open_bench(read_bench_file(small_bench_file), timed=True) as bench:
-        assert bench.config.render.quantisation == bench.renderer.target.quantisation == bench.effort.quantisation == "round"
+        assert (
+            bench.config.render.quantisation
+            == bench.renderer.target.quantisation
+            == bench.effort.quantisation
+            == "round"
+        )
         assert bench.config.render.codes_ms == (1.0, 500.0)
         assert bench.draw(ORION).levels.any()

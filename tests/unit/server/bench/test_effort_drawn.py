@@ -65,29 +65,46 @@ def drawn_errors(bench, rng):
     x, y = np.meshgrid(np.arange(20, SIZE[0] - 20, STEP_PX), np.arange(20, SIZE[1] - 20, STEP_PX))
     whole = x.ravel(), y.ravel()
     x_px, y_px = (place + rng.uniform(-0.5, 0.5, place.size) for place in whole)
-    sigma_px, white = bench.config.render.sprite_sigma_px, bench.flux_at_white_e_per_s * bench.darkest
+    sigma_px, white = (
+        bench.config.render.sprite_sigma_px,
+        bench.flux_at_white_e_per_s * bench.darkest,
+    )
     brightest = white / GaussianPsf(sigma_px).peak_share
     deepest = 2.5 * math.log10(brightest / bench.stars.electrons_per_s.min())
     rates = brightest * 10 ** (-0.4 * rng.uniform(0, deepest, x_px.size))
     sprites = pack_sprites(x_px, y_px, rates, np.arange(x_px.size), SIZE, bench.psf.footprint_px)
     bench.renderer.draw(sprites, 0)
-    images = shown_light(bench.renderer.levels(), bench.panel), linear_image(sprites, SIZE, GaussianPsf(sigma_px))
+    images = (
+        shown_light(bench.renderer.levels(), bench.panel),
+        linear_image(sprites, SIZE, GaussianPsf(sigma_px)),
+    )
     near = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = whole[1][:, None, None] + near[:, None], whole[0][:, None, None] + near
     shown, wanted = (image[rows, columns] for image in images)
     flux_mag = np.abs(2.5 * np.log10(shown.sum((1, 2)) / wanted.sum((1, 2)))).max()
     seen = bench.renderer.target.seen
-    off_px = stamp_errors(shown, wanted, sigma_px, seen.blur_px, seen.pixel_px)[bench.config.verify.centroider]
+    off_px = stamp_errors(shown, wanted, sigma_px, seen.blur_px, seen.pixel_px)[
+        bench.config.verify.centroider
+    ]
     return flux_mag, np.hypot(*off_px).max()
 
 
-@pytest.mark.parametrize(("bits", "light", "stealing", "pitch_um", "centroider", "tolerance", "taken"), KINDS)
+@pytest.mark.parametrize(
+    ("bits", "light", "stealing", "pitch_um", "centroider", "tolerance", "taken"), KINDS
+)
 def test_what_is_said_of_codes_holds_for_what_is_drawn(
     bits, light, stealing, pitch_um, centroider, tolerance, taken, tmp_path, rng
 ):
     path = tmp_path / "bench.toml"
     path.write_text(
-        BENCH.format(bits=bits, light=light, stealing=stealing, pitch_um=pitch_um, centroider=centroider, tolerance=tolerance)
+        BENCH.format(
+            bits=bits,
+            light=light,
+            stealing=stealing,
+            pitch_um=pitch_um,
+            centroider=centroider,
+            tolerance=tolerance,
+        )
     )
     with load(path) as bench:
         claimed, method = bench.effort.codes, bench.effort.quantisation

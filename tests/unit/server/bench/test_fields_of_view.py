@@ -35,7 +35,9 @@ def fields(folder: Path, *changes: tuple[str, str]):
 def test_the_angles_are_those_of_the_lenses(tmp_path):
     found = fields(tmp_path)
     assert found.line() == LINE
-    width_deg, height_deg = (2 * math.degrees(math.atan(n * 57.65e-3 / 2 / 350)) for n in (1920, 1080))
+    width_deg, height_deg = (
+        2 * math.degrees(math.atan(n * 57.65e-3 / 2 / 350)) for n in (1920, 1080)
+    )
     assert found.screen_deg == pytest.approx((width_deg, height_deg), abs=FIGURE_DEG)
     tracker_deg = 2 * math.degrees(math.atan(1024 * 13e-3 / 2 / 70))
     assert found.tracker_deg == pytest.approx((tracker_deg, tracker_deg), abs=FIGURE_DEG)
@@ -84,13 +86,25 @@ def test_a_length_in_another_unit_is_named_with_what_was_meant(tmp_path, key, va
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ([("= 30\n", "= 3\n"), ("= 70\n", "= 7\n"), ("= 350\n", "= 35\n")], "115.4 deg is wider than a lens sees"),
+        (
+            [("= 30\n", "= 3\n"), ("= 70\n", "= 7\n"), ("= 350\n", "= 35\n")],
+            "115.4 deg is wider than a lens sees",
+        ),
         ([("= 70\n", "= 7\n"), ("= 350\n", "= 35\n")], "f/0.23"),  # both focal lengths in cm
-        ([("= 13\n", "= 1000\n"), ("= 57.65\n", "= 4434\n")], r"\[tracker\] pixel_pitch_um is 1000"),
-        ([("= 13\n", "= 0.13\n"), ("= 57.65\n", "= 0.5765\n")], r"\[tracker\] pixel_pitch_um is 0.13"),
+        (
+            [("= 13\n", "= 1000\n"), ("= 57.65\n", "= 4434\n")],
+            r"\[tracker\] pixel_pitch_um is 1000",
+        ),
+        (
+            [("= 13\n", "= 0.13\n"), ("= 57.65\n", "= 0.5765\n")],
+            r"\[tracker\] pixel_pitch_um is 0.13",
+        ),
         ([("[1024, 1024]", "[150, 150]")], "the tracker sees .* % of the screen"),
         ([("[1920, 1080]", "[320, 240]")], "the tracker sees past the screen"),
-        ([("[background]\n", "[verify]\ntrue_focal_length_mm = 35\n[background]\n")], r"\[verify\] true_focal_length_mm is 35"),
+        (
+            [("[background]\n", "[verify]\ntrue_focal_length_mm = 35\n[background]\n")],
+            r"\[verify\] true_focal_length_mm is 35",
+        ),
     ],
 )
 def test_what_cannot_be_is_said(tmp_path, changes, words):
@@ -126,7 +140,9 @@ def test_a_small_part_of_the_screen_and_a_fine_tracker_are_no_units(tmp_path):
         (("= 50\n", "= 0.05\n"), "[tracker] focal_length_mm = 0.05 in m, which is 50"),
     ],
 )
-@pytest.mark.parametrize("odd", [None, ("= 30\n", "= 1.9\n"), ("[2560, 1440]", "[160, 120]")], ids=["", "f/26", "past"])
+@pytest.mark.parametrize(
+    "odd", [None, ("= 30\n", "= 1.9\n"), ("[2560, 1440]", "[160, 120]")], ids=["", "f/26", "past"]
+)
 def test_a_unit_is_named_on_a_bench_that_is_odd_in_other_ways(tmp_path, change, meant, odd):
     text = BENCH
     for old, new in [*NEWCOMER, change, *([] if odd is None else [odd])]:
@@ -156,13 +172,21 @@ def test_frame_and_doctor_print_the_line_and_warn_on_stderr(tmp_path):
     assert (drawn.returncode, drawn.stdout.splitlines()[1:], drawn.stderr) == (0, [LINE, STAR], "")
     wrong = run_hilstar_here("frame", "wrong.toml", *at, cwd=tmp_path)
     assert wrong.returncode == 0
-    assert wrong.stdout.splitlines()[1] == "screen 0.018 x 0.01 deg, tracker 10.9 deg, 0.00089 tracker px a monitor px"
+    assert (
+        wrong.stdout.splitlines()[1]
+        == "screen 0.018 x 0.01 deg, tracker 10.9 deg, 0.00089 tracker px a monitor px"
+    )
     assert len(wrong.stderr.splitlines()) == 1
     assert "pixel_pitch_um = 0.05765 in mm, which is 57.65?" in wrong.stderr
     told = run_hilstar_here("frame", "bench.toml", *at, "--json", cwd=tmp_path)
-    assert json.loads(told.stdout)["fields_of_view"]["screen_deg"] == pytest.approx([17.97, 10.16], abs=0.01)
+    assert json.loads(told.stdout)["fields_of_view"]["screen_deg"] == pytest.approx(
+        [17.97, 10.16], abs=0.01
+    )
     examined = run_hilstar_here("doctor", "bench.toml", cwd=tmp_path)
-    assert examined.stdout.splitlines()[-2:] == [f"ok      bench.toml  {LINE}", f"ok      star        {STAR}"]
+    assert examined.stdout.splitlines()[-2:] == [
+        f"ok      bench.toml  {LINE}",
+        f"ok      star        {STAR}",
+    ]
     told = run_hilstar_here("doctor", "wrong.toml", "--json", cwd=tmp_path)
     assert "which is 57.65?" in json.loads(told.stdout)["benches"]["wrong.toml"]["warning"]
     assert len(told.stderr.splitlines()) == 1

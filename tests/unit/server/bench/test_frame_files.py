@@ -8,7 +8,13 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from hilstar.server.bench.frame_files import PREVIEW_BLUR_PX, PREVIEW_POWER, PREVIEW_RADIUS_PX, png_of, write_preview_png
+from hilstar.server.bench.frame_files import (
+    PREVIEW_BLUR_PX,
+    PREVIEW_POWER,
+    PREVIEW_RADIUS_PX,
+    png_of,
+    write_preview_png,
+)
 
 
 def preview_by_filters(codes):
@@ -22,16 +28,22 @@ def preview_by_filters(codes):
         bright = np.where(signal >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2, signal, 0)
         disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
         picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
-    return (255 * np.clip(gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX), 0, 1)).astype(np.uint8)
+    return (255 * np.clip(gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX), 0, 1)).astype(
+        np.uint8
+    )
 
 
 @pytest.mark.parametrize("lit", [0.002, 0.3])
 def test_a_preview_has_a_disc_for_each_lit_pixel_to_the_edges(tmp_path, lit):
     rng = np.random.default_rng(4)
-    codes = np.where(rng.random((90, 120)) < lit, rng.integers(1, 256, (90, 120)), 0).astype(np.uint8)
+    codes = np.where(rng.random((90, 120)) < lit, rng.integers(1, 256, (90, 120)), 0).astype(
+        np.uint8
+    )
     codes[0, 0] = codes[89, 60] = 255
     write_preview_png(tmp_path / "preview.png", codes)
-    assert np.array_equal(np.asarray(Image.open(tmp_path / "preview.png")), preview_by_filters(codes))
+    assert np.array_equal(
+        np.asarray(Image.open(tmp_path / "preview.png")), preview_by_filters(codes)
+    )
 
 
 @pytest.mark.parametrize("radius_px", [8, 20, 45])

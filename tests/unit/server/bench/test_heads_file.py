@@ -15,7 +15,9 @@ def test_each_head_has_its_own_bench_and_the_common_source(tmp_path):
     heads = read_heads(path)
     assert isinstance(read_bench_or_heads(path), HeadsFile)
     assert heads.names == ("a", "b", "c")
-    assert [file.config.tracker.q_body_to_cam for file in heads.files] == [pytest.approx(q) for q in MOUNTINGS.values()]
+    assert [file.config.tracker.q_body_to_cam for file in heads.files] == [
+        pytest.approx(q) for q in MOUNTINGS.values()
+    ]
     assert {file.config.attitude.endpoint for file in heads.files} == {"tcp://127.0.0.1:5599"}
     assert as_head(tmp_path / "b.toml", path).sha256 == heads.files[1].sha256
 
@@ -61,5 +63,7 @@ def test_two_names_of_one_file_are_no_two_heads(tmp_path, link):
         (tmp_path / "b.toml").hardlink_to(tmp_path / "a.toml")
     path = tmp_path / "heads.toml"
     path.write_text('heads = ["a.toml", "b.toml"]\n')
-    with pytest.raises(InputError, match=r"heads: b.toml is the same file as a.toml; give each a file of its own"):
+    with pytest.raises(
+        InputError, match=r"heads: b.toml is the same file as a.toml; give each a file of its own"
+    ):
         read_heads(path)

@@ -51,12 +51,20 @@ def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
         q = attitude(rng)
         x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
         inside = (
-            (x > -0.5 - reach + 1) & (x < SIZE[0] - 0.5 + reach - 1) & (y > -0.5 - reach + 1) & (y < SIZE[1] - 0.5 + reach - 1)
+            (x > -0.5 - reach + 1)
+            & (x < SIZE[0] - 0.5 + reach - 1)
+            & (y > -0.5 - reach + 1)
+            & (y < SIZE[1] - 0.5 + reach - 1)
         )
         near = (x > -1 - reach) & (x < SIZE[0] + reach) & (y > -1 - reach) & (y < SIZE[1] + reach)
         sprites = bench.sprites(q, bench.stars)
-        assert set(np.flatnonzero(inside)) <= set(sprites.star.tolist()) <= set(np.flatnonzero(near))
-        assert np.hypot(sprites.x_px - x[sprites.star], sprites.y_px - y[sprites.star]).max() < PLACE_PX
+        assert (
+            set(np.flatnonzero(inside)) <= set(sprites.star.tolist()) <= set(np.flatnonzero(near))
+        )
+        assert (
+            np.hypot(sprites.x_px - x[sprites.star], sprites.y_px - y[sprites.star]).max()
+            < PLACE_PX
+        )
 
 
 def test_light_truth_and_clipping_are_at_the_bent_places(bench, folder, rng):
@@ -95,7 +103,12 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
         x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
         bright = bench.stars.electrons_per_s > 0.02 * bench.flux_at_white_e_per_s
         bright &= bench.stars.electrons_per_s < bench.flux_at_white_e_per_s
-        corner = (np.abs(x - 959.5) > 500) & (np.abs(y - 539.5) > 250) & (np.abs(x - 959.5) < 950) & (np.abs(y - 539.5) < 530)
+        corner = (
+            (np.abs(x - 959.5) > 500)
+            & (np.abs(y - 539.5) > 250)
+            & (np.abs(x - 959.5) < 950)
+            & (np.abs(y - 539.5) < 530)
+        )
         for k in np.flatnonzero(bright & corner):
             c, r = round(x[k]), round(y[k])
             window = light[r - 5 : r + 6, c - 5 : c + 6]
@@ -103,7 +116,10 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
                 continue
             rows, columns = np.mgrid[-5:6, -5:6]
             offs.append(
-                np.hypot((columns * window).sum() / window.sum() + c - x[k], (rows * window).sum() / window.sum() + r - y[k])
+                np.hypot(
+                    (columns * window).sum() / window.sum() + c - x[k],
+                    (rows * window).sum() / window.sum() + r - y[k],
+                )
             )
     assert len(offs) > 5
     assert np.median(offs) < 0.02
@@ -117,7 +133,9 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
     q, rate = attitude(rng), np.array(rate)
     found = bench.light(bench.view(q, rate))
     scan = bench.scan
-    near = np.flatnonzero((bench.shown_stars.vectors @ to_matrix(q).T)[:, 2] > np.cos(np.radians(25)))
+    near = np.flatnonzero(
+        (bench.shown_stars.vectors @ to_matrix(q).T)[:, 2] > np.cos(np.radians(25))
+    )
     stars, rates_e = bench.shown_stars.vectors[near], bench.shown_stars.electrons_per_s[near]
 
     def at(seconds):
@@ -133,7 +151,9 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
         # The row of each star at each time; the panel is there where the two agree.
         found_s, rows = np.zeros(len(near)), np.array([at(t + after_s)[1] for t in times])
         with np.errstate(invalid="ignore"):
-            differ = np.abs(np.clip((rows - 539.5) / SIZE[1], -0.5, 0.5) * scan.scanout_s - times[:, None])
+            differ = np.abs(
+                np.clip((rows - 539.5) / SIZE[1], -0.5, 0.5) * scan.scanout_s - times[:, None]
+            )
         seen_ever = np.isfinite(differ).any(axis=0)
         found_s[seen_ever] = times[np.nanargmin(differ[:, seen_ever], axis=0)]
         return found_s
@@ -145,7 +165,11 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
     total = np.zeros((len(cam), 3))
     for step in (np.arange(PATH_STEPS) + 0.5) / PATH_STEPS:
         angle = (-np.linalg.norm(rate) * (late + step * span))[:, None]
-        turned = cam * np.cos(angle) + np.cross(axis, cam) * np.sin(angle) + (cam @ axis)[:, None] * axis * (1 - np.cos(angle))
+        turned = (
+            cam * np.cos(angle)
+            + np.cross(axis, cam) * np.sin(angle)
+            + (cam @ axis)[:, None] * axis * (1 - np.cos(angle))
+        )
         x, y = true_places_px(folder, turned)
         on = (x > -0.5) & (x < SIZE[0] - 0.5) & (y > -0.5) & (y < SIZE[1] - 0.5)
         total[on] += np.column_stack([np.ones(on.sum()), x[on], y[on]]) / PATH_STEPS
@@ -181,11 +205,20 @@ def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_dra
     rate = 4.5 * outward / np.linalg.norm(outward)
     turn = CameraTurn(propagate(q, rate, -hold_s / 2), rate)
     for seconds in (0.0, hold_s):
-        seen = camera.cam_to_image @ to_matrix(propagate(turn.q_icrs_to_cam, rate, seconds)) @ from_star
+        seen = (
+            camera.cam_to_image
+            @ to_matrix(propagate(turn.q_icrs_to_cam, rate, seconds))
+            @ from_star
+        )
         assert np.isnan(camera.project(seen[None])[0])
     sigma_px = bench.config.render.sprite_sigma_px
-    found = swept_sprites(bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, GaussianPsf(sigma_px))
-    assert found.data["electrons_per_s"][found.star == star].sum() > 0.01 * bench.shown_stars.electrons_per_s[star]
+    found = swept_sprites(
+        bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, GaussianPsf(sigma_px)
+    )
+    assert (
+        found.data["electrons_per_s"][found.star == star].sum()
+        > 0.01 * bench.shown_stars.electrons_per_s[star]
+    )
 
 
 def test_the_crosshair_is_where_the_boresight_is_shown(bench, folder):
@@ -197,7 +230,9 @@ def test_the_crosshair_is_where_the_boresight_is_shown(bench, folder):
 def test_a_budget_counts_arcseconds_where_a_pixel_is_widest(bench, folder):
     """By differences: two directions a small angle apart, all ways, all over the screen."""
     rng, h = np.random.default_rng(8), 1e-6
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0, 1919, 33), np.linspace(0, 1079, 19)))
+    x, y = (
+        part.ravel() for part in np.meshgrid(np.linspace(0, 1919, 33), np.linspace(0, 1079, 19))
+    )
     seen = bench.camera.rays(x, y)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     arcsec = []
@@ -215,14 +250,20 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
     the lens has it.
     """
     light = np.linspace(0, 1, 1024) ** 2.2
-    (tmp_path / "r.csv").write_text("code,w\n" + "\n".join(f"{code},{value!r}" for code, value in enumerate(light.tolist())))
+    (tmp_path / "r.csv").write_text(
+        "code,w\n" + "\n".join(f"{code},{value!r}" for code, value in enumerate(light.tolist()))
+    )
     (tmp_path / "u.csv").write_text("0.8,1.0\n1.0,0.9\n")
     (tmp_path / "c.toml").write_text(
         '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 10\nresponse = "r.csv"\n'
         '[uniformity]\nfile = "u.csv"\n'
     )
     (tmp_path / "geometry.toml").write_text((folder / "geometry.toml").read_text())
-    text = (folder / "bench.toml").read_text().replace("[monitor]", '[monitor]\ncalibration = "c.toml"')
+    text = (
+        (folder / "bench.toml")
+        .read_text()
+        .replace("[monitor]", '[monitor]\ncalibration = "c.toml"')
+    )
     (tmp_path / "bench.toml").write_text(text)
     wrong = []
     with load(tmp_path / "bench.toml") as bench:
@@ -236,7 +277,9 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
             shown = light[bench.frame(q).levels] * across * bench.flux_at_white_e_per_s
             x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
             rate = bench.stars.electrons_per_s
-            good = (rate > 0.05 * bench.flux_at_white_e_per_s) & (rate < bench.flux_at_white_e_per_s)
+            good = (rate > 0.05 * bench.flux_at_white_e_per_s) & (
+                rate < bench.flux_at_white_e_per_s
+            )
             good &= (np.abs(x - 959.5) < 940) & (np.abs(y - 539.5) < 520)
             for k in np.flatnonzero(good):
                 if (np.hypot(x - x[k], y - y[k]) < 14).sum() == 1:

@@ -45,7 +45,9 @@ def test_every_key_has_its_row(rows):
     assert set(rows) == {(table, field.name) for table, field in KEYS}
 
 
-@pytest.mark.parametrize(("table", "field"), KEYS, ids=[f"{table}.{field.name}" for table, field in KEYS])
+@pytest.mark.parametrize(
+    ("table", "field"), KEYS, ids=[f"{table}.{field.name}" for table, field in KEYS]
+)
 def test_a_row_says_what_the_definition_says(rows, table: str, field: FieldInfo):
     value, default, meaning = rows[table, field.name]
     assert value
@@ -61,10 +63,13 @@ def test_a_row_says_what_the_definition_says(rows, table: str, field: FieldInfo)
 def test_a_default_in_the_reference_is_the_one_that_is_used(tmp_path, rows):
     """Every default that the page shows as TOML, written into a bench file, changes nothing."""
     keys = {
-        table: {key: json.dumps(value) for key, value in given.items()} for table, given in tomllib.loads(SMALL_BENCH).items()
+        table: {key: json.dumps(value) for key, value in given.items()}
+        for table, given in tomllib.loads(SMALL_BENCH).items()
     }
     count = 0
-    optional = {field.name for field in msgspec.structs.fields(BenchConfig) if field.default is None}
+    optional = {
+        field.name for field in msgspec.structs.fields(BenchConfig) if field.default is None
+    }
     for (table, key), (_, default, _) in rows.items():
         # a file without the table is not one with its defaults
         if table.partition(".")[0] in optional:
@@ -75,6 +80,9 @@ def test_a_default_in_the_reference_is_the_one_that_is_used(tmp_path, rows):
     assert count > 60
     files = tmp_path / "short.toml", tmp_path / "written.toml"
     files[0].write_text(SMALL_BENCH)
-    tables = (f"[{table}]\n" + "".join(f"{key} = {value}\n" for key, value in own.items()) for table, own in keys.items())
+    tables = (
+        f"[{table}]\n" + "".join(f"{key} = {value}\n" for key, value in own.items())
+        for table, own in keys.items()
+    )
     files[1].write_text("".join(tables))
     assert read_config(files[0]) == read_config(files[1])

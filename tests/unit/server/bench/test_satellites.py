@@ -35,7 +35,9 @@ TABLE = "norad,standard_mag\n" + "".join(f"{10_000 + k},{3}\n" for k in range(60
 
 @pytest.fixture
 def bench_file(tmp_path, rng) -> Path:
-    (tmp_path / "tles.txt").write_text(some_orbits(rng, 60) + "OLD\n" + element_set(5, (10.0, 0.0, 0.0, 0.0), 0.001, 18.0))
+    (tmp_path / "tles.txt").write_text(
+        some_orbits(rng, 60) + "OLD\n" + element_set(5, (10.0, 0.0, 0.0, 0.0), 0.001, 18.0)
+    )
     (tmp_path / "station.tle").write_text(STATION_TLE)
     (tmp_path / "seen.csv").write_text(TABLE)
     path = tmp_path / "bench.toml"
@@ -74,14 +76,22 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(bench_file)
         middle = [(size - 1) / 2 for size in bench.camera.resolution_px]
         # 200 arcsec a px; 10 by the velocity since
         assert (row["x_px"], row["y_px"]) == pytest.approx(middle, abs=0.1)
-        assert len(np.unique(shot.truth["name"][shot.truth["hip"] == 0])) == (shot.truth["hip"] == 0).sum()
-        wide = shot.linear[int(row["y_px"]) - 12 : int(row["y_px"]) + 13, int(row["x_px"]) - 12 : int(row["x_px"]) + 13]
+        assert (
+            len(np.unique(shot.truth["name"][shot.truth["hip"] == 0]))
+            == (shot.truth["hip"] == 0).sum()
+        )
+        wide = shot.linear[
+            int(row["y_px"]) - 12 : int(row["y_px"]) + 13,
+            int(row["x_px"]) - 12 : int(row["x_px"]) + 13,
+        ]
         assert wide.sum() >= 0.999 * row["electrons_per_s"]
         drawn = bench.draw(q, t_ns=t_ns)
         assert np.array_equal(drawn.levels, shot.levels)
         sprites = bench.light(bench.view(q, np.array([0.0, 0.02, 0.0]), t_ns))
         first = len(bench.shown_stars) - len(bench.shown_stars.bodies)
-        assert bench.shown_stars.names(np.unique(sprites.star[sprites.star >= first])).count(name) == 1
+        assert (
+            bench.shown_stars.names(np.unique(sprites.star[sprites.star >= first])).count(name) == 1
+        )
 
 
 def fast_moment(bench: Bench) -> int:
@@ -89,7 +99,10 @@ def fast_moment(bench: Bench) -> int:
     for t_ns in range(0, 20_000 * S_NS, 40 * S_NS):
         seen = bench.moving.passing(Cone(NORTH, np.pi, 0.0), t_ns)
         name = brightest(bench, t_ns)[0]
-        if seen.speeds_rad_s()[[bench.moving.satellites.names[k] for k in seen.index].index(name)] > 0.009:
+        if (
+            seen.speeds_rad_s()[[bench.moving.satellites.names[k] for k in seen.index].index(name)]
+            > 0.009
+        ):
             return t_ns
     raise AssertionError("there is none")
 
@@ -103,7 +116,10 @@ def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streak
         name, place, _ = brightest(bench, t_ns)
         q = from_radec_roll_deg(*place, 0.0)
         before, after = (brightest(bench, t_ns + k)[1] for k in (-S_NS // 4, S_NS // 4))
-        ways = [np.array([np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)]) for r, d in np.radians([before, after])]
+        ways = [
+            np.array([np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)])
+            for r, d in np.radians([before, after])
+        ]
         turn = np.cross(ways[0], ways[1]) * 2  # rad/s about ICRS axes
         rate = to_matrix(q) @ turn
         found = [tracker.expose(tracker.view(q, one, t_ns), None) for one in (rate, np.zeros(3))]
@@ -127,7 +143,9 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
     with load(bench_file) as bench:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
-        number = bench.moving.satellites._satellites[bench.moving.satellites.names.index(name)].number
+        number = bench.moving.satellites._satellites[
+            bench.moving.satellites.names.index(name)
+        ].number
     (bench_file.parent / "seen.csv").write_text(f"norad,standard_mag,size_m\n{number},3,{SIZE_M}\n")
     bench_file.write_text(bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5"))
     q = from_radec_roll_deg(*place, 0.0)
@@ -141,14 +159,18 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
         point = bench.frame(q, t_ns=t_ns)
         (as_point,) = point.truth[point.truth["name"] == name]
         assert row["electrons_per_s"] == pytest.approx(as_point["electrons_per_s"], rel=1e-3)
-        assert lit.sum() - point.linear.sum(dtype=np.float64) == pytest.approx(0, abs=0.005 * row["electrons_per_s"])
+        assert lit.sum() - point.linear.sum(dtype=np.float64) == pytest.approx(
+            0, abs=0.005 * row["electrons_per_s"]
+        )
         width_px = 2 * disc.radius_rad * bench.camera.focal_length_px
         assert width_px > 3
         near = lit[80:160, 120:200]  # 320 x 240
         seen = np.argwhere(near > 0.05 * near.max())
         # of 24, along the terminator, blurred
         assert np.abs(np.ptp(seen, axis=0) - width_px).min() < 3
-        assert (row["x_px"], row["y_px"]) == pytest.approx((as_point["x_px"], as_point["y_px"]), abs=1.5)
+        assert (row["x_px"], row["y_px"]) == pytest.approx(
+            (as_point["x_px"], as_point["y_px"]), abs=1.5
+        )
     with Simulator(read_bench_file(bench_file)) as tracker:
         found = tracker.expose(tracker.view(q, np.zeros(3), t_ns), None)
         (of_exposure,) = found.truth[found.truth["name"] == name]
@@ -171,9 +193,14 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
     with load(bench_file) as bench:
         name, place, _ = brightest(bench, 0)
     radec = f"{place[0]:.5f},{place[1]:.5f},0"
-    done = run_hilstar_here("frame", bench_file, "--radec", radec, "--truth", bench_file.parent / "t.csv", "--explain")
+    done = run_hilstar_here(
+        "frame", bench_file, "--radec", radec, "--truth", bench_file.parent / "t.csv", "--explain"
+    )
     assert done.returncode == 0, done.stderr
-    assert "satellites: 60 of 61 have a place by their elements; 60 are in [sky.bodies] satellite_magnitudes" in done.stderr
+    assert (
+        "satellites: 60 of 61 have a place by their elements; 60 are in [sky.bodies] satellite_magnitudes"
+        in done.stderr
+    )
     assert done.stderr.count("OLD") == 1
     assert name in (bench_file.parent / "t.csv").read_text()
     assert run_hilstar_here("verify", bench_file, "--fields", "1", "--json").returncode == 0
@@ -187,7 +214,11 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
     ("named", "text", "said"),
     [
         ("tles.txt", None, "tles.txt: cannot be read"),
-        ("tles.txt", STATION_TLE.replace("2927", "2928"), "tles.txt:2: its digits add up to 7, not 8"),
+        (
+            "tles.txt",
+            STATION_TLE.replace("2927", "2928"),
+            "tles.txt:2: its digits add up to 7, not 8",
+        ),
         ("tles.txt", "SIMPLE  =  T", "tles.txt: cannot be read (it is a FITS file)"),
         ("seen.csv", "norad,mag\n1,2\n", "seen.csv:1: no column 'mag' is known"),
         ("seen.csv", None, "seen.csv: cannot be read"),
@@ -198,7 +229,9 @@ def test_a_wrong_file_is_one_line_and_exit_code_2(bench_file, named, text, said)
     path.unlink()
     if text is not None:
         path.write_text(text)
-    done = run_hilstar_here("frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv")
+    done = run_hilstar_here(
+        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+    )
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
@@ -206,14 +239,20 @@ def test_a_wrong_file_is_one_line_and_exit_code_2(bench_file, named, text, said)
 
 def test_a_table_without_a_list_is_refused(bench_file):
     bench_file.write_text(bench_file.read_text().replace("satellites =", "# satellites ="))
-    done = run_hilstar_here("frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv")
+    done = run_hilstar_here(
+        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+    )
     assert done.returncode == 2
-    assert 'satellite_magnitudes is of no satellites; write satellites = "tles.txt" too' in done.stderr
+    assert (
+        'satellite_magnitudes is of no satellites; write satellites = "tles.txt" too' in done.stderr
+    )
 
 
 def test_satellites_need_a_date(bench_file):
     bench_file.write_text(bench_file.read_text().replace("epoch_utc", "# epoch_utc"))
-    done = run_hilstar_here("frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv")
+    done = run_hilstar_here(
+        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+    )
     assert done.returncode == 2
     assert "need a date" in done.stderr
 
@@ -235,21 +274,29 @@ def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_se
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
     text = bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5")
-    bench_file.write_text(text.replace("transmission", "psf_sigma_px = [1.0, 1.0]\ntransmission", 1))
+    bench_file.write_text(
+        text.replace("transmission", "psf_sigma_px = [1.0, 1.0]\ntransmission", 1)
+    )
     q, file = from_radec_roll_deg(*place, 0.0), read_bench_file(bench_file)
     display = DisplayTracker(file)
     with Simulator(file) as tracker:
-        of_sky, of_display = (one.expose(tracker.view(q, np.zeros(3), t_ns), None) for one in (tracker, display))
+        of_sky, of_display = (
+            one.expose(tracker.view(q, np.zeros(3), t_ns), None) for one in (tracker, display)
+        )
     display.close()
     rows = [shot.truth[shot.truth["name"] == name][0] for shot in (of_sky, of_display)]
-    assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx((rows[1]["x_px"], rows[1]["y_px"]), abs=0.01)
+    assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx(
+        (rows[1]["x_px"], rows[1]["y_px"]), abs=0.01
+    )
     middles, lengths = [], []
     for shot in (of_sky, of_display):
         light = shot.mean_e[480:544, 480:544] - np.median(shot.mean_e[480:544, 480:544])
         light[light < 0.02 * light.max()] = 0.0
         y, x = np.indices(light.shape)
         at = np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
-        minor, major = np.linalg.eigvalsh(np.cov(np.stack([x.ravel(), y.ravel()]), aweights=light.ravel()))
+        minor, major = np.linalg.eigvalsh(
+            np.cov(np.stack([x.ravel(), y.ravel()]), aweights=light.ravel())
+        )
         middles.append(at)
         lengths.append(np.sqrt(major - minor))  # the screen's sprites are wider, in every direction
     assert middles[1] == pytest.approx(middles[0], abs=0.3)

@@ -45,9 +45,14 @@ def test_a_bench_with_the_collimator_or_the_panel_that_would_do_is_at_the_limit(
     assert wide.too_wide and wide.would_do is not None
     longer = size(tmp_path, WIDE, {"collimator": {"focal_length_mm": wide.would_do.collimator_mm}})
     assert longer.sigma_ratio == pytest.approx(wide.limit, rel=EXACT)
-    panel = {"pixel_pitch_um": wide.would_do.pixel_pitch_um, "resolution_px": list(wide.would_do.resolution_px)}
+    panel = {
+        "pixel_pitch_um": wide.would_do.pixel_pitch_um,
+        "resolution_px": list(wide.would_do.resolution_px),
+    }
     finer = bench_file_of(tmp_path / "bench.toml", bench_text(WIDE, {"monitor": panel}))
-    assert star_size(finer.config, tmp_path, bench_camera(finer.config, tmp_path)).sigma_ratio == pytest.approx(2.0, rel=EXACT)
+    assert star_size(
+        finer.config, tmp_path, bench_camera(finer.config, tmp_path)
+    ).sigma_ratio == pytest.approx(2.0, rel=EXACT)
     # Its pixels hold the whole of the tracker's field.
     assert fields_of_view(finer.config, tmp_path).field_on_screen == 1.0
 
@@ -58,7 +63,9 @@ def test_what_a_longer_collimator_leaves_of_the_field_on_the_screen_is_counted(t
     assert not would_do.field_fits
     assert would_do.field_on_screen == pytest.approx(height_mm / field_mm, rel=EXACT)
     small = size(tmp_path, WIDE, {"tracker": {"resolution_px": [512, 512]}}).would_do
-    assert small.field_fits and small.text().startswith("a collimator of 1857 mm would do, or a panel of ")
+    assert small.field_fits and small.text().startswith(
+        "a collimator of 1857 mm would do, or a panel of "
+    )
 
 
 def test_a_limit_under_the_lens_itself_is_met_by_nothing(tmp_path):
@@ -68,21 +75,30 @@ def test_a_limit_under_the_lens_itself_is_met_by_nothing(tmp_path):
     assert "no collimator and no panel would do" in found.text()
 
 
-def test_each_panel_is_at_the_limit_with_the_shorter_collimator_and_shows_the_field_with_the_longer(tmp_path):
+def test_each_panel_is_at_the_limit_with_the_shorter_collimator_and_shows_the_field_with_the_longer(
+    tmp_path,
+):
     wide = size(tmp_path, WIDE).would_do
     assert len(wide.panels) == len(PANELS)
     lengths = {one.panel: one for one in wide.panels if one.collimator_mm is not None}
     assert "27-inch 5K" in lengths and "27-inch 2560 x 1440" not in lengths
     for one in lengths.values():
-        its = {"monitor": {"resolution_px": list(one.resolution_px), "pixel_pitch_um": one.pixel_pitch_um}}
+        its = {
+            "monitor": {
+                "resolution_px": list(one.resolution_px),
+                "pixel_pitch_um": one.pixel_pitch_um,
+            }
+        }
         shorter, longer = one.collimator_mm
         at_limit = size(tmp_path, WIDE, its, {"collimator": {"focal_length_mm": shorter}})
         assert at_limit.sigma_ratio == pytest.approx(2.0, rel=EXACT)
-        fits = bench_file_of(tmp_path / "b.toml", bench_text(WIDE, its, {"collimator": {"focal_length_mm": longer}}))
-        assert fields_of_view(fits.config, tmp_path).field_on_screen == 1.0
-        assert star_size(fits.config, tmp_path, bench_camera(fits.config, tmp_path)).sigma_ratio == pytest.approx(
-            one.sigma_ratio, rel=EXACT
+        fits = bench_file_of(
+            tmp_path / "b.toml", bench_text(WIDE, its, {"collimator": {"focal_length_mm": longer}})
         )
+        assert fields_of_view(fits.config, tmp_path).field_on_screen == 1.0
+        assert star_size(
+            fits.config, tmp_path, bench_camera(fits.config, tmp_path)
+        ).sigma_ratio == pytest.approx(one.sigma_ratio, rel=EXACT)
 
 
 def test_a_display_that_draws_the_trackers_psf_is_wider_by_its_own_pixels_alone(tmp_path):
@@ -95,7 +111,13 @@ def test_a_monitor_pixel_of_many_tracker_pixels_is_summed_up_in_coarser_squares(
     # the collimator, mm, at which a monitor pixel is one of the tracker's
     at = 60 * (57.65 / 60) / (13 / 70)
     below, above = (
-        size(tmp_path, {"collimator": {"focal_length_mm": at / FINEST * step}, "tracker": {"resolution_px": [64, 64]}})
+        size(
+            tmp_path,
+            {
+                "collimator": {"focal_length_mm": at / FINEST * step},
+                "tracker": {"resolution_px": [64, 64]},
+            },
+        )
         for step in (1.001, 0.999)
     )
     assert above.peak_loss_mag == pytest.approx(below.peak_loss_mag, abs=SMOOTH_MAG)
@@ -118,7 +140,9 @@ def test_each_command_states_the_star_and_warns_once(tmp_path):
         found = found["benches"]["bench.toml"] if words[0] == "doctor" else found
         assert found["star"]["sigma_ratio"] == pytest.approx(6.51, abs=0.01)
         assert found["star"]["would_do"]["collimator_mm"] == pytest.approx(1857, abs=1)
-    served = run_hilstar_here("serve", "bench.toml", "--headless", "--duration", "0.1", "--json", cwd=tmp_path)
+    served = run_hilstar_here(
+        "serve", "bench.toml", "--headless", "--duration", "0.1", "--json", cwd=tmp_path
+    )
     assert line in served.stderr
     assert served.stderr.count("a star is 6.5 times") == 1
     assert json.loads(served.stdout)["star"]["limit"] == 2.0
@@ -127,11 +151,15 @@ def test_each_command_states_the_star_and_warns_once(tmp_path):
 def test_verify_does_not_pass_a_bench_whose_star_is_too_wide(tmp_path):
     wide = {"collimator": {"focal_length_mm": 40}}
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, wide))
-    failed = run_hilstar_here("verify", "bench.toml", "--fields", 1, "--strict", "--json", cwd=tmp_path)
+    failed = run_hilstar_here(
+        "verify", "bench.toml", "--fields", 1, "--strict", "--json", cwd=tmp_path
+    )
     assert failed.returncode == 1
     found = json.loads(failed.stdout)
     assert any("[verify] star_sigma_ratio = 2" in reason for reason in found["reasons"])
     assert found["star"]["sigma_ratio"] > 2.0
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, wide, {"verify": {"star_sigma_ratio": 5.0}}))
+    (tmp_path / "bench.toml").write_text(
+        bench_text(TWIN, wide, {"verify": {"star_sigma_ratio": 5.0}})
+    )
     allowed = run_hilstar_here("verify", "bench.toml", "--fields", 1, "--json", cwd=tmp_path)
     assert not any("star_sigma_ratio" in reason for reason in json.loads(allowed.stdout)["reasons"])

@@ -52,9 +52,13 @@ def test_a_written_table_has_the_errors_of_its_epoch():
     # of V from Hp, and its scatter about Hp
     assert at_start["sigma_mag"] == pytest.approx(np.hypot(0.0088, 0.004), abs=5e-5)
     # 34.75 years of 0.48 mas a year; the correlations of place and motion take 0.1 from it.
-    assert with_errors(truth, catalog, 2026.0)["sigma_pos_mas"][row] == pytest.approx(0.48 * 34.75, abs=0.12)
+    assert with_errors(truth, catalog, 2026.0)["sigma_pos_mas"][row] == pytest.approx(
+        0.48 * 34.75, abs=0.12
+    )
     truth["hip"][~row] = 0
-    assert np.isnan(with_errors(truth, catalog, 2026.0)["sigma_pos_mas"]).tolist() == (~row).tolist()
+    assert (
+        np.isnan(with_errors(truth, catalog, 2026.0)["sigma_pos_mas"]).tolist() == (~row).tolist()
+    )
     other = replace(catalog, epoch_jyear=np.where(mizar, 2016.0, catalog.epoch_jyear))
     assert np.isnan(with_errors(truth, other, 2026.0)["sigma_pos_mas"]).all()
 
@@ -65,7 +69,9 @@ def test_a_frame_that_writes_no_truth_table_reads_no_facts(tmp_path, monkeypatch
 
     monkeypatch.setattr("hilstar.sky.facts._packaged", no_facts)
     path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}}))
+    path.write_text(
+        bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}})
+    )
     with load(path) as bench:
         shot = bench.frame(from_radec_roll_deg(84.0, -1.2, 0.0))
     assert len(shot.rows)
@@ -75,14 +81,20 @@ def test_a_frame_that_writes_no_truth_table_reads_no_facts(tmp_path, monkeypatch
 
 def test_the_table_that_python_has_is_the_one_that_is_written(tmp_path):
     path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}}))
+    path.write_text(
+        bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}})
+    )
     with load(path) as bench:
         shot = bench.frame(from_radec_roll_deg(84.0, -1.2, 0.0))
     write_truth_csv(tmp_path / "truth.csv", shot)
-    written = np.genfromtxt(tmp_path / "truth.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    written = np.genfromtxt(
+        tmp_path / "truth.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+    )
     for name in ("sigma_pos_mas", "sigma_mag"):
         assert np.isfinite(shot.truth[name]).all()
         assert written[name].tolist() == shot.truth[name].tolist()
     with Simulator(read_bench_file(path)) as simulator:
-        exposure = simulator.expose(simulator.view(from_radec_roll_deg(84.0, -1.2, 0.0), np.zeros(3)), None)
+        exposure = simulator.expose(
+            simulator.view(from_radec_roll_deg(84.0, -1.2, 0.0), np.zeros(3)), None
+        )
     assert np.isfinite(exposure.truth["sigma_pos_mas"][exposure.truth["hip"] > 0]).all()

@@ -17,7 +17,11 @@ from tests.support.skies import STATION_TLE, moving_sky, utc_ns
 
 ARCSEC = np.pi / (180 * 3600)
 DAY_NS = 86_400 * 10**9
-MOON = {"sky": {"epoch_utc": "unix"}, "sky.bodies": {"moon": True}, "spacecraft": {"orbit": "geocentre"}}
+MOON = {
+    "sky": {"epoch_utc": "unix"},
+    "sky.bodies": {"moon": True},
+    "spacecraft": {"orbit": "geocentre"},
+}
 # Cubics of three hours are within 0.1 mas; the start's and another observer's aberration add 2e-9
 # of their 20 arcsec.
 LIMIT_ARCSEC = 5e-3
@@ -38,8 +42,13 @@ def moon(sky, t_ns: int) -> np.ndarray:
     return sky._seen_from(sky._moment(t_ns, None, None)).seen_km[-1]
 
 
-@pytest.mark.parametrize("started", ["2016-12-31T09:00:00", "2017-01-01T09:00:00", "2016-12-01T09:00:00"])
-@pytest.mark.parametrize("utc", ["2016-12-31T12:00:00", "2016-12-31T23:59:59.5", LEAP, "2017-01-01T02:00:00.25", "2017-01-20"])
+@pytest.mark.parametrize(
+    "started", ["2016-12-31T09:00:00", "2017-01-01T09:00:00", "2016-12-01T09:00:00"]
+)
+@pytest.mark.parametrize(
+    "utc",
+    ["2016-12-31T12:00:00", "2016-12-31T23:59:59.5", LEAP, "2017-01-01T02:00:00.25", "2017-01-20"],
+)
 def test_before_and_after_a_leap_second_the_moon_is_where_its_utc_has_it(bench_file, started, utc):
     file = dated(read_bench_file(bench_file), None, utc_ns(started))
     sky = bench_moving(file.config, file.folder)
@@ -72,7 +81,12 @@ def test_satellites_are_where_sgp4_has_them_at_that_utc(tmp_path, rng):
     (tmp_path / "tles.txt").write_text(some_orbits(rng, 3))
     (tmp_path / "station.tle").write_text(STATION_TLE)
     path = tmp_path / "bench.toml"
-    path.write_text(bench_text(MOON | {"sky.bodies": {"satellites": "tles.txt"}, "spacecraft": {"orbit": "station.tle"}}))
+    path.write_text(
+        bench_text(
+            MOON
+            | {"sky.bodies": {"satellites": "tles.txt"}, "spacecraft": {"orbit": "station.tle"}}
+        )
+    )
     now = utc_ns("2008-09-20T12:30:00")
     file = at_moment(read_bench_file(path), now)
     sky = bench_moving(file.config, file.folder)
@@ -82,7 +96,10 @@ def test_satellites_are_where_sgp4_has_them_at_that_utc(tmp_path, rng):
 
 def test_stars_of_a_live_run_are_of_today(bench_file):
     file = read_bench_file(bench_file)
-    assert abs(file.config.sky.epoch_jyear - (2000 + (time.time() / 86_400 - 10_957.5) / 365.25)) < 0.01
+    assert (
+        abs(file.config.sky.epoch_jyear - (2000 + (time.time() / 86_400 - 10_957.5) / 365.25))
+        < 0.01
+    )
     assert at_moment(file, None) is file
 
 

@@ -27,7 +27,11 @@ JD_LIMIT_MAG = 0.002  # the Julian year of UTC keeps the date to a minute, the p
 def stars(folder, **sky):
     (folder / "stars.csv").write_text(TABLE)
     path = folder / "bench.toml"
-    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"catalogue": "stars.csv", **sky}}))
+    path.write_text(
+        bench_text(
+            {"collimator": {"focal_length_mm": 350}, "sky": {"catalogue": "stars.csv", **sky}}
+        )
+    )
     file = read_bench_file(path)
     return bench_stars(file.config, file.folder)
 
@@ -45,9 +49,17 @@ def test_a_table_s_stars_have_the_light_of_the_date(tmp_path):
     date = {"epoch_utc": "2025-11-21T00:00:00Z"}
     mean, phase = stars(tmp_path, **date), stars(tmp_path, variables="phase", **date)
     assert list(by_row(mean).values()) == [5.0] * 5
-    wanted = {"stars row 1": 4.6, "stars row 2": 5.4, "stars row 3": 5.0, "stars row 4": 5.0, "stars row 5": 5.0}
+    wanted = {
+        "stars row 1": 4.6,
+        "stars row 2": 5.4,
+        "stars row 3": 5.0,
+        "stars row 4": 5.0,
+        "stars row 5": 5.0,
+    }
     assert by_row(phase) == pytest.approx(wanted, abs=JD_LIMIT_MAG)
-    assert phase.electrons_per_s.max() / phase.electrons_per_s.min() == pytest.approx(10**0.32, rel=2 * JD_LIMIT_MAG)
+    assert phase.electrons_per_s.max() / phase.electrons_per_s.min() == pytest.approx(
+        10**0.32, rel=2 * JD_LIMIT_MAG
+    )
     half_later = stars(tmp_path, variables="phase", epoch_utc="2025-11-26T00:00:00Z")
     assert by_row(half_later)["stars row 1"] == pytest.approx(5.4, abs=JD_LIMIT_MAG)
 

@@ -61,12 +61,21 @@ def test_a_fits_file_of_a_bent_sky_is_read_within_what_it_says(bench, folder, tm
     wcs = WCS(header)
     # SIP alone finds the pixel by iteration; the polynomials AP and BP do so at once.
     flat = np.column_stack(wcs.wcs_world2pix(ra_deg, dec_deg, 0)) - (wcs.wcs.crpix - 1)
-    inverse = [flat[:, k] + _polynomial(header, name, flat) + wcs.wcs.crpix[k] - 1 for k, name in enumerate(("AP", "BP"))]
+    inverse = [
+        flat[:, k] + _polynomial(header, name, flat) + wcs.wcs.crpix[k] - 1
+        for k, name in enumerate(("AP", "BP"))
+    ]
     ways = {"iterated": wcs.all_world2pix(ra_deg, dec_deg, 0), "inverse": inverse}
     for way, (x_px, y_px) in ways.items():
         off = np.hypot(x_px - true[:, 0], y_px - true[:, 1]).max()
         assert off < BETWEEN_PLACES * header["LENSERR"] + 1e-4, way  # to 1e-4 px Astropy iterates
-    plain = WCS({key: header[key] for key in header if not key.startswith(("A_", "B_", "AP_", "BP_", "LENS"))})
+    plain = WCS(
+        {
+            key: header[key]
+            for key in header
+            if not key.startswith(("A_", "B_", "AP_", "BP_", "LENS"))
+        }
+    )
     plain.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     x_px, y_px = plain.all_world2pix(ra_deg, dec_deg, 0)
     # what the polynomials are worth
@@ -76,7 +85,9 @@ def test_a_fits_file_of_a_bent_sky_is_read_within_what_it_says(bench, folder, tm
 def _polynomial(header, name, at):
     order = header[f"{name}_ORDER"]
     powers = [(p, q) for p in range(order + 1) for q in range(order + 1 - p)]
-    return sum(header.get(f"{name}_{p}_{q}", 0.0) * at[:, 0] ** p * at[:, 1] ** q for p, q in powers)
+    return sum(
+        header.get(f"{name}_{p}_{q}", 0.0) * at[:, 0] ** p * at[:, 1] ** q for p, q in powers
+    )
 
 
 def test_a_lens_that_no_sip_fits_leaves_tan_and_says_how_far_it_is_off(rng):

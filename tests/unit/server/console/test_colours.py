@@ -14,7 +14,11 @@ from hilstar.basics.palette import THEMES, colours_of
 TEXT, GRAPHIC = 4.5, 3.0  # WCAG 2.2, 1.4.3 (AA) and 1.4.11
 MIN_CURVES_APART = 12.0  # CIE 1976 dE of two curves in a chart; 2.3 is just seen, side by side
 READ = [
-    *((ink, ground) for ink in ("text", "muted", "accent", "ok", "warn", "bad") for ground in ("ground", "panel", "raised")),
+    *(
+        (ink, ground)
+        for ink in ("text", "muted", "accent", "ok", "warn", "bad")
+        for ground in ("ground", "panel", "raised")
+    ),
     ("ok", "ok-ground"),
     ("text", "ok-ground"),
     ("bad-text", "bad-ground"),
@@ -41,7 +45,9 @@ def themes() -> dict[str, dict[str, np.ndarray]]:
     plain = {}
     for theme in THEMES:
         colours = colours_of(theme).items()
-        plain[theme] = {name: linear(colour[1:]) for name, colour in colours if colour.startswith("#")}
+        plain[theme] = {
+            name: linear(colour[1:]) for name, colour in colours if colour.startswith("#")
+        }
     # The light theme has every colour of the dark one: what it lacked would stay dark.
     assert plain["dark"].keys() == plain["light"].keys()
     return plain

@@ -12,7 +12,9 @@ from hilstar.server.console.server.reader import Health, RecentFrames, reasons
 
 S = 1_000_000_000
 NOW = 1_000 * S
-ATTITUDE = ShownAttitude(q=(1.0, 0.0, 0.0, 0.0), ra_deg=90.0, dec_deg=0.0, roll_deg=0.0, rate_deg_s=None, age_ms=1250.0)
+ATTITUDE = ShownAttitude(
+    q=(1.0, 0.0, 0.0, 0.0), ra_deg=90.0, dec_deg=0.0, roll_deg=0.0, rate_deg_s=None, age_ms=1250.0
+)
 FRAME = NewestFrame(number=1, missing=False, blank=False)
 STALE = replace(FRAME, stale=True)
 WELL = RunState(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, frame=FRAME, attitude=ATTITUDE)
@@ -33,18 +35,30 @@ def test_a_run_that_goes_well_has_no_reason():
     [
         ({"frame": NewestFrame()}, "no attitude has come yet"),
         ({"frame": STALE}, "the attitude is stale: 1.2 s old"),
-        ({"frame": STALE, "attitude": replace(ATTITUDE, age_ms=3_725e3)}, "the attitude is stale: 1 h 02 min old"),
-        ({"frame": STALE, "attitude": replace(ATTITUDE, age_ms=725e3)}, "the attitude is stale: 12 min 05 s old"),
+        (
+            {"frame": STALE, "attitude": replace(ATTITUDE, age_ms=3_725e3)},
+            "the attitude is stale: 1 h 02 min old",
+        ),
+        (
+            {"frame": STALE, "attitude": replace(ATTITUDE, age_ms=725e3)},
+            "the attitude is stale: 12 min 05 s old",
+        ),
         ({"frame": STALE, "attitude": None}, "the attitude is stale"),
         ({"alive_ns": 0}, "being prepared"),
         ({"alive_ns": NOW - S}, "the frame loop has hung for 1.0 s"),
         ({"host_ns": NOW - S, "alive_ns": NOW - S}, "silent for 1.0 s"),
         ({"display_lost": "the window went away"}, "the display is lost: the window went away"),
         ({"hidden": "covered"}, "the window is covered"),
-        ({"ledger": LedgerState("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
+        (
+            {"ledger": LedgerState("run.mcap", 1, "cannot be written")},
+            "the ledger fails: cannot be written",
+        ),
         ({"operator_text": "blank"}, "changed by the operator: blank"),
         ({"faults": ["flash"]}, "a fault is on: flash"),
-        ({"tracker": TrackerFigures(silent="the tracker has not answered for 2.0 s")}, "has not answered for 2.0 s"),
+        (
+            {"tracker": TrackerFigures(silent="the tracker has not answered for 2.0 s")},
+            "has not answered for 2.0 s",
+        ),
         (
             {"wrong_sky": [WrongCondition("rates-wrong", "the packets' rates are wrong")]},
             "the packets' rates are wrong",

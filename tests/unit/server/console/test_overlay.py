@@ -29,7 +29,9 @@ def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
     told = msgspec.to_builtins(overlay_of(bench).truth(0, np.array(ORION_Q), (26311,)))["stars"]
     drawn = frame.truth[frame.truth["drawn"]]
     places = {int(row["hip"]): (row["x_px"], row["y_px"]) for row in drawn}
-    inside = {hip for hip, (x, y) in places.items() if abs(x - 159.5) < 159 and abs(y - 119.5) < 119}
+    inside = {
+        hip for hip, (x, y) in places.items() if abs(x - 159.5) < 159 and abs(y - 119.5) < 119
+    }
     assert inside <= {star[3] for star in told} <= set(places)
     for x, y, v_mag, hip, label, clipped, _ in told:
         assert places[hip] == pytest.approx((x, y), abs=ROUNDED_PX)
@@ -46,11 +48,14 @@ def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(bench):
     outline = np.array(overlay_of(bench).truth(0, np.array(ORION_Q)).tracker_px)
     wanted_px = 1024 * 13 / 70 * 60 / 57.65
     assert np.ptp(outline, axis=0) == pytest.approx([wanted_px, wanted_px], abs=2 * ROUNDED_PX)
-    assert (outline.min(axis=0) + outline.max(axis=0)) / 2 == pytest.approx([159.5, 119.5], abs=ROUNDED_PX)
+    assert (outline.min(axis=0) + outline.max(axis=0)) / 2 == pytest.approx(
+        [159.5, 119.5], abs=ROUNDED_PX
+    )
 
 
 @pytest.mark.parametrize(
-    ("ra_deg", "dec_deg", "roll_deg"), [(84.057, -1.2, 0.0), (0.1, 60.0, 40.0), (200.0, 89.5, 10.0), (359.9, -90.0, 5.0)]
+    ("ra_deg", "dec_deg", "roll_deg"),
+    [(84.057, -1.2, 0.0), (0.1, 60.0, 40.0), (200.0, 89.5, 10.0), (359.9, -90.0, 5.0)],
 )
 def test_each_line_of_the_grid_is_where_its_label_says(bench, ra_deg, dec_deg, roll_deg):
     q = from_radec_roll_deg(ra_deg, dec_deg, roll_deg)
@@ -66,7 +71,9 @@ def test_each_line_of_the_grid_is_where_its_label_says(bench, ra_deg, dec_deg, r
             off_deg = (np.degrees(np.arctan2(y, x)) - float(text) + 180) % 360 - 180
             from_pole_deg = np.degrees(np.hypot(x, y) / np.sqrt(x * x + y * y + z * z))
             # At right angles to the meridian; on the pole itself every right ascension is right.
-            off_deg = np.where(np.abs(off_deg) < 90, np.sin(np.radians(off_deg)), 1.0) * from_pole_deg
+            off_deg = (
+                np.where(np.abs(off_deg) < 90, np.sin(np.radians(off_deg)), 1.0) * from_pole_deg
+            )
         assert np.abs(off_deg).max() < LINE_DEG
 
 

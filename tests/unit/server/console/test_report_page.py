@@ -13,7 +13,14 @@ import pytest
 
 from hilstar.server.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.server.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.server.record.report import BLOCK, MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
+from hilstar.server.record.report import (
+    BLOCK,
+    MAX_EVENTS,
+    RunFigures,
+    SpanTable,
+    TimeBins,
+    summarise,
+)
 from tests.support.run_page import run_data_of
 
 PERIOD_NS = 16_666_667
@@ -25,13 +32,28 @@ def frame(k: int, **more: object) -> FrameRecord:
     swap_ns = 10**12 + k * PERIOD_NS
     turn = 1e-4 * k
     q = (np.cos(turn), 0.0, np.sin(turn), 0.0)
-    known = {"frame": k, "t_ns": swap_ns, "light_ns": swap_ns, "draw_ns": swap_ns - 5_000_000, "swap_ns": swap_ns, "q": q}
-    return FrameRecord(**(known | {"age_ns": 7_000_000 + 1000 * (k % 997), "stars_drawn": 200} | more))
+    known = {
+        "frame": k,
+        "t_ns": swap_ns,
+        "light_ns": swap_ns,
+        "draw_ns": swap_ns - 5_000_000,
+        "swap_ns": swap_ns,
+        "q": q,
+    }
+    return FrameRecord(
+        **(known | {"age_ns": 7_000_000 + 1000 * (k % 997), "stars_drawn": 200} | more)
+    )
 
 
 @pytest.fixture(scope="module")
 def run() -> RunFigures:
-    figures = RunFigures({"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12), "bench_text": "</script>"})
+    figures = RunFigures(
+        {
+            "unix_ns": str(1_800_000_000 * 10**9),
+            "monotonic_ns": str(10**12),
+            "bench_text": "</script>",
+        }
+    )
     for begin in range(0, FRAMES, BLOCK):
         block = range(begin, min(begin + BLOCK, FRAMES))
         late = {31_415: {"age_ns": 900_000_000, "stale": True, "missed_before": 3}}
@@ -53,7 +75,10 @@ def test_the_page_stands_alone_and_lets_nothing_else_in(run):
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         assert f"{kind}-src 'sha256-{digest}'" in policy[1]
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert not re.search(r"https?://(?!www\.w3\.org)", page.replace(script[1], "")) and "fetch(" not in script[1]
+    assert (
+        not re.search(r"https?://(?!www\.w3\.org)", page.replace(script[1], ""))
+        and "fetch(" not in script[1]
+    )
     assert run_data_of(page)["bench_text"] == "</script>"
 
 
@@ -73,7 +98,14 @@ def test_a_long_run_keeps_its_worst_frame_and_stays_small(run):
     begins = np.array(spans["t_s"])
     assert begins[worst] <= 31_415 * PERIOD_NS / 1e9 < begins[worst + 1]
     assert sum(spans["missed"]) == 3 and spans["missed"][worst] == 3 and sum(spans["stale"]) == 1
-    assert told["events"] == [{"t_s": 90.0, "utc": "2027-01-15T08:01:30.000+00:00", "kind": "mark", "line": "<b>cover off</b>"}]
+    assert told["events"] == [
+        {
+            "t_s": 90.0,
+            "utc": "2027-01-15T08:01:30.000+00:00",
+            "kind": "mark",
+            "line": "<b>cover off</b>",
+        }
+    ]
 
 
 def test_packets_are_counted_at_their_time(run):
@@ -81,15 +113,27 @@ def test_packets_are_counted_at_their_time(run):
     *accepted, last = told["accepted_hz"]
     assert last is None  # the run ended before this bin did
     rate_hz = FRAMES / (told["t_s"][-1] + told["width_s"])
-    assert sum(accepted) * told["width_s"] == pytest.approx(FRAMES, abs=2 * rate_hz * told["width_s"])
-    refused = {at: rate * told["width_s"] for at, rate in zip(told["t_s"], told["refused_hz"], strict=True) if rate}
+    assert sum(accepted) * told["width_s"] == pytest.approx(
+        FRAMES, abs=2 * rate_hz * told["width_s"]
+    )
+    refused = {
+        at: rate * told["width_s"]
+        for at, rate in zip(told["t_s"], told["refused_hz"], strict=True)
+        if rate
+    }
     assert refused == {500.0: pytest.approx(77)}
 
 
 def test_the_verdict_names_everything_that_was_wrong():
     figures = RunFigures({})
     for k, more in enumerate(
-        [{}, {"stale": True}, {"q": None, "stale": True}, {"missed_before": 2, "missed": 2}, {"hidden": "covered", "missed": 2}]
+        [
+            {},
+            {"stale": True},
+            {"q": None, "stale": True},
+            {"missed_before": 2, "missed": 2},
+            {"hidden": "covered", "missed": 2},
+        ]
     ):
         figures.add(frame(k, **more))
     told = verdict(summarise(figures), figures.counted["late"])
@@ -110,7 +154,9 @@ def test_the_verdict_names_everything_that_was_wrong():
 
 def event(k: int, kind: str, since: int | None = None) -> EventRecord:
     since_ns = None if since is None else 10**12 + since * PERIOD_NS
-    return EventRecord(host_ns=10**12 + k * PERIOD_NS, kind=kind, detail="by a factor of 1.5", since_ns=since_ns)
+    return EventRecord(
+        host_ns=10**12 + k * PERIOD_NS, kind=kind, detail="by a factor of 1.5", since_ns=since_ns
+    )
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000])
@@ -134,7 +180,9 @@ def test_lost_packets_are_a_figure_of_their_own():
     figures = RunFigures({})
     figures.add(frame(0), CountRecord(host_ns=10**12, kind="lost", reason="sequence", count=3))
     found = summarise(figures)
-    assert found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
+    assert (
+        found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
+    )
 
 
 def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():

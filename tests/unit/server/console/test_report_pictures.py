@@ -30,7 +30,9 @@ RATE = (0.0, 0.02, 0.0)
 
 
 def attitude(k: int) -> tuple[float, ...]:
-    return tuple(multiply(from_rotation_vector(np.array([0.0, 1e-3 * k, 0.0])), np.array(ORION_Q)).tolist())
+    return tuple(
+        multiply(from_rotation_vector(np.array([0.0, 1e-3 * k, 0.0])), np.array(ORION_Q)).tolist()
+    )
 
 
 @pytest.fixture
@@ -40,7 +42,11 @@ def ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
     with Ledger(tmp_path / "run.mcap", bench) as written:
         for k in range(40):
             q, rate = (None, None) if k == 0 else (attitude(k), RATE)
-            written.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=10**9 + k, q=q, rate=rate))
+            written.frame(
+                FrameRecord(
+                    frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=10**9 + k, q=q, rate=rate
+                )
+            )
     return tmp_path / "run.mcap", bench
 
 
@@ -49,7 +55,9 @@ def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
     report(path, tmp_path)
     data = run_data_of((tmp_path / "report.html").read_text())
     pictures = data["pictures"]
-    assert [picture["frame"] for picture in pictures] == sorted({picture["frame"] for picture in pictures})
+    assert [picture["frame"] for picture in pictures] == sorted(
+        {picture["frame"] for picture in pictures}
+    )
     assert pictures[0]["frame"] == 0 and pictures[-1]["frame"] == 39 and len(pictures) >= 8
     assert pictures[0]["truth"] is None and not levels_of(pictures[0]).any()
     for picture in pictures[1:]:
@@ -83,7 +91,9 @@ def test_pictures_have_the_faults_that_the_run_had(tmp_path):
     assert (levels_of(pictures[0]) != (sound if sound.ndim == 2 else sound[..., 0])).any()
 
 
-def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gone_says_why_not(bench_with, tmp_path):
+def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gone_says_why_not(
+    bench_with, tmp_path
+):
     bench = bench_with('[verify]\ntrue_calibration = "truth.toml"\n')
     with Ledger(tmp_path / "run.mcap", bench) as written:
         written.frame(FrameRecord(frame=0, t_ns=0, light_ns=0, draw_ns=0, swap_ns=1, q=attitude(0)))
@@ -97,7 +107,9 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
     assert none["sky"].stars[0].label == "α CMa"
 
 
-def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(ledger, tmp_path):
+def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(
+    ledger, tmp_path
+):
     path, _ = ledger
     (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])
     assert report(tmp_path / "cut.mcap", tmp_path).frames == 40
@@ -116,10 +128,20 @@ ABSURD = {
 @pytest.mark.filterwarnings("error")
 def test_a_foreign_ledger_of_absurd_figures_is_reported_without_a_word_too_many(tmp_path, absurd):
     form = {"light_ns": 1, "draw_ns": 1, "q": [1, 0, 0, 0]} | ABSURD[absurd]
-    records = [("/event", {"host_ns": 2**62, "kind": "<script>", "detail": "\0</script>", "who": "x" * 9999})]
-    records += [("/process", {"host_ns": k, "resident_bytes": 1, "cpu_s": 1e308 * (k - 1)}) for k in range(3)]
+    records = [
+        (
+            "/event",
+            {"host_ns": 2**62, "kind": "<script>", "detail": "\0</script>", "who": "x" * 9999},
+        )
+    ]
+    records += [
+        ("/process", {"host_ns": k, "resident_bytes": 1, "cpu_s": 1e308 * (k - 1)})
+        for k in range(3)
+    ]
     for k, swap_ns in enumerate((0, 10**18, 5, 2**62, 7)):
-        records.append(("/frame", form | {"frame": k, "t_ns": (-1) ** k * (2**63 - 1), "swap_ns": swap_ns}))
+        records.append(
+            ("/frame", form | {"frame": k, "t_ns": (-1) ** k * (2**63 - 1), "swap_ns": swap_ns})
+        )
     path = foreign_ledger(tmp_path, records)
     result = run_hilstar_here("report", path, "-o", tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
@@ -129,7 +151,20 @@ def test_a_foreign_ledger_of_absurd_figures_is_reported_without_a_word_too_many(
 
 def test_a_frame_without_an_attitude_s_norm_is_refused_by_its_number(tmp_path):
     path = foreign_ledger(
-        tmp_path, [("/frame", {"frame": 0, "t_ns": 0, "light_ns": 0, "draw_ns": 0, "swap_ns": 1, "q": [0, 0, 0, 0]})]
+        tmp_path,
+        [
+            (
+                "/frame",
+                {
+                    "frame": 0,
+                    "t_ns": 0,
+                    "light_ns": 0,
+                    "draw_ns": 0,
+                    "swap_ns": 1,
+                    "q": [0, 0, 0, 0],
+                },
+            )
+        ],
     )
     result = run_hilstar_here("report", path, "-o", tmp_path / "report")
     assert_refused(result, 2, "message 1, of /frame: the quaternion's norm is 0")
@@ -140,7 +175,12 @@ def foreign_ledger(folder: Path, records: list[tuple[str, dict[str, Any]]]) -> P
     file = io.BytesIO()
     writer = Writer(file)
     writer.start(library="test")
-    head = {"bench_text": SMALL_BENCH, "bench_file": "bench.toml", "unix_ns": "<b>", "monotonic_ns": "9" * 400}
+    head = {
+        "bench_text": SMALL_BENCH,
+        "bench_file": "bench.toml",
+        "unix_ns": "<b>",
+        "monotonic_ns": "9" * 400,
+    }
     writer.add_metadata("hilstar", head)
     channels = {topic: writer.register_channel(topic, "json", 0) for topic, _ in records}
     for topic, record in records:

@@ -48,7 +48,9 @@ def error_of(line: str) -> int:
                     scpi.number(parameter, "DEG/S")
                 else:
                     scpi.integer(parameter, 255)
-    assert raised.value.text.startswith(f'{raised.value.number},"{scpi.DESCRIPTIONS[raised.value.number]}')
+    assert raised.value.text.startswith(
+        f'{raised.value.number},"{scpi.DESCRIPTIONS[raised.value.number]}'
+    )
     return raised.value.number
 
 
@@ -56,7 +58,13 @@ def test_every_command_has_its_short_and_its_long_form_in_any_case():
     for pattern in [*QUERIES, *COMMANDS]:
         bare = pattern.replace("[:EVENt]", "").replace("[:NEXT]", "")
         short = "".join(c for c in bare if not c.islower())
-        for form in (short, short.lower(), bare, bare.upper(), pattern.replace("[", "").replace("]", "")):
+        for form in (
+            short,
+            short.lower(),
+            bare,
+            bare.upper(),
+            pattern.replace("[", "").replace("]", ""),
+        ):
             assert patterns(form + " 1") == [pattern], form
             assert patterns(("" if form.startswith("*") else ":") + form) == [pattern], form
 
@@ -152,7 +160,10 @@ def test_the_status_byte_sums_up_what_is_enabled():
     status.questionable.see(0)
     assert status.byte(True) & scpi.QUESTIONABLE == 0
     status.questionable.enable = 1 << 9
-    assert status.byte(True) & (scpi.QUESTIONABLE | scpi.MESSAGE_WAITS) == scpi.QUESTIONABLE | scpi.MESSAGE_WAITS
+    assert (
+        status.byte(True) & (scpi.QUESTIONABLE | scpi.MESSAGE_WAITS)
+        == scpi.QUESTIONABLE | scpi.MESSAGE_WAITS
+    )
     assert (status.questionable.read(), status.questionable.read()) == (1 << 9, 0)
     status.clear()
     assert status.byte(False) == 0 and status.standard.enable == 16
@@ -160,7 +171,13 @@ def test_the_status_byte_sums_up_what_is_enabled():
 
 @pytest.mark.parametrize("chunk", [1, 3, 10_000])
 def test_lines_are_the_same_however_they_are_cut(chunk):
-    data = b"*IDN?\r\n\n" + b"x" * (MAX_LINE_BYTES + 1) + b"\n*CLS\n" + b"y" * MAX_LINE_BYTES + b"\nrest"
+    data = (
+        b"*IDN?\r\n\n"
+        + b"x" * (MAX_LINE_BYTES + 1)
+        + b"\n*CLS\n"
+        + b"y" * MAX_LINE_BYTES
+        + b"\nrest"
+    )
     buffer, lines = LineBuffer(), []
     for at in range(0, len(data), chunk):
         lines += buffer.feed(data[at : at + chunk])
@@ -170,8 +187,25 @@ def test_lines_are_the_same_however_they_are_cut(chunk):
 def mutated(rng: np.random.Generator) -> bytes:
     """A line of pieces of SCPI, some of its bytes others."""
     heads = [b"SKY:ATT 1,0,0,0", b"SKY:RATE ", b"SYST:ERR?;", b"*IDN?;", b":SKY:", b"SKY:FAUL 'a'"]
-    pieces = [b":", b"?", b" ", b"1", b",", b"-.5e-1", b"'", b'"', b";", b"#H", b"(", b"DEG/S", *heads]
-    chosen = [heads[rng.integers(len(heads))], *(pieces[k] for k in rng.integers(len(pieces), size=rng.integers(5)))]
+    pieces = [
+        b":",
+        b"?",
+        b" ",
+        b"1",
+        b",",
+        b"-.5e-1",
+        b"'",
+        b'"',
+        b";",
+        b"#H",
+        b"(",
+        b"DEG/S",
+        *heads,
+    ]
+    chosen = [
+        heads[rng.integers(len(heads))],
+        *(pieces[k] for k in rng.integers(len(pieces), size=rng.integers(5))),
+    ]
     data = bytearray(b"".join(chosen))
     for at in rng.integers(len(data), size=rng.integers(0, 3)):
         data[at] = rng.integers(256)
@@ -182,7 +216,11 @@ def test_whatever_bytes_come_give_units_or_a_standard_error():
     rng, status = np.random.default_rng(34), InstrumentStatus()
     good = closed = 0
     for k in range(LINES):
-        data = mutated(rng) if k % 3 else rng.integers(256, size=rng.integers(60), dtype=np.uint8).tobytes()
+        data = (
+            mutated(rng)
+            if k % 3
+            else rng.integers(256, size=rng.integers(60), dtype=np.uint8).tobytes()
+        )
         try:
             lines = list(LineBuffer().feed(data + b"\n"))
         except NotScpi:
@@ -198,14 +236,38 @@ def test_whatever_bytes_come_give_units_or_a_standard_error():
                         scpi.number(parameter, "DEG/S")
             except ScpiError as error:
                 status.add(error)
-                assert error.number in scpi.DESCRIPTIONS and error.text.isascii() and len(error.text) < 260
+                assert (
+                    error.number in scpi.DESCRIPTIONS
+                    and error.text.isascii()
+                    and len(error.text) < 260
+                )
     assert good > LINES / 30 and closed > LINES / 30 and len(status.errors) == MAX_ERRORS
 
 
 BLANKED = b"\nSKY:BLAN ON\n"
 LONG_PATH = b"/" + b"a" * 5000
-METHODS = (b"GET", b"HEAD", b"POST", b"PUT", b"DELETE", b"CONNECT", b"OPTIONS", b"TRACE", b"PATCH", b"PRI", b"M-SEARCH", b"X!Y")
-TARGETS = (b"/", b"*", b"/a?b=SKY:BLAN%20ON", LONG_PATH, b"http://127.0.0.1:5025/", b"127.0.0.1:5025")
+METHODS = (
+    b"GET",
+    b"HEAD",
+    b"POST",
+    b"PUT",
+    b"DELETE",
+    b"CONNECT",
+    b"OPTIONS",
+    b"TRACE",
+    b"PATCH",
+    b"PRI",
+    b"M-SEARCH",
+    b"X!Y",
+)
+TARGETS = (
+    b"/",
+    b"*",
+    b"/a?b=SKY:BLAN%20ON",
+    LONG_PATH,
+    b"http://127.0.0.1:5025/",
+    b"127.0.0.1:5025",
+)
 CLIENT_HELLO = bytes.fromhex("16030100c8010000c40303") + bytes(range(32)) + BLANKED
 SSL_2_HELLO = bytes.fromhex("802e010002001500000010") + BLANKED
 STUN = bytes.fromhex("000300082112a442") + b"turn:127.0.0.1" + BLANKED
@@ -222,8 +284,20 @@ def obeyed(data: bytes, cuts: list[int]) -> tuple[list[str | None], bool]:
     return lines, False
 
 
-def request(method: bytes, target: bytes, version: bytes, blank: bytes = b" ", end: bytes = b"\r\n") -> bytes:
-    return method + blank + target + blank + version + end + b"Host: 127.0.0.1:5025\r\nOrigin: http://a" + end + BLANKED
+def request(
+    method: bytes, target: bytes, version: bytes, blank: bytes = b" ", end: bytes = b"\r\n"
+) -> bytes:
+    return (
+        method
+        + blank
+        + target
+        + blank
+        + version
+        + end
+        + b"Host: 127.0.0.1:5025\r\nOrigin: http://a"
+        + end
+        + BLANKED
+    )
 
 
 def test_a_request_of_any_method_case_length_and_cut_is_closed_before_a_line_of_it_is_read(rng):
@@ -290,4 +364,6 @@ def test_a_number_of_four_thousand_digits_is_refused_at_once():
 
 def test_a_device_s_own_headers_may_leave_out_what_stands_in_brackets():
     headers = Headers(["SOURce[:SKY]:POWer"])
-    assert [next(headers.units(line)).pattern for line in ("SOUR:POW 1", "source:sky:power 1")] == ["SOURce[:SKY]:POWer"] * 2
+    assert [next(headers.units(line)).pattern for line in ("SOUR:POW 1", "source:sky:power 1")] == [
+        "SOURce[:SKY]:POWer"
+    ] * 2

@@ -38,13 +38,18 @@ def reader() -> RunReader:
 
 
 def put(reader: RunReader, figures: TrackerFigures) -> None:
-    reader._memory.answers.put(msgspec.json.encode(NewAnswer(figures, tuple(ORION_Q), [(1.0, 2.0)])))
+    reader._memory.answers.put(
+        msgspec.json.encode(NewAnswer(figures, tuple(ORION_Q), [(1.0, 2.0)]))
+    )
 
 
 def test_an_answer_is_read_once_and_makes_a_point_of_the_chart(reader):
     assert reader.new_answer() is None
     put(reader, FIGURES)
-    put(reader, msgspec.structs.replace(FIGURES, wrong=2, verdict="wrong", residual_arcsec=[9e4, 0.0, 0.0]))
+    put(
+        reader,
+        msgspec.structs.replace(FIGURES, wrong=2, verdict="wrong", residual_arcsec=[9e4, 0.0, 0.0]),
+    )
     assert reader.new_answer().wrong == 2
     assert reader.new_answer() is None and reader.answer.centroids == [(1.0, 2.0)]
     reader.look()
@@ -58,7 +63,9 @@ def test_the_metrics_and_the_state_have_the_trackers_figures(reader):
     collector = RunCollector(reader)
     assert b"tracker" not in collector.text()
     silent = msgspec.structs.replace(FIGURES, silent="the tracker has not answered for 3.0 s")
-    reader._memory.states.put(msgspec.json.encode(RunState(host_ns=2**62, alive_ns=2**62, tracker=silent)))
+    reader._memory.states.put(
+        msgspec.json.encode(RunState(host_ns=2**62, alive_ns=2**62, tracker=silent))
+    )
     reader.look()
     assert "the tracker has not answered for 3.0 s" in reader.health.reasons
     assert reader.state().tracker == silent
@@ -75,13 +82,17 @@ def test_the_metrics_and_the_state_have_the_trackers_figures(reader):
 
 
 def test_the_terminal_has_a_line_of_the_tracker():
-    loop = SimpleNamespace(tally=SimpleNamespace(frames=1, missed_frames=0, stale_frames=0), notices=Notices())
+    loop = SimpleNamespace(
+        tally=SimpleNamespace(frames=1, missed_frames=0, stale_frames=0), notices=Notices()
+    )
     packets = SimpleNamespace(received=0, refused=0, refused_by={}, lost=0)
     status = RunStatus(RunSource("zmq", "llvmpipe", 60.0))
     status.see(SimpleNamespace(attitude=None, missing=True, swap_ns=0, stale=False))
 
     def line(figures: TrackerFigures) -> tuple[str, bool]:
-        status.follow(SimpleNamespace(loop=loop, packets=packets, answers=SimpleNamespace(figures=figures)))
+        status.follow(
+            SimpleNamespace(loop=loop, packets=packets, answers=SimpleNamespace(figures=figures))
+        )
         return next((line.text, line.well) for line in status.lines(1) if line.label == "tracker")
 
     text = "1.0, -2.0, 30.0 arcsec off, rms 1.5, 2.5, 3.5, 75.0 % available, 150 ms late, track; 1 of 12 answers wrong"
@@ -110,5 +121,7 @@ def test_the_reported_field_and_centroids_lie_over_the_picture_where_the_tracker
     later = multiply(from_rotation_vector(np.radians([0.0, 1.0, 0.0])), q)
     moved = marks.answer(None, q, later, star_px[1:].tolist())
     assert moved.field_px == []
-    star = marks.monitor.project(np.array([[np.sin(np.radians(1.0)), 0.0, np.cos(np.radians(1.0))]]))
+    star = marks.monitor.project(
+        np.array([[np.sin(np.radians(1.0)), 0.0, np.cos(np.radians(1.0))]])
+    )
     assert moved.centroids_px[0] == pytest.approx([star[0][0], star[1][0]], abs=0.011)

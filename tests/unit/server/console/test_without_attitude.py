@@ -23,7 +23,9 @@ def test_what_the_first_refused_packet_showed_is_said_and_not_the_cable() -> Non
 
 
 def test_a_crc_that_shows_nothing_is_the_cable_s() -> None:
-    assert "cable" in without_attitude(PLACE, summary_of(Refusal("crc", "the CRC-32 does not match the packet")))
+    assert "cable" in without_attitude(
+        PLACE, summary_of(Refusal("crc", "the CRC-32 does not match the packet"))
+    )
 
 
 def test_what_the_link_knows_comes_before_start_the_sender() -> None:

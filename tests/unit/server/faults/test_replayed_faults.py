@@ -73,7 +73,11 @@ turn_deg = [0, 0.5, 0]
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "bench.toml"
-    path.write_text(bench_text({"monitor": {"refresh_hz": 50}, "render": {"quantisation": "temporal", "motion": "on"}}))
+    path.write_text(
+        bench_text(
+            {"monitor": {"refresh_hz": 50}, "render": {"quantisation": "temporal", "motion": "on"}}
+        )
+    )
     with hilstar.load(path) as opened:
         yield opened
 
@@ -121,7 +125,13 @@ def test_a_scenario_is_replayed_from_its_ledger_code_for_code(bench, log, tmp_pa
 
 def test_the_same_scenario_twice_is_the_same_light_and_another_seed_is_not(bench, log, tmp_path):
     runs = [
-        played(bench, log, scenario=parse_scenario(tmp_path / "f.toml", SCENARIO.replace("seed = 1", f"seed = {seed}")))[1]
+        played(
+            bench,
+            log,
+            scenario=parse_scenario(
+                tmp_path / "f.toml", SCENARIO.replace("seed = 1", f"seed = {seed}")
+            ),
+        )[1]
         for seed in (1, 1, 2)
     ]
     assert all(np.array_equal(runs[0][k], runs[1][k]) for k in runs[0])
@@ -131,9 +141,15 @@ def test_the_same_scenario_twice_is_the_same_light_and_another_seed_is_not(bench
 def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(log, tmp_path):
     """Not with `temporal`, whose stars make up for what the frames with faults left."""
     path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"monitor": {"refresh_hz": 50}, "render": {"quantisation": "exact", "motion": "on"}}))
+    path.write_text(
+        bench_text(
+            {"monitor": {"refresh_hz": 50}, "render": {"quantisation": "exact", "motion": "on"}}
+        )
+    )
     with hilstar.load(path) as bench:
-        frames, codes, _ = played(bench, log, scenario=parse_scenario(tmp_path / "f.toml", SCENARIO))
+        frames, codes, _ = played(
+            bench, log, scenario=parse_scenario(tmp_path / "f.toml", SCENARIO)
+        )
         _, plain, _ = played(bench, log)
     free = [shown.number for shown in frames if not shown.faults]
     assert len(free) >= 3
@@ -143,7 +159,9 @@ def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(log, tmp_pat
 def test_frames_freeze_and_blank_and_the_ledger_says_by_what(bench, log, tmp_path):
     scenario = parse_scenario(tmp_path / "faults.toml", SCENARIO)
     _, codes, _ = played(bench, log, tmp_path / "run.mcap", scenario)
-    assert all(np.array_equal(codes[19], codes[k]) for k in range(20, 25)) and not np.array_equal(codes[19], codes[25])
+    assert all(np.array_equal(codes[19], codes[k]) for k in range(20, 25)) and not np.array_equal(
+        codes[19], codes[25]
+    )
     assert not codes[28].any() and codes[31].any()
     records = list(fault_records(tmp_path / "run.mcap"))
     assert records[0].event == "scenario" and records[0].table == SCENARIO
@@ -176,7 +194,15 @@ def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(bench, log, tm
         if shown.number == 20:
             faults.schedule.stop("cover", "Ada")
 
-    replay(bench, plan_play(log, Wanted(speed=float("inf")), bench.config), sink, Outlet(notices=notices, faults=faults))
+    replay(
+        bench,
+        plan_play(log, Wanted(speed=float("inf")), bench.config),
+        sink,
+        Outlet(notices=notices, faults=faults),
+    )
     assert [number for number in codes if not codes[number].any()] == list(range(11, 21))
     said = [(notice.detail, notice.who) for notice in heard if notice.kind == "fault"]
-    assert said == [("fault cover (blank) begins, by Ada", "Ada"), ("fault cover (blank) ends, by Ada", "Ada")]
+    assert said == [
+        ("fault cover (blank) begins, by Ada", "Ada"),
+        ("fault cover (blank) ends, by Ada", "Ada"),
+    ]

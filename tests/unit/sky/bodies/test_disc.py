@@ -28,7 +28,9 @@ def disc(phase_deg: float, distance: float, law="lambert", share=1.0, polar=1.0,
     side = np.cross(towards, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     sun = -np.cos(np.radians(phase_deg)) * towards + np.sin(np.radians(phase_deg)) * side
-    return Disc("x", towards, distance, 1.0, polar, np.array([0.6, 0.0, 0.8]), sun, law, 1.0, share, air)
+    return Disc(
+        "x", towards, distance, 1.0, polar, np.array([0.6, 0.0, 0.8]), sun, law, 1.0, share, air
+    )
 
 
 def rays_about(one: Disc, rng, count=RAYS) -> tuple[np.ndarray, float]:
@@ -38,7 +40,9 @@ def rays_about(one: Disc, rng, count=RAYS) -> tuple[np.ndarray, float]:
     first = np.cross(one.direction, [1.0, 0.0, 0.0])
     first /= np.linalg.norm(first)
     across = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * np.cross(one.direction, first)
-    return cosine[:, None] * one.direction + np.sqrt(1 - cosine**2)[:, None] * across, 2 * np.pi * (1 - np.cos(reach))
+    return cosine[:, None] * one.direction + np.sqrt(1 - cosine**2)[:, None] * across, 2 * np.pi * (
+        1 - np.cos(reach)
+    )
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 40.0, 90.0, 140.0, 170.0, 178.0])
@@ -47,33 +51,61 @@ def test_a_far_sphere_s_whole_light_is_that_of_the_closed_forms(phase_deg):
     lambertian = 2 / 3 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     half = phase / 2
     lunar = 1 - np.sin(half) * np.tan(half) * np.log(1 / np.tan(half / 2)) if phase else 1.0
-    assert disc(phase_deg, FAR).law_integral_sr() == pytest.approx(whole_sr * lambertian, rel=CLOSED_LIMIT)
-    assert disc(phase_deg, FAR, "lunar-lambert").law_integral_sr() == pytest.approx(whole_sr * lunar, rel=CLOSED_LIMIT)
-    assert disc(phase_deg, FAR, "uniform").law_integral_sr() == pytest.approx(whole_sr, rel=CLOSED_LIMIT)
+    assert disc(phase_deg, FAR).law_integral_sr() == pytest.approx(
+        whole_sr * lambertian, rel=CLOSED_LIMIT
+    )
+    assert disc(phase_deg, FAR, "lunar-lambert").law_integral_sr() == pytest.approx(
+        whole_sr * lunar, rel=CLOSED_LIMIT
+    )
+    assert disc(phase_deg, FAR, "uniform").law_integral_sr() == pytest.approx(
+        whole_sr, rel=CLOSED_LIMIT
+    )
     # 0.30 + 0.93 mu - 0.23 mu^2 over a disc: the mean of mu is 2/3 there, that of its square 1/2.
     limb = 0.30 + 0.93 * 2 / 3 - 0.23 / 2
-    assert disc(phase_deg, FAR, "limb-darkened").law_integral_sr() == pytest.approx(whole_sr * limb, rel=CLOSED_LIMIT)
+    assert disc(phase_deg, FAR, "limb-darkened").law_integral_sr() == pytest.approx(
+        whole_sr * limb, rel=CLOSED_LIMIT
+    )
 
 
 @pytest.mark.parametrize(("distance", "polar"), [(1.08, 1.0), (3.0, 0.9), (200.0, 0.95)])
 @pytest.mark.parametrize(("law", "share"), [("lambert", 1.0), ("lunar-lambert", 0.4)])
-def test_each_ray_has_the_light_of_a_traced_one_and_all_have_the_integral(distance, polar, law, share, rng):
+def test_each_ray_has_the_light_of_a_traced_one_and_all_have_the_integral(
+    distance, polar, law, share, rng
+):
     one = disc(75.0, distance, law, share, polar)
     rays, whole_sr = rays_about(one, rng)
-    body = Body(distance * one.direction, 1.0, polar, one.pole, one.sun, lambert if law == "lambert" else lunar_lambert(share))
+    body = Body(
+        distance * one.direction,
+        1.0,
+        polar,
+        one.pole,
+        one.sun,
+        lambert if law == "lambert" else lunar_lambert(share),
+    )
     found = one.radiance(rays)
     truth, through = traced(body, rays)
     # A ray at the limb may be on either side.
     assert np.mean(np.abs(found - truth) > 1e-6) < 1e-4
     assert np.mean((one.transmission(rays) == 0) != (through == 0)) < 1e-4
     assert found.mean() * whole_sr == pytest.approx(one.law_integral_sr(), rel=MEAN_LIMIT * 2)
-    assert one.of_rate(5e6).radiance(rays).mean() * whole_sr == pytest.approx(5e6, rel=MEAN_LIMIT * 2)
+    assert one.of_rate(5e6).radiance(rays).mean() * whole_sr == pytest.approx(
+        5e6, rel=MEAN_LIMIT * 2
+    )
 
 
 def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
     earth = Air(8.0 / 6378.0, 0.097)
     one = disc(60.0, 1.1, polar=6356.75 / 6378.14, air=earth)
-    body = Body(1.1 * one.direction * 6378.0, 6378.0, 6378.0 * one.polar_km, one.pole, one.sun, lambert, 1.0, (8.0, 0.097))
+    body = Body(
+        1.1 * one.direction * 6378.0,
+        6378.0,
+        6378.0 * one.polar_km,
+        one.pole,
+        one.sun,
+        lambert,
+        1.0,
+        (8.0, 0.097),
+    )
     rays, _ = rays_about(one, rng, 20_000)
     light, through = traced(body, rays)
     found = one.transmission(rays)
@@ -88,7 +120,17 @@ def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
 def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():
     moving = moving_sky(UTC)
     found = moving.discs(np.array([1.0, 0.0, 0.0]), np.pi)
-    assert [one.name for one in found] == ["Moon", "Venus", "Sun", "Mercury", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune"]
+    assert [one.name for one in found] == [
+        "Moon",
+        "Venus",
+        "Sun",
+        "Mercury",
+        "Mars",
+        "Jupiter",
+        "Saturn",
+        "Uranus",
+        "Neptune",
+    ]
     moon, sun = found[0], found[2]
     # 1942 arcsec at 0.988 au
     assert 2 * np.degrees(sun.radius_rad) == pytest.approx(0.5394, abs=1e-3)

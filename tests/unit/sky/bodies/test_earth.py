@@ -38,11 +38,17 @@ def outline(disc: Disc, directions: np.ndarray) -> np.ndarray:
     return (angle - np.arcsin(1 / disc.distance_radii)) / ARCSEC
 
 
-@pytest.mark.parametrize(("radius_km", "speed_km_s"), [(6728.0, 7.7), (6728.0, 10.5), (42_164.0, 3.07), (380_000.0, 1.0)])
-def test_each_ray_of_the_limb_is_where_its_own_light_time_and_aberration_have_it(radius_km, speed_km_s, rng):
+@pytest.mark.parametrize(
+    ("radius_km", "speed_km_s"), [(6728.0, 7.7), (6728.0, 10.5), (42_164.0, 3.07), (380_000.0, 1.0)]
+)
+def test_each_ray_of_the_limb_is_where_its_own_light_time_and_aberration_have_it(
+    radius_km, speed_km_s, rng
+):
     towards, ahead = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
     seen_km = radius_km * towards
-    velocity = speed_km_s * (ahead if speed_km_s < 8 else (ahead + 0.4 * towards) / np.hypot(1, 0.4))
+    velocity = speed_km_s * (
+        ahead if speed_km_s < 8 else (ahead + 0.4 * towards) / np.hypot(1, 0.4)
+    )
     disc = earth_disc(seen_km, SUN_KM, velocity, 1.0)
     body = Body(seen_km, disc.equator_km, disc.polar_km, disc.pole, disc.sun, lambert)
     rays = limb(body, 36)

@@ -35,8 +35,13 @@ def seen_arcsec(stars: Stars, exact: np.ndarray) -> np.ndarray:
     return np.linalg.norm(seen - exact, axis=1) / ARCSEC
 
 
-@pytest.mark.parametrize(("orbit", "utc", "limit_arcsec"), [(None, UTC, GEOCENTRE_ARCSEC), ("tle", STATION_UTC, ORBIT_ARCSEC)])
-def test_at_any_time_of_a_day_bodies_are_where_an_ephemeris_of_that_moment_has_them(orbit, utc, limit_arcsec, rng):
+@pytest.mark.parametrize(
+    ("orbit", "utc", "limit_arcsec"),
+    [(None, UTC, GEOCENTRE_ARCSEC), ("tle", STATION_UTC, ORBIT_ARCSEC)],
+)
+def test_at_any_time_of_a_day_bodies_are_where_an_ephemeris_of_that_moment_has_them(
+    orbit, utc, limit_arcsec, rng
+):
     def observer():
         return None if orbit is None else TleOrbit(STATION_TLE, "station.tle")
 
@@ -58,7 +63,9 @@ def test_stars_follow_the_observer_s_velocity(rng):
     far = np.zeros(50)
     stars = moving.among(stars_at(moving.stars_seen(vectors, far), np.ones(50)))
     later = moving.seen(stars, 46 * 60 * 10**9)
-    then = moving_sky(utc_ns(STATION_UTC) + 46 * 60 * 10**9, (), orbit=orbit).stars_seen(vectors, far)
+    then = moving_sky(utc_ns(STATION_UTC) + 46 * 60 * 10**9, (), orbit=orbit).stars_seen(
+        vectors, far
+    )
     order = stars.grid.order
     off = np.linalg.norm(later.directions(np.arange(50)) - then[order], axis=1) / ARCSEC
     assert off.max() < ORBIT_ARCSEC
@@ -74,7 +81,10 @@ def test_a_moment_gives_the_same_light_whatever_came_before(rng):
         moving.seen(stars, other)
     again = moving.seen(stars, t_ns)
     assert all(
-        np.array_equal(a, b) for a, b in zip(once, (again.vectors, again.electrons_per_s, again.velocity_km_s), strict=True)
+        np.array_equal(a, b)
+        for a, b in zip(
+            once, (again.vectors, again.electrons_per_s, again.velocity_km_s), strict=True
+        )
     )
 
 
@@ -127,7 +137,10 @@ LINES = STATION_TLE.splitlines()
         ("", "not one set of two lines"),
         (LINES[1], "not one set of two lines"),
         ("\n".join(LINES[1:] * 2), "not one set of two lines"),
-        ("\n".join((LINES[1], LINES[2][:-1] + "8")), "element line 2: its digits add up to 7, not 8"),
+        (
+            "\n".join((LINES[1], LINES[2][:-1] + "8")),
+            "element line 2: its digits add up to 7, not 8",
+        ),
     ],
 )
 def test_wrong_elements_are_refused(text, words):
@@ -139,5 +152,7 @@ def test_an_orbit_that_has_ended_is_refused():
     dragged = LINES[1].replace("-11606-4", " 11606-1")[:-1]
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in dragged) % 10
     orbit = TleOrbit(f"{dragged}{checksum}\n{LINES[2]}", "station.tle")
-    with pytest.raises(InputError, match=r"station.tle: no orbit at 2009-09-20T00:00:00: .*; give newer elements"):
+    with pytest.raises(
+        InputError, match=r"station.tle: no orbit at 2009-09-20T00:00:00: .*; give newer elements"
+    ):
         moving_sky("2009-09-20T00:00:00Z", orbit=orbit)

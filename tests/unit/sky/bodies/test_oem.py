@@ -36,7 +36,10 @@ def test_between_epochs_the_orbit_is_that_of_the_program_that_wrote_it(rng):
         assert velocity == pytest.approx(true_velocity, abs=VELOCITY_KM_S)
 
 
-@pytest.mark.parametrize(("scale", "ahead_s"), [("UTC", 0.0), ("TAI", 33.0), ("TT", 65.184), ("TDB", 65.184), ("GPS", 14.0)])
+@pytest.mark.parametrize(
+    ("scale", "ahead_s"),
+    [("UTC", 0.0), ("TAI", 33.0), ("TT", 65.184), ("TDB", 65.184), ("GPS", 14.0)],
+)
 @pytest.mark.parametrize("day_of_year", [False, True])
 def test_every_time_scale_tells_the_same_moment(scale, ahead_s, day_of_year):
     """In September 2008 TAI was 33 s ahead of UTC."""
@@ -46,9 +49,13 @@ def test_every_time_scale_tells_the_same_moment(scale, ahead_s, day_of_year):
 
 
 def test_segments_are_not_joined_and_covariances_and_accelerations_are_passed_over():
-    first = segment(MINUTES) + "COVARIANCE_START\nEPOCH = 2008-09-20T00:00:00\n1.0\n1.0 2.0\nCOVARIANCE_STOP\n"
+    first = (
+        segment(MINUTES)
+        + "COVARIANCE_START\nEPOCH = 2008-09-20T00:00:00\n1.0\n1.0 2.0\nCOVARIANCE_STOP\n"
+    )
     second = "\n".join(
-        line + " 0 0 0" if line.startswith("2008") else line for line in segment([1200, 1300, 1400]).splitlines()
+        line + " 0 0 0" if line.startswith("2008") else line
+        for line in segment([1200, 1300, 1400]).splitlines()
     )
     orbit = station(oem(first, second, version="3.0"))
     for second_s in (30, 1199, 1250, 1399):
@@ -79,12 +86,18 @@ def test_the_moment_for_which_stars_are_placed_need_not_be_covered(caplog):
     """With the dates of a source that is the beginning of its day."""
     with caplog.at_level(logging.WARNING):
         orbit = OemOrbit(oem(segment(MINUTES)), "a.oem", START_NS - 12 * 3600 * NS, day=True)
-        assert orbit.state(START_NS - 12 * 3600 * NS)[0] == pytest.approx(STATION.state(START_NS)[0], abs=PLACE_KM)
-        assert orbit.state(START_NS + 60 * NS)[0] == pytest.approx(STATION.state(START_NS + 60 * NS)[0], abs=PLACE_KM)
+        assert orbit.state(START_NS - 12 * 3600 * NS)[0] == pytest.approx(
+            STATION.state(START_NS)[0], abs=PLACE_KM
+        )
+        assert orbit.state(START_NS + 60 * NS)[0] == pytest.approx(
+            STATION.state(START_NS + 60 * NS)[0], abs=PLACE_KM
+        )
     assert not caplog.records
 
 
-@pytest.mark.parametrize(("step_s", "told"), [(60, False), (600, False), (1800, True), (3600, True)])
+@pytest.mark.parametrize(
+    ("step_s", "told"), [(60, False), (600, False), (1800, True), (3600, True)]
+)
 def test_epochs_too_far_apart_for_the_polynomial_are_told(caplog, step_s, told):
     """At ten minutes it is good to 1e-3 km; at half an hour, a third of the orbit, to some km."""
     with caplog.at_level(logging.WARNING):
@@ -104,7 +117,10 @@ ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
     [
         (oem(), "contains no segment"),
         (oem(segment([0])), "a segment has 1 states"),
-        (oem(segment([90_000, 90_060])), "no orbit within a day of 2008-09-20T12:30:00 UTC; it has 2008-09-21T13:30:00 to"),
+        (
+            oem(segment([90_000, 90_060])),
+            "no orbit within a day of 2008-09-20T12:30:00 UTC; it has 2008-09-21T13:30:00 to",
+        ),
         (oem(segment([0, 60], REF_FRAME="ITRF")), "REF_FRAME is ITRF and CENTER_NAME EARTH"),
         (oem(segment([0, 60], CENTER_NAME="MARS BARYCENTER")), "CENTER_NAME MARS BARYCENTER"),
         (oem(segment([0, 60], REF_FRAME=None)), "REF_FRAME is missing"),
@@ -113,10 +129,19 @@ ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
         (GOOD.replace(ROW, ROW.rsplit(" ", 1)[0]), "write an epoch, X Y Z"),
         (GOOD.replace(ROW, ROW.replace("2008-09-20", "2008-09-31")), "the epoch is '2008-09-31"),
         (GOOD.replace(ROW, ROW.replace("2008-09-20", "9999-09-20")), "the epoch is '9999-09-20"),
-        (GOOD.replace(ROW, ROW.split(" ")[0] + " nan 0 0 0 0 0"), "write km from the Earth's centre"),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " nan 0 0 0 0 0"),
+            "write km from the Earth's centre",
+        ),
         (GOOD.replace(ROW, ROW.split(" ")[0] + " 1 1 1 0 0 0"), "write km from the Earth's centre"),
-        (GOOD.replace(ROW, ROW.split(" ")[0] + " 7000 1e308 0 0 7.5 0"), "write km from the Earth's centre"),
-        (GOOD.replace(ROW, ROW.split(" ")[0] + " 7000e3 0 0 0 7.5e3 0"), "write km from the Earth's centre"),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " 7000 1e308 0 0 7.5 0"),
+            "write km from the Earth's centre",
+        ),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " 7000e3 0 0 0 7.5e3 0"),
+            "write km from the Earth's centre",
+        ),
         (GOOD[: GOOD.index("META_STOP")], "ends in the metadata"),
         (GOOD.replace("META_STOP", "META_STOP\nanything"), "'anything'"),
     ],

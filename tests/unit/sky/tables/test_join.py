@@ -36,7 +36,8 @@ def shifted(table: Catalog, row: int, north_arcsec: float, fainter_mag: float) -
 
 def stacked(*parts: Catalog) -> Catalog:
     columns = {
-        n: np.concatenate([getattr(p, n) for p in parts]) for n in ("ra_deg", "dec_deg", "v_mag", "bv_mag", "epoch_jyear")
+        n: np.concatenate([getattr(p, n) for p in parts])
+        for n in ("ra_deg", "dec_deg", "v_mag", "bv_mag", "epoch_jyear")
     }
     return plain_catalog("Gaia DR3", len(columns["v_mag"]), columns)
 
@@ -73,7 +74,10 @@ def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
     assert len(join(hipparcos, components).catalog) == len(hipparcos)
     # A star as near to a single one, and farther than any photometer's blur, is one of its own.
     vega = moved(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
-    assert len(join(hipparcos, stacked(vega, shifted(vega, 0, -14.4, 6.0))).catalog) == len(hipparcos) + 1
+    assert (
+        len(join(hipparcos, stacked(vega, shifted(vega, 0, -14.4, 6.0))).catalog)
+        == len(hipparcos) + 1
+    )
 
 
 def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
@@ -85,7 +89,10 @@ def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"dec_deg": 0.01}, "Hipparcos has 0% at their place"), ({"v_mag": 0.05}, "its V differs by +0.050 mag")],
+    [
+        ({"dec_deg": 0.01}, "Hipparcos has 0% at their place"),
+        ({"v_mag": 0.05}, "its V differs by +0.050 mag"),
+    ],
 )
 def test_an_overlap_that_does_not_fit_is_said(change, words):
     hipparcos = load_catalog()

@@ -35,7 +35,10 @@ def rewritten(path, **changes):
 
 
 def same(a, b):
-    return all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=getattr(a, n).dtype.kind == "f") for n in column_names())
+    return all(
+        np.array_equal(getattr(a, n), getattr(b, n), equal_nan=getattr(a, n).dtype.kind == "f")
+        for n in column_names()
+    )
 
 
 def test_the_second_time_the_cache_is_read_and_says_the_same(table, caplog):
@@ -53,7 +56,9 @@ def test_the_second_time_the_cache_is_read_and_says_the_same(table, caplog):
 def test_another_content_epoch_or_company_is_another_catalogue(table):
     choose_catalog(TableChoice(table))
     choose_catalog(TableChoice(table, epoch_jyear=2000.0))
-    assert len(choose_catalog(TableChoice(table, with_hipparcos=True, epoch_jyear=2000.0))) > 100_000
+    assert (
+        len(choose_catalog(TableChoice(table, with_hipparcos=True, epoch_jyear=2000.0))) > 100_000
+    )
     before = table.stat()
     table.write_text(TEXT.replace("0.5", "0.7"))
     os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
@@ -115,7 +120,10 @@ def test_two_processes_at_once_both_have_the_catalogue(table):
         "import sys; from pathlib import Path; from hilstar.sky.star_table import *;"
         "print(len(choose_catalog(TableChoice(Path(sys.argv[1])))))"
     )
-    runs = [subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE) for _ in range(2)]
+    runs = [
+        subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE)
+        for _ in range(2)
+    ]
     counts = [run.communicate(timeout=PATIENCE_S)[0].strip() for run in runs]
     assert counts == [b"2"] * 2
     (path,) = stored(table)

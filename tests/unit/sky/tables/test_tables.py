@@ -38,11 +38,15 @@ def gaia_table() -> Table:
             "ra": MaskedColumn([10.5, 359.999, 0.0, 33.0, 0.0], mask=[0, 0, 0, 0, 1], unit=u.deg),
             "dec": MaskedColumn([-45.25, 89.9, 12.0, 1.0, 0.0], unit=u.deg),
             "ref_epoch": np.full(5, 2016.0),
-            "pmra": MaskedColumn([-3.5, 0.0, 100.25, 1.0, 1.0], mask=[0, 1, 0, 0, 0], unit=u.mas / u.yr),
+            "pmra": MaskedColumn(
+                [-3.5, 0.0, 100.25, 1.0, 1.0], mask=[0, 1, 0, 0, 0], unit=u.mas / u.yr
+            ),
             "pmdec": np.array([1.0, 2.0, 3.0, 4.0, 5.0]) * u.mas / u.yr,
             "parallax": MaskedColumn([2.0, 0.0, 5.0, 1.0, 1.0], mask=[0, 1, 0, 0, 0], unit=u.mas),
             "phot_g_mean_mag": np.array([5.0, 6.0, 7.0, 8.0, 9.0]) * u.mag,
-            "phot_bp_mean_mag": MaskedColumn([5.5, 6.1, 8.0, 0.0, 9.0], mask=[0, 0, 0, 1, 0], unit=u.mag),
+            "phot_bp_mean_mag": MaskedColumn(
+                [5.5, 6.1, 8.0, 0.0, 9.0], mask=[0, 0, 0, 1, 0], unit=u.mag
+            ),
             "phot_rp_mean_mag": MaskedColumn([4.5, 6.0, 6.0, 7.0, 8.0], unit=u.mag),
             "note": ["a b", "c,d", "", "e", "f"],
         }
@@ -70,7 +74,11 @@ def test_gaia_s_own_columns_are_read_from_every_format(tmp_path, name, caplog):
         f"Gaia DR3 {2**62 + 1}",
     ]
     row = {name: row for row, name in enumerate(map(catalog.name, range(3)))}
-    first, second, third = row["Gaia DR3 5"], row["Gaia DR3 4295806720"], row[f"Gaia DR3 {2**62 + 1}"]
+    first, second, third = (
+        row["Gaia DR3 5"],
+        row["Gaia DR3 4295806720"],
+        row[f"Gaia DR3 {2**62 + 1}"],
+    )
     v, vi = from_gaia(np.array([5.0, 7.0]), np.array([1.0, 2.0]))
     assert catalog.v_mag[[first, third]] == pytest.approx(v, abs=SAME)
     assert catalog.vi_mag[[first, third]] == pytest.approx(vi, abs=SAME)
@@ -154,12 +162,32 @@ def test_stars_of_hipparcos_in_its_own_columns_are_hipparcos(tmp_path):
     table.write(tmp_path / "hip.csv")
     own = read(tmp_path / "hip.csv")
     order = np.argsort(own.hip)
-    for name in ("hip", "ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "v_mag", "bv_mag", "vi_mag", "epoch_jyear"):
-        assert np.array_equal(getattr(own, name)[order], getattr(packaged, name)[np.argsort(packaged.hip)]), name
+    for name in (
+        "hip",
+        "ra_deg",
+        "dec_deg",
+        "pm_ra_cosdec_mas_yr",
+        "v_mag",
+        "bv_mag",
+        "vi_mag",
+        "epoch_jyear",
+    ):
+        assert np.array_equal(
+            getattr(own, name)[order], getattr(packaged, name)[np.argsort(packaged.hip)]
+        ), name
 
 
 def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
-    rows = ["1,2,nan,0.1", "1,2,5,", ",2,5,1", "1,2,5,1", "1,2,5,1", "2,99,5,1", "3,3,inf,1", "-20,3,4,1"]
+    rows = [
+        "1,2,nan,0.1",
+        "1,2,5,",
+        ",2,5,1",
+        "1,2,5,1",
+        "1,2,5,1",
+        "2,99,5,1",
+        "3,3,inf,1",
+        "-20,3,4,1",
+    ]
     (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
     catalog = read(tmp_path / "t.csv")
     assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
@@ -201,11 +229,14 @@ REFUSED = {
     "ra,dec,mass\n1,2,3\n": "no magnitude with a colour among its columns (ra, dec, mass); name V with B-V",
     "hello\nworld\n": "its first line names no columns",
     HEAD + "12:00:00,-01:02:03,5,0.1\n": "is no column of numbers (its first is '",
-    HEAD + "1,2,nan,0.1\n1,2,5,\n": "none of its 2 rows is a star (2 without a magnitude and a colour)",
+    HEAD
+    + "1,2,nan,0.1\n1,2,5,\n": "none of its 2 rows is a star (2 without a magnitude and a colour)",
     HEAD + "1,2,3,0.1\n1,2,3,4,5\n": "cannot be read",
     "ra,dec,vmag,b-v,pmra,pmdec\n1,2,3,0.1,5,5\n": "write [sky] catalogue_epoch_jyear",
     "ra,dec,vmag,b-v,pmra,pmdec,ref_epoch\n1,2,3,0.1,5,5,1\n": "column ref_epoch is no Julian year",
-    "source_id,ra,dec,vmag,b-v\n" + "9" * 30 + ",1,2,3,0.1\n": "column source_id is no column of numbers",
+    "source_id,ra,dec,vmag,b-v\n"
+    + "9" * 30
+    + ",1,2,3,0.1\n": "column source_id is no column of numbers",
     HEAD.strip() + "," + "x," * 2000 + "\n": "its first line names more than 1000 columns",
     "# %ECSV 1.0\n# ---\n# datatype: {\nra dec\n1 2\n": "cannot be read",
     '<?xml version="1.0"?><VOTABLE>': "cannot be read",
@@ -256,7 +287,10 @@ def test_a_table_beside_hipparcos_has_to_have_an_epoch(tmp_path):
     assert len(read(tmp_path / "t.csv")) == 3
     with pytest.raises(InputError, match="has no epoch of its places, and stars move; write "):
         read(tmp_path / "t.csv", with_hipparcos=True)
-    assert len(read(tmp_path / "t.csv", with_hipparcos=True, epoch_jyear=2000.0)) == len(load_catalog()) + 3
+    assert (
+        len(read(tmp_path / "t.csv", with_hipparcos=True, epoch_jyear=2000.0))
+        == len(load_catalog()) + 3
+    )
 
 
 def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):

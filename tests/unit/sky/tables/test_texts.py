@@ -47,7 +47,13 @@ def assert_stars(catalog, order):
     assert catalog.bv_mag[order].tolist() == BV
 
 
-VIZIER_HEAD = ["#", "#RESOURCE=yCat_9999", "#Name: I/239/hip_main", '#Column\tRAICRS\t(F12.8)\tright ascension (5")', ""]
+VIZIER_HEAD = [
+    "#",
+    "#RESOURCE=yCat_9999",
+    "#Name: I/239/hip_main",
+    '#Column\tRAICRS\t(F12.8)\tright ascension (5")',
+    "",
+]
 
 
 @pytest.mark.parametrize("between", ["\t", ";", "|"])
@@ -68,14 +74,23 @@ def test_vizier_s_texts_are_read_in_the_units_of_their_second_line(read, between
         BV,
         ['5"', "", "a b", "é", "", ""],
     ]
-    catalog, order = read(lines([line.replace("|", between) for line in head], *rows, between=between) + "\n")
+    catalog, order = read(
+        lines([line.replace("|", between) for line in head], *rows, between=between) + "\n"
+    )
     assert_stars(catalog, order)
     assert catalog.hip[order].tolist() == [1, 2, 0, 4, 5, 6]
 
 
 def test_vizier_s_sexagesimal_places_are_read_by_their_unit(read):
-    head = [*VIZIER_HEAD, "RAJ2000\tDEJ2000\tVmag\tB-V", '"h:m:s"\t"d:m:s"\tmag\tmag', "---\t---\t---\t---"]
-    text = lines(head, ["05 14 31.2", "05 55 09.6"], ["-08 12 00", "+07 24 36"], V[:2], BV[:2], between="\t")
+    head = [
+        *VIZIER_HEAD,
+        "RAJ2000\tDEJ2000\tVmag\tB-V",
+        '"h:m:s"\t"d:m:s"\tmag\tmag',
+        "---\t---\t---\t---",
+    ]
+    text = lines(
+        head, ["05 14 31.2", "05 55 09.6"], ["-08 12 00", "+07 24 36"], V[:2], BV[:2], between="\t"
+    )
     catalog, order = read(text)
     assert np.allclose(catalog.ra_deg[order], RA[:2], rtol=0, atol=PLACES_DEG)
     assert np.allclose(catalog.dec_deg[order], DEC[:2], rtol=0, atol=PLACES_DEG)
@@ -94,7 +109,12 @@ def test_dialects_of_a_catalogue_are_read(read):
         if between == decimal:
             continue
         text = lines(["name;ra_deg;dec_deg;vmag;b-v"], ["a"] * 6, RA, DEC, V, BV, between=";")
-        text = text.replace(".", decimal).replace(";", between).replace("-", "−" if k % 2 else "-").replace("b−v", "b-v")
+        text = (
+            text.replace(".", decimal)
+            .replace(";", between)
+            .replace("-", "−" if k % 2 else "-")
+            .replace("b−v", "b-v")
+        )
         catalog, order = read(text.replace("\n", end), name=f"{k}.txt")
         assert_stars(catalog, order)
     text = lines(["# ra_deg dec_deg vmag b-v"], RA, DEC, V, BV, between="   ")
@@ -102,7 +122,14 @@ def test_dialects_of_a_catalogue_are_read(read):
 
 
 @pytest.mark.parametrize(
-    "header", ["ra_h,dec", "ra_hours,dec_deg", "RA (h),DEC (deg)", "RA [hours],Dec [deg]", "ra hours,dec deg"]
+    "header",
+    [
+        "ra_h,dec",
+        "ra_hours,dec_deg",
+        "RA (h),DEC (deg)",
+        "RA [hours],Dec [deg]",
+        "ra hours,dec deg",
+    ],
 )
 def test_hours_are_read_where_a_name_says_so(read, header, caplog):
     assert_stars(*read(lines([f"{header},vmag,b-v"], np.divide(RA, 15), DEC, V, BV)))
@@ -122,10 +149,25 @@ PLACES_REFUSED = {
         DEC,
         "so it is in hours, or of one field in degrees; give the column its unit: ra_deg",
     ),
-    "radians": ("ra,dec", np.radians(RA), np.radians(DEC), "radians, hours or degrees? give the column its unit"),
+    "radians": (
+        "ra,dec",
+        np.radians(RA),
+        np.radians(DEC),
+        "radians, hours or degrees? give the column its unit",
+    ),
     "west": ("raj2000,dej2000", np.radians(RA) - 3, np.radians(DEC), "radians, hours or degrees?"),
-    "degrees as radians": ("rarad,derad", RA, DEC, "column rarad is in rad and runs to 88.79; name it ra_deg"),
-    "degrees as hours": ("ra_h,dec_deg", RA, DEC, "column ra_h is in h and runs to 88.79; name it ra_deg"),
+    "degrees as radians": (
+        "rarad,derad",
+        RA,
+        DEC,
+        "column rarad is in rad and runs to 88.79; name it ra_deg",
+    ),
+    "degrees as hours": (
+        "ra_h,dec_deg",
+        RA,
+        DEC,
+        "column ra_h is in h and runs to 88.79; name it ra_deg",
+    ),
     "twice": ("ra,dec,RA", RA, DEC, "column ra is there twice"),
 }
 
@@ -169,7 +211,9 @@ def test_motions_are_in_the_unit_of_their_names(read, names, per_mas, factor, ca
 @pytest.mark.parametrize("per_mas", [1e-3, 1 / 3.6e6, 1e-3 / 15])
 def test_motions_too_small_for_mas_are_refused_without_a_unit(read, per_mas):
     text = lines(["ra,dec,pmra,pmdec,vmag,b-v"], RA, DEC, PM[0] * per_mas, PM[1] * per_mas, V, BV)
-    with pytest.raises(InputError, match=r"column pmra has no unit, and half .* so they are in arcsec a year"):
+    with pytest.raises(
+        InputError, match=r"column pmra has no unit, and half .* so they are in arcsec a year"
+    ):
         read(text, epoch_jyear=2000.0)
 
 
@@ -194,8 +238,16 @@ def test_identifiers_that_name_no_star_alone_are_not_used_and_that_is_said(read,
 
 def test_float_identifiers_in_fits_are_not_used_where_they_cannot_hold_them(read, tmp_path, caplog):
     for k, kind in enumerate((np.float64, np.float32, np.int64)):
-        identifiers = np.array([4_000_000_000_000_000_000 + 3 * star for star in range(6)]).astype(kind)
-        columns = dict(zip(f"source_id,{GAIA}".split(","), [identifiers, [2016.0] * 6, RA, DEC, V, BV], strict=True))
+        identifiers = np.array([4_000_000_000_000_000_000 + 3 * star for star in range(6)]).astype(
+            kind
+        )
+        columns = dict(
+            zip(
+                f"source_id,{GAIA}".split(","),
+                [identifiers, [2016.0] * 6, RA, DEC, V, BV],
+                strict=True,
+            )
+        )
         Table(columns).write(tmp_path / f"{k}.fits")
         catalog, _ = read(None, name=f"{k}.fits")
         assert (catalog.designation == "Gaia DR3") == (kind is np.int64)
@@ -203,7 +255,9 @@ def test_float_identifiers_in_fits_are_not_used_where_they_cannot_hold_them(read
 
 
 def test_whole_floats_that_hold_their_identifiers_are_used(read):
-    text = lines([f"source_id,{GAIA}"], [f"{k}.0" for k in range(11, 17)], [2016.0] * 6, RA, DEC, V, BV)
+    text = lines(
+        [f"source_id,{GAIA}"], [f"{k}.0" for k in range(11, 17)], [2016.0] * 6, RA, DEC, V, BV
+    )
     catalog, _ = read(text)
     assert sorted(map(catalog.name, range(6))) == [f"Gaia DR3 {k}" for k in range(11, 17)]
 
@@ -211,7 +265,9 @@ def test_whole_floats_that_hold_their_identifiers_are_used(read):
 def test_a_row_of_other_cells_is_named_with_its_line(read):
     text = lines(["ra,dec,vmag,b-v"], RA, DEC, V, BV)
     for wrong in ("1,2,3", "1,2,3,4,5"):
-        with pytest.raises(InputError, match=rf"cannot be read \(8: {wrong.count(',') + 1} cells and 4 columns"):
+        with pytest.raises(
+            InputError, match=rf"cannot be read \(8: {wrong.count(',') + 1} cells and 4 columns"
+        ):
             read(f"{text}{wrong}\n")
     catalog, order = read(text.replace("\n", ",\n").replace("b-v,", "b-v"), name="trailing.txt")
     assert_stars(catalog, order)

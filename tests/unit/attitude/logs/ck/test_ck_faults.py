@@ -45,7 +45,9 @@ def words(at, *values):
 
     def edit(raw):
         where = at if at >= 0 else len(segment(raw)) + DATA_WORD + at
-        raw[where * WORD_BYTES : (where + len(values)) * WORD_BYTES] = struct.pack(f"<{len(values)}d", *values)
+        raw[where * WORD_BYTES : (where + len(values)) * WORD_BYTES] = struct.pack(
+            f"<{len(values)}d", *values
+        )
 
     return edit
 
@@ -79,17 +81,29 @@ def cut(count):
         (bytes_at(8, struct.pack("<2i", 99, 9999)), "is another kind of DAF than a CK"),
         # a list that goes round for ever
         (words(RECORD_BYTES // WORD_BYTES, 2.0), "has more than 100000 segments"),
-        (words(RECORD_BYTES // WORD_BYTES, 1e15), "SPICE refuses it (Attempt to read descriptor record"),
+        (
+            words(RECORD_BYTES // WORD_BYTES, 1e15),
+            "SPICE refuses it (Attempt to read descriptor record",
+        ),
         (words(RECORD_BYTES // WORD_BYTES + 2, 0.0), "contains no segment"),
-        (words(RECORD_BYTES // WORD_BYTES + 2, 1e9), "segment 2 is of type 0; types 1 to 6 are read"),
+        (
+            words(RECORD_BYTES // WORD_BYTES + 2, 1e9),
+            "segment 2 is of type 0; types 1 to 6 are read",
+        ),
         (words(RECORD_BYTES // WORD_BYTES + 3, float("nan")), "segment 1 spans the ticks nan"),
-        (bytes_at(RECORD_BYTES + 5 * WORD_BYTES + 8, struct.pack("<i", 9)), "segment 1 is of type 9; types 1 to 6 are read"),
+        (
+            bytes_at(RECORD_BYTES + 5 * WORD_BYTES + 8, struct.pack("<i", 9)),
+            "segment 1 is of type 9; types 1 to 6 are read",
+        ),
         (words(-1, 1e9), "its counts do not fit"),
         (words(-1, float("nan")), "its counts do not fit"),
         (words(-2, 0.0), "SPICE refuses it (The requested segment"),
         (words(DATA_WORD + 7 * len(TIMES) + 3, 0.0), "its times do not increase"),
         (words(DATA_WORD + 7 * len(TIMES) + 3, float("inf")), "its times do not increase"),
-        (words(DATA_WORD + 7 * len(TIMES) + len(TIMES), 5.0), "its directory is not that of its times"),
+        (
+            words(DATA_WORD + 7 * len(TIMES) + len(TIMES), 5.0),
+            "its directory is not that of its times",
+        ),
     ],
 )
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, raw, edit, words_said):
@@ -98,11 +112,15 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, raw, edit, words_said):
     assert words_said in refusal(tmp_path / "a.bc")
 
 
-@pytest.mark.parametrize(("q", "norm"), [([0.0] * 4, "0"), ([2.0, 0.0, 0.0, 0.0], "2"), ([float("nan")] * 4, "nan")])
+@pytest.mark.parametrize(
+    ("q", "norm"), [([0.0] * 4, "0"), ([2.0, 0.0, 0.0, 0.0], "2"), ([float("nan")] * 4, "nan")]
+)
 def test_a_quaternion_that_is_none_is_refused_and_not_taken_for_an_attitude(tmp_path, raw, q, norm):
     words(DATA_WORD + 7, *q)(raw)
     (tmp_path / "a.bc").write_bytes(raw)
-    assert f"a.bc: segment 1: the norm of its quaternion 2 is {norm}; it must be 1" in refusal(tmp_path / "a.bc")
+    assert f"a.bc: segment 1: the norm of its quaternion 2 is {norm}; it must be 1" in refusal(
+        tmp_path / "a.bc"
+    )
 
 
 def test_a_file_on_which_spice_aborts_ends_a_process_of_its_own_and_is_one_line(tmp_path, raw):
@@ -125,15 +143,19 @@ def test_a_file_on_which_spice_aborts_ends_a_process_of_its_own_and_is_one_line(
 
 
 def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
-    assert "its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc" in refusal(
-        tmp_path / "whole.bc", kernels=["leap.tls"]
+    assert (
+        "its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc"
+        in refusal(tmp_path / "whole.bc", kernels=["leap.tls"])
     )
     with ck.new_ck(tmp_path / "a.bc") as handle:
         (tmp_path / "frames.tf").write_text(ck.frame_kernel())
         with spiceypy.KernelPool([str(tmp_path / "frames.tf")]):
-            ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(1)), TIMES, reference="PROBE_TABLE")
-    assert "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc" in refusal(
-        tmp_path / "a.bc"
+            ck.write_segment(
+                handle, 3, ck.Motion(np.random.default_rng(1)), TIMES, reference="PROBE_TABLE"
+            )
+    assert (
+        "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc"
+        in refusal(tmp_path / "a.bc")
     )
 
 
@@ -152,8 +174,14 @@ def test_a_meta_kernel_gives_its_kernels(tmp_path, raw, relative):
     ("text", "words_said"),
     [
         ("KPL/MK\n", "names no kernels"),
-        ("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '/dev/zero' )\n", "/dev/zero: cannot be read (it is a device)"),
-        ("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( 'missing.tls' )\n", "missing.tls: cannot be read"),
+        (
+            "KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '/dev/zero' )\n",
+            "/dev/zero: cannot be read (it is a device)",
+        ),
+        (
+            "KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( 'missing.tls' )\n",
+            "missing.tls: cannot be read",
+        ),
         ("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( 'all.tm' )\n", "names another meta-kernel"),
         ("DAFETF NAIF DAF ENCODED TRANSFER FILE\n", "is a transfer file; convert it by tobin"),
         ("KPL/LSK\n\\begindata\nDELTET/K = = 3\n", "SPICE refuses it"),
@@ -169,12 +197,17 @@ def test_a_kernel_that_is_none_is_refused(tmp_path, raw, monkeypatch, text, word
 
 def test_a_structure_that_is_not_there_is_refused_with_those_that_are(tmp_path, raw):
     for stated in ("-7", "NOBODY", "MARS"):
-        assert f"contains no structure {stated!r}; it has -82000: --body ID" in refusal(tmp_path / "whole.bc", body=stated)
+        assert f"contains no structure {stated!r}; it has -82000: --body ID" in refusal(
+            tmp_path / "whole.bc", body=stated
+        )
     with spiceypy.KernelPool([]):
         answer(tmp_path / "whole.bc", [tmp_path / "leap.tls", tmp_path / "clock.tsc"], "-82000")
 
 
 def test_without_the_library_one_line_says_what_to_install(tmp_path, raw, monkeypatch):
     monkeypatch.setitem(sys.modules, "spiceypy", None)
-    with pytest.raises(MachineError, match=r"whole\.bc: a SPICE CK; reading it needs spiceypy: pip install 'hilstar\[spice\]'"):
+    with pytest.raises(
+        MachineError,
+        match=r"whole\.bc: a SPICE CK; reading it needs spiceypy: pip install 'hilstar\[spice\]'",
+    ):
         open_log(tmp_path / "whole.bc", Stated())

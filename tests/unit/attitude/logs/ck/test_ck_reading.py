@@ -75,7 +75,9 @@ def test_instances_are_read_back_with_their_rates(folder, motion, kind, rates):
     assert seconds_of(found).tolist() == TIMES.tolist()
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
         assert angle_between_rad(q, motion.quaternion(second)) < READ_BACK_RAD
-        assert rate == pytest.approx(motion.rate(second) if rates else [np.nan] * 3, abs=RATE_RAD_S, nan_ok=True)
+        assert rate == pytest.approx(
+            motion.rate(second) if rates else [np.nan] * 3, abs=RATE_RAD_S, nan_ok=True
+        )
 
 
 def spice_at(path, second):
@@ -87,7 +89,10 @@ def spice_at(path, second):
 def write_kind(path, motion, kind, subtype, rates):
     with ck.new_ck(path) as handle:
         if kind == 2:
-            turns = [(t, t + 0.5, motion.turn(t), motion.reference_rate(t)) for t in np.arange(0.0, 6.0, 0.5)]
+            turns = [
+                (t, t + 0.5, motion.turn(t), motion.reference_rate(t))
+                for t in np.arange(0.0, 6.0, 0.5)
+            ]
             ck.write_type_2(handle, turns)
         elif kind == 6:
             ck.write_type_6(handle, motion, [TIMES[:13], TIMES[12:]], rates=rates, subtype=subtype)
@@ -96,8 +101,13 @@ def write_kind(path, motion, kind, subtype, rates):
             ck.write_segment(handle, kind, motion, times, rates=rates, subtype=subtype)
 
 
-@pytest.mark.parametrize(("kind", "subtype", "rates"), [(2, 0, True), (5, 0, True), (5, 1, False), (5, 2, True), (6, 0, True)])
-def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(folder, motion, kind, subtype, rates):
+@pytest.mark.parametrize(
+    ("kind", "subtype", "rates"),
+    [(2, 0, True), (5, 0, True), (5, 1, False), (5, 2, True), (6, 0, True)],
+)
+def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
+    folder, motion, kind, subtype, rates
+):
     path = folder / "a.bc"
     write_kind(path, motion, kind, subtype, rates)
     found, _ = read(path)
@@ -112,7 +122,9 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(folde
             shown = timeline.at(J2000_NS + round((ck.START_S + second) * NS_PER_S))
             assert angle_between_rad(shown.q_icrs_to_cam, from_matrix(matrix)) < BETWEEN_RAD
             if kind != 2:  # whose intervals do not join
-                assert shown.rate_cam_rad_s == pytest.approx(motion.rate(second), abs=DIFFERENCE_RAD_S)
+                assert shown.rate_cam_rad_s == pytest.approx(
+                    motion.rate(second), abs=DIFFERENCE_RAD_S
+                )
 
 
 # Frames
@@ -140,7 +152,10 @@ def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, referenc
     kernels = ("leap.tls", "clock.tsc", "frames.tf", "earth.tpc")
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, reference="J2000")
-    with ck.new_ck(folder / "b.bc") as handle, spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
+    with (
+        ck.new_ck(folder / "b.bc") as handle,
+        spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]),
+    ):
         ck.write_segment(handle, 3, motion, TIMES, reference=reference)
     found, _ = read(folder / "b.bc", kernels=kernels)
     with spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
@@ -219,7 +234,9 @@ def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(folder, motion)
         ck.write_segment(handle, 3, motion, TIMES, rates=False)
         ck.write_segment(handle, 3, other, np.array([1.0, 1.5, 3.0, 3.5]), starts=[1.0, 3.0])
     found, _ = read(folder / "a.bc")
-    between = [q for second, q in zip(seconds_of(found), found.q, strict=True) if 1.6 < second < 2.9]
+    between = [
+        q for second, q in zip(seconds_of(found), found.q, strict=True) if 1.6 < second < 2.9
+    ]
     assert len(between) == 5  # the earlier segment's own times: 1.75 to 2.75 s
     assert angle_between_rad(between[2], motion.quaternion(2.25)) < READ_BACK_RAD
     assert found.gaps_s == []
@@ -238,7 +255,9 @@ def test_a_segment_with_a_directory_is_read(folder, motion, kind, count):
 
 def test_functions_of_time_with_a_directory_are_read(folder, motion):
     starts_s = [0.5 * k for k in range(101)]
-    steps = [(start_s, start_s + 0.4, motion.turn(start_s), [0.0, 0.0, 0.1]) for start_s in starts_s]
+    steps = [
+        (start_s, start_s + 0.4, motion.turn(start_s), [0.0, 0.0, 0.1]) for start_s in starts_s
+    ]
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_type_2(handle, steps)
     found, _ = read(folder / "a.bc")
@@ -278,7 +297,9 @@ def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(folder, motion
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES)
         ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(9)), TIMES, body=-82001)
-    with pytest.raises(InputError, match=r"several structures, -82001, -82000 \(PROBE_BUS\); choose one: --body ID"):
+    with pytest.raises(
+        InputError, match=r"several structures, -82001, -82000 \(PROBE_BUS\); choose one: --body ID"
+    ):
         open_log(folder / "a.bc")
     mounting = Mounting((0.6, 0.0, 0.8, 0.0))
     log = open_log(folder / "a.bc", Stated(mounting, body="PROBE_BUS"))
@@ -286,14 +307,21 @@ def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(folder, motion
     for second, sample in zip(TIMES, log.samples, strict=True):
         camera = (to_cam * motion.turn(second).inv()).as_matrix()
         assert angle_between_rad(sample.q_icrs_to_cam, from_matrix(camera)) < READ_BACK_RAD
-        assert sample.rate_cam_rad_s == pytest.approx(to_cam.apply(motion.rate(second)), abs=RATE_RAD_S)
-    assert ("kernels", "kernels from beside the CK: leap.tls, clock.tsc, frames.tf; --kernel names others") in log.told
+        assert sample.rate_cam_rad_s == pytest.approx(
+            to_cam.apply(motion.rate(second)), abs=RATE_RAD_S
+        )
+    assert (
+        "kernels",
+        "kernels from beside the CK: leap.tls, clock.tsc, frames.tf; --kernel names others",
+    ) in log.told
     lines = log.conventions.lines(mounting)
     assert "structure -82000 (PROBE_BUS)" in lines[0]
     assert log.conventions.of_body
 
 
-def test_times_are_tdb_whatever_the_clock_counts_and_one_log_leaves_nothing_to_the_next(folder, motion):
+def test_times_are_tdb_whatever_the_clock_counts_and_one_log_leaves_nothing_to_the_next(
+    folder, motion
+):
     for name, system in (("tdb", 1), ("tt", 2)):
         place = folder / name
         place.mkdir()

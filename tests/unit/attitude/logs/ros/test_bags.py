@@ -34,21 +34,37 @@ KINDS = [
 ]
 WRITERS = {
     "ROS 1": lambda path, sent: write_bag1(path / "a.bag", sent("noetic")),
-    "ROS 1, bz2, chunks": lambda path, sent: write_bag1(path / "a.bag", sent("noetic"), "bz2", chunk=1000),
-    "ROS 1, lz4, chunks": lambda path, sent: write_bag1(path / "a.bag", sent("noetic"), "lz4", chunk=1000),
+    "ROS 1, bz2, chunks": lambda path, sent: write_bag1(
+        path / "a.bag", sent("noetic"), "bz2", chunk=1000
+    ),
+    "ROS 1, lz4, chunks": lambda path, sent: write_bag1(
+        path / "a.bag", sent("noetic"), "lz4", chunk=1000
+    ),
     "db3 directory": lambda path, sent: write_bag2(path / "a", sent("humble"), "humble"),
     "db3 file": lambda path, sent: write_bag2(path / "a", sent("jazzy")) / "a.db3",
-    "db3, packed file": lambda path, sent: write_bag2(path / "a", sent("jazzy"), compression="file"),
-    "db3, packed messages": lambda path, sent: write_bag2(path / "a", sent("jazzy"), compression="message"),
+    "db3, packed file": lambda path, sent: write_bag2(
+        path / "a", sent("jazzy"), compression="file"
+    ),
+    "db3, packed messages": lambda path, sent: write_bag2(
+        path / "a", sent("jazzy"), compression="message"
+    ),
     "MCAP directory": lambda path, sent: write_bag2(path / "a", sent("jazzy"), mcap=True),
     "MCAP, packed chunks": lambda path, sent: (
         write_bag2(path / "a", sent("jazzy"), mcap=True, compression="storage") / "a.mcap"
     ),
-    "MCAP, packed messages": lambda path, sent: write_bag2(path / "a", sent("jazzy"), mcap=True, compression="message"),
+    "MCAP, packed messages": lambda path, sent: write_bag2(
+        path / "a", sent("jazzy"), mcap=True, compression="message"
+    ),
     "other MCAP, lz4": lambda path, sent: write_mcap(path / "a.mcap", sent("humble")),
-    "other MCAP, zstd": lambda path, sent: write_mcap(path / "a.mcap", sent("jazzy"), compression=CompressionType.ZSTD),
-    "ROS 1 of another name": lambda path, sent: write_bag1(path / "a.bag", sent("noetic")).rename(path / "flight.log"),
-    "db3 of another name": lambda path, sent: (write_bag2(path / "a", sent("jazzy")) / "a.db3").rename(path / "flight.log"),
+    "other MCAP, zstd": lambda path, sent: write_mcap(
+        path / "a.mcap", sent("jazzy"), compression=CompressionType.ZSTD
+    ),
+    "ROS 1 of another name": lambda path, sent: write_bag1(path / "a.bag", sent("noetic")).rename(
+        path / "flight.log"
+    ),
+    "db3 of another name": lambda path, sent: (
+        write_bag2(path / "a", sent("jazzy")) / "a.db3"
+    ).rename(path / "flight.log"),
 }
 
 
@@ -73,7 +89,9 @@ def assert_is_truth(log, truth):
     star = np.array([0.3, -0.4, 0.5])
     # the message turns body into reference
     assert q.apply(star) == pytest.approx(truth.inv().apply(star), abs=ROUNDING)
-    assert [sample.t_ns for sample in log.samples] == [START_NS + i * STEP_NS for i in range(len(truth))]
+    assert [sample.t_ns for sample in log.samples] == [
+        START_NS + i * STEP_NS for i in range(len(truth))
+    ]
 
 
 @pytest.mark.parametrize("writer", WRITERS)
@@ -121,7 +139,10 @@ def test_db3_of_old_releases_has_no_definitions(tmp_path, truth):
     """Before Iron the tables held none; before Foxy `topics` had no quality of service."""
     import sqlite3
 
-    bag = write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("humble"), "humble") / "a.db3"
+    bag = (
+        write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("humble"), "humble")
+        / "a.db3"
+    )
     with sqlite3.connect(bag) as database:
         database.execute("DROP TABLE message_definitions")
         database.execute("DROP TABLE schema")
@@ -145,9 +166,18 @@ def without_metadata(path):
 
 
 KILLED = {
-    "ROS 1": (lambda path, sent: half(write_bag1(path / "a.bag", sent("noetic"), chunk=1000)), "rosbag reindex half.bag"),
-    "MCAP": (lambda path, sent: half(write_mcap(path / "a.mcap", sent("humble"))), "ros2 bag reindex DIRECTORY"),
-    "directory": (lambda path, sent: without_metadata(write_bag2(path / "a", sent("jazzy"))), "ros2 bag reindex a"),
+    "ROS 1": (
+        lambda path, sent: half(write_bag1(path / "a.bag", sent("noetic"), chunk=1000)),
+        "rosbag reindex half.bag",
+    ),
+    "MCAP": (
+        lambda path, sent: half(write_mcap(path / "a.mcap", sent("humble"))),
+        "ros2 bag reindex DIRECTORY",
+    ),
+    "directory": (
+        lambda path, sent: without_metadata(write_bag2(path / "a", sent("jazzy"))),
+        "ros2 bag reindex a",
+    ),
 }
 
 
@@ -162,10 +192,15 @@ def test_a_bag_without_an_index_is_refused_with_the_command_that_makes_one(tmp_p
 def test_a_db3_whose_recorder_was_killed_names_the_file_that_has_the_rest(tmp_path, truth):
     import sqlite3
 
-    bag = write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("humble"), "humble") / "a.db3"
+    bag = (
+        write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("humble"), "humble")
+        / "a.db3"
+    )
     with sqlite3.connect(bag) as database:
         database.execute("PRAGMA journal_mode = WAL")
-        database.execute("INSERT INTO messages SELECT id + 1000, topic_id, timestamp, data FROM messages")
+        database.execute(
+            "INSERT INTO messages SELECT id + 1000, topic_id, timestamp, data FROM messages"
+        )
         database.commit()
         for name in ("a.db3", "a.db3-wal"):
             shutil.copy(bag.with_name(name), tmp_path / name)
@@ -175,21 +210,29 @@ def test_a_db3_whose_recorder_was_killed_names_the_file_that_has_the_rest(tmp_pa
 
 
 @pytest.mark.parametrize(("release", "profile"), [("humble", ""), ("noetic", "ros1")])
-def test_an_mcap_whose_profile_is_not_ros_2s_is_refused_with_the_way_to_one(tmp_path, truth, release, profile):
+def test_an_mcap_whose_profile_is_not_ros_2s_is_refused_with_the_way_to_one(
+    tmp_path, truth, release, profile
+):
     sent = messages(truth, ros_bags.POSE_STAMPED)(release)
     path = write_mcap(tmp_path / "a.mcap", sent, release, profile=profile)
-    with pytest.raises(InputError, match="MCAP of another kind than ROS 2's; write it again with ros2 bag convert"):
+    with pytest.raises(
+        InputError, match="MCAP of another kind than ROS 2's; write it again with ros2 bag convert"
+    ):
         open_log(path)
 
 
 def test_messages_that_are_packed_by_themselves_need_their_directory(tmp_path, truth):
-    bag = write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("jazzy"), compression="message")
+    bag = write_bag2(
+        tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("jazzy"), compression="message"
+    )
     with pytest.raises(InputError, match="its messages are packed; give the bag's directory"):
         open_log(bag / "a.db3")
 
 
 def test_hilstars_own_mcap_is_not_taken_for_a_bag(tmp_path, truth):
-    log = open_log(write_mcap(tmp_path / "ros.mcap", messages(truth, ros_bags.POSE_STAMPED)("humble")))
+    log = open_log(
+        write_mcap(tmp_path / "ros.mcap", messages(truth, ros_bags.POSE_STAMPED)("humble"))
+    )
     write_log(tmp_path / "own.mcap", log.samples)
     own = open_log(tmp_path / "own.mcap")
     assert own.conventions.source == "MCAP"

@@ -22,7 +22,9 @@ def poses(release, count=5):
     make = Make(release)
     for i, turn in enumerate(Rotation.random(count, rng=np.random.default_rng(3))):
         t_ns = START_NS + i * 10**8
-        message = make.of(ros_bags.POSE_STAMPED, t_ns, "icrs", "", turn.as_quat(scalar_first=True), ())
+        message = make.of(
+            ros_bags.POSE_STAMPED, t_ns, "icrs", "", turn.as_quat(scalar_first=True), ()
+        )
         yield "/pose", ros_bags.POSE_STAMPED, t_ns, message
 
 
@@ -30,7 +32,9 @@ WHOLE = {
     "ROS 1": lambda path: write_bag1(path / "a.bag", poses("noetic")),
     "ROS 1, bz2": lambda path: write_bag1(path / "a.bag", poses("noetic"), "bz2"),
     "db3": lambda path: write_bag2(path / "a", poses("jazzy")) / "a.db3",
-    "MCAP": lambda path: write_bag2(path / "a", poses("jazzy"), mcap=True, compression="storage") / "a.mcap",
+    "MCAP": lambda path: (
+        write_bag2(path / "a", poses("jazzy"), mcap=True, compression="storage") / "a.mcap"
+    ),
     "MCAP of another program": lambda path: write_mcap(path / "a.mcap", poses("humble")),
 }
 
@@ -56,7 +60,10 @@ def test_a_damaged_bag_is_refused_in_one_line_or_read(tmp_path, kind):
         except InputError as refusal:
             assert "\n" not in str(refusal)
         else:
-            assert len(sent.intersection(sample.t_ns for sample in log.samples)) >= len(log.samples) - 7
+            assert (
+                len(sent.intersection(sample.t_ns for sample in log.samples))
+                >= len(log.samples) - 7
+            )
 
 
 @pytest.mark.parametrize(
@@ -82,7 +89,9 @@ def test_a_message_that_is_cut_or_counts_in_billions_is_refused_with_its_number(
         with sqlite3.connect(bag) as database:
             database.execute("UPDATE messages SET data = ? WHERE id = 3", (data,))
         database.close()
-        with pytest.raises(InputError, match=r"message 3 of /pose is no geometry_msgs/msg/PoseStamped"):
+        with pytest.raises(
+            InputError, match=r"message 3 of /pose is no geometry_msgs/msg/PoseStamped"
+        ):
             open_log(bag)
 
 
@@ -108,7 +117,9 @@ def test_a_topic_without_messages_is_refused(tmp_path):
     with sqlite3.connect(bag) as database:
         database.execute("DELETE FROM messages")
     database.close()
-    with pytest.raises(InputError, match="has no message of /pose; record it, or choose another with --topic"):
+    with pytest.raises(
+        InputError, match="has no message of /pose; record it, or choose another with --topic"
+    ):
         open_log(bag)
 
 
@@ -121,5 +132,7 @@ def test_without_rosbags_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     for kind in ("ROS 1", "db3", "MCAP"):
         (tmp_path / kind).mkdir()
-        with pytest.raises(MachineError, match=r"a ROS bag; reading it needs rosbags: pip install 'hilstar\[ros\]'"):
+        with pytest.raises(
+            MachineError, match=r"a ROS bag; reading it needs rosbags: pip install 'hilstar\[ros\]'"
+        ):
             open_log(WHOLE[kind](tmp_path / kind))

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.logs.earth import earth_rate_ned_rad_s, q_icrs_to_enu, q_icrs_to_ned, utc_ns_of
+from hilstar.attitude.logs.earth import (
+    earth_rate_ned_rad_s,
+    q_icrs_to_enu,
+    q_icrs_to_ned,
+    utc_ns_of,
+)
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
@@ -43,7 +48,12 @@ def attitudes(log):
 def poses(frame, turns, topic="/pose", step_ns=10**8, start_ns=START_NS):
     for i, turn in enumerate(turns):
         t_ns = start_ns + i * step_ns
-        yield topic, ros_bags.POSE_STAMPED, t_ns, MAKE.of(ros_bags.POSE_STAMPED, t_ns, frame, "", first(turn), ())
+        yield (
+            topic,
+            ros_bags.POSE_STAMPED,
+            t_ns,
+            MAKE.of(ros_bags.POSE_STAMPED, t_ns, frame, "", first(turn), ()),
+        )
 
 
 @pytest.fixture
@@ -78,11 +88,15 @@ def test_any_other_frame_is_refused_until_it_is_stated(bag, frame):
 
 def test_what_is_stated_against_the_frames_own_name_is_refused(bag):
     path = bag(poses("icrs", rotations(3)))
-    with pytest.raises(InputError, match="'icrs', which is not east, north, up; leave out --reference"):
+    with pytest.raises(
+        InputError, match="'icrs', which is not east, north, up; leave out --reference"
+    ):
         open_log(path, Stated(reference="enu", place=PLACE))
     with pytest.raises(InputError, match="refer to the frame 'icrs', not to 'map'"):
         open_log(path, Stated(reference="map=icrs"))
-    with pytest.raises(InputError, match="the axes of map are icrs, enu or ned; write --reference map=icrs"):
+    with pytest.raises(
+        InputError, match="the axes of map are icrs, enu or ned; write --reference map=icrs"
+    ):
         open_log(path, Stated(reference="map=sideways"))
 
 
@@ -99,7 +113,9 @@ def test_a_level_frame_turns_with_the_earth(bag, stated, turn):
 
 def test_a_level_frame_needs_a_place_and_dates(bag):
     path = bag(poses("map", rotations(3), start_ns=0))
-    with pytest.raises(InputError, match="refer to east, north, up; give the place with --place LAT,LON,HEIGHT"):
+    with pytest.raises(
+        InputError, match="refer to east, north, up; give the place with --place LAT,LON,HEIGHT"
+    ):
         open_log(path, Stated(reference="enu"))
     with pytest.raises(InputError, match="begin at 0 s, no date; give --epoch-utc TIME"):
         open_log(path, Stated(reference="enu", place=PLACE))
@@ -108,19 +124,29 @@ def test_a_level_frame_needs_a_place_and_dates(bag):
 def test_a_simulated_clock_gets_its_date_from_the_user(bag):
     turned = rotations(3)
     simulated = open_log(
-        bag(poses("map", turned, start_ns=5 * 10**9)), Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35")
+        bag(poses("map", turned, start_ns=5 * 10**9)),
+        Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35"),
     )
     dated = open_log(bag(poses("map", turned)), Stated(reference="enu", place=PLACE))
     assert utc_ns_of("2025-11-22T08:26:35", "") == START_NS - 5 * 10**9
-    assert (attitudes(simulated) * attitudes(dated).inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert (attitudes(simulated) * attitudes(dated).inv()).magnitude() == pytest.approx(
+        0, abs=ROUNDING
+    )
     assert simulated.samples[0].t_ns == 5 * 10**9
     with pytest.raises(InputError, match=r"dates already .* leave out --epoch-utc"):
-        open_log(bag(poses("map", turned)), Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35"))
+        open_log(
+            bag(poses("map", turned)),
+            Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35"),
+        )
 
 
 def test_a_frame_that_changes_in_the_bag_is_refused(bag):
-    path = bag([*poses("icrs", rotations(3)), *poses("map", rotations(2), start_ns=START_NS + 10**9)])
-    with pytest.raises(InputError, match="message 4 of /pose: refers to the frame 'map', the first to 'icrs'"):
+    path = bag(
+        [*poses("icrs", rotations(3)), *poses("map", rotations(2), start_ns=START_NS + 10**9)]
+    )
+    with pytest.raises(
+        InputError, match="message 4 of /pose: refers to the frame 'map', the first to 'icrs'"
+    ):
         open_log(path)
 
 
@@ -133,7 +159,9 @@ def test_the_self_check_of_a_bag_points_where_it_says(bag, reference):
     x, y, z, w = map(float, re.search(r"x y z w = \((.*?)\)", line)[1].split(","))
     shown = open_log(bag(poses("map", [Rotation.from_quat([x, y, z, w])])), stated)
     digits_deg = np.degrees(2e-7)  # the line has seven digits
-    assert to_radec_roll_deg(shown.samples[0].q_icrs_to_cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=digits_deg)
+    assert to_radec_roll_deg(shown.samples[0].q_icrs_to_cam)[:2] == pytest.approx(
+        CHECK_RADEC_DEG, abs=digits_deg
+    )
 
 
 # Rates
@@ -147,7 +175,9 @@ def spinning(kind, frame, rate, earths, count=4):
     begin = rotations(1)[0]
     for i, t_ns in enumerate(times.tolist()):
         body_from_icrs = Rotation.from_rotvec(-np.asarray(rate) * 0.01 * i) * begin
-        level = Rotation.from_quat(earths(np.array([t_ns]), PLACE[0], PLACE[1])[0], scalar_first=True)
+        level = Rotation.from_quat(
+            earths(np.array([t_ns]), PLACE[0], PLACE[1])[0], scalar_first=True
+        )
         frame_from_body = level * body_from_icrs.inv()
         told = rate
         if kind == ros_bags.ODOMETRY:  # its twist is with respect to the frame that it refers to
@@ -174,52 +204,87 @@ def test_a_mounting_turns_attitude_and_rate_of_the_body(bag):
     plain = open_log(bag(sent), Stated(reference="icrs"))
     turned = open_log(bag(sent), Stated(mounted, reference="icrs"))
     body_to_cam = Rotation.from_quat(mounted.q_body_to_cam, scalar_first=True)
-    assert (attitudes(turned) * attitudes(plain).inv() * body_to_cam.inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
-    assert turned.samples[0].rate_cam_rad_s == pytest.approx(body_to_cam.apply([0.2, -0.3, 0.1]), abs=ROUNDING)
+    assert (
+        attitudes(turned) * attitudes(plain).inv() * body_to_cam.inv()
+    ).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert turned.samples[0].rate_cam_rad_s == pytest.approx(
+        body_to_cam.apply([0.2, -0.3, 0.1]), abs=ROUNDING
+    )
 
 
 def test_an_imu_without_orientation_is_refused_and_without_rate_is_not(bag):
     at = [START_NS, START_NS + 10**7]
-    blind = [("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (0, 0, 0), covariance0=-1)) for t in at]
-    with pytest.raises(InputError, match=r"message 1 of /imu: orientation_covariance\[0\] is -1: the IMU gives no orientation"):
+    blind = [
+        ("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (0, 0, 0), covariance0=-1))
+        for t in at
+    ]
+    with pytest.raises(
+        InputError,
+        match=r"message 1 of /imu: orientation_covariance\[0\] is -1: the IMU gives no orientation",
+    ):
         open_log(bag(blind), Stated(reference="icrs"))
-    still = [("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (9, 9, 9), rate0=-1)) for t in at]
-    assert [sample.rate_cam_rad_s for sample in open_log(bag(still), Stated(reference="icrs")).samples] == [None, None]
+    still = [
+        ("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (9, 9, 9), rate0=-1)) for t in at
+    ]
+    assert [
+        sample.rate_cam_rad_s for sample in open_log(bag(still), Stated(reference="icrs")).samples
+    ] == [None, None]
 
 
 def test_an_imus_own_frame_is_its_body_and_never_its_reference(bag):
     sent = [("/imu", ros_bags.IMU, START_NS, MAKE.imu(START_NS, "icrs", (1, 0, 0, 0), (0, 0, 0)))]
-    with pytest.raises(InputError, match=r"do not say which frame their orientation refers to .*REP 145"):
+    with pytest.raises(
+        InputError, match=r"do not say which frame their orientation refers to .*REP 145"
+    ):
         open_log(bag(sent))
 
 
 def test_an_optical_frame_with_a_mounting_is_said(bag):
-    sent = [("/imu", ros_bags.IMU, START_NS, MAKE.imu(START_NS, "star_camera_optical_frame", (1, 0, 0, 0), (0, 0, 0)))]
+    sent = [
+        (
+            "/imu",
+            ros_bags.IMU,
+            START_NS,
+            MAKE.imu(START_NS, "star_camera_optical_frame", (1, 0, 0, 0), (0, 0, 0)),
+        )
+    ]
     turned = Stated(Mounting((0.5, 0.5, 0.5, 0.5)), reference="icrs")
-    assert any("has the axes of a camera by its name" in line for _, line in open_log(bag(sent), turned).told)
-    assert not any("axes of a camera" in line for _, line in open_log(bag(sent), Stated(reference="icrs")).told)
+    assert any(
+        "has the axes of a camera by its name" in line
+        for _, line in open_log(bag(sent), turned).told
+    )
+    assert not any(
+        "axes of a camera" in line for _, line in open_log(bag(sent), Stated(reference="icrs")).told
+    )
 
 
 # Topics and bodies
 
 
 def test_of_several_topics_one_is_chosen_by_name(bag):
-    path = bag([*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")])
+    path = bag(
+        [*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")]
+    )
     several = r"several topics with attitudes: /a/pose \(geometry_msgs/PoseStamped\), /b/pose .*; choose one with --topic NAME"
     with pytest.raises(InputError, match=several):
         open_log(path)
     assert len(open_log(path, Stated(topic="/b/pose")).samples) == 3
     assert len(open_log(path, Stated(topic="a/pose")).samples) == 2
-    with pytest.raises(InputError, match=r"has no topic /c; it has /a/pose \(geometry_msgs/PoseStamped\), /b/pose"):
+    with pytest.raises(
+        InputError, match=r"has no topic /c; it has /a/pose \(geometry_msgs/PoseStamped\), /b/pose"
+    ):
         open_log(path, Stated(topic="/c"))
 
 
 def test_a_topic_of_a_type_that_says_no_attitude_is_refused(bag):
     point = ("/p", "geometry_msgs/msg/Vector3", START_NS, MAKE.vector((1, 2, 3)))
-    with pytest.raises(InputError, match=r"has no topic with attitudes; it has /p \(geometry_msgs/Vector3\)"):
+    with pytest.raises(
+        InputError, match=r"has no topic with attitudes; it has /p \(geometry_msgs/Vector3\)"
+    ):
         open_log(bag([point]))
     with pytest.raises(
-        InputError, match=r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry, Pose"
+        InputError,
+        match=r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry, Pose",
     ):
         open_log(bag([point, *poses("icrs", rotations(2))]), Stated(topic="/p"))
 
@@ -227,11 +292,18 @@ def test_a_topic_of_a_type_that_says_no_attitude_is_refused(bag):
 def test_of_several_bodies_on_one_topic_one_is_chosen(bag):
     kind = ros_bags.TRANSFORM_STAMPED
     sent = [
-        ("/vicon", kind, START_NS + i, MAKE.transform_stamped(START_NS + 10**7 * i, "icrs", child, first(turn)))
+        (
+            "/vicon",
+            kind,
+            START_NS + i,
+            MAKE.transform_stamped(START_NS + 10**7 * i, "icrs", child, first(turn)),
+        )
         for i, turn in enumerate(rotations(4))
         for child in ("one", "two")
     ]
-    with pytest.raises(InputError, match="is of the frame 'two', the first of 'one'; choose one with --body"):
+    with pytest.raises(
+        InputError, match="is of the frame 'two', the first of 'one'; choose one with --body"
+    ):
         open_log(bag(sent))
     assert len(open_log(bag(sent), Stated(body="two")).samples) == 4
     with pytest.raises(InputError, match="has no attitude of three"):
@@ -250,24 +322,32 @@ def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path):
         schema = writer.register_schema("geometry_msgs/msg/QuaternionStamped", "ros2msg", text)
         writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
         writer.finish()
-    with pytest.raises(InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"):
+    with pytest.raises(
+        InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"
+    ):
         open_log(tmp_path / "a.mcap")
 
 
 def test_a_type_whose_inner_type_has_other_fields_is_refused(tmp_path):
     from mcap.writer import Writer
 
-    inner = "=" * 80 + "\nMSG: geometry_msgs/Quaternion\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    inner = (
+        "=" * 80 + "\nMSG: geometry_msgs/Quaternion\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    )
     text = f"std_msgs/Header header\ngeometry_msgs/Quaternion quaternion\n{inner}" + "=" * 80
     text += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80
     text += "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2")
-        schema = writer.register_schema("geometry_msgs/msg/QuaternionStamped", "ros2msg", text.encode())
+        schema = writer.register_schema(
+            "geometry_msgs/msg/QuaternionStamped", "ros2msg", text.encode()
+        )
         writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
         writer.finish()
-    with pytest.raises(InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"):
+    with pytest.raises(
+        InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"
+    ):
         open_log(tmp_path / "a.mcap")
 
 
@@ -278,7 +358,10 @@ def recorded_in_turn(sent):
     """Messages whose recorder's clock is right, whatever their stamps say: rosbags gives them in
     its order.
     """
-    return [(topic, kind, START_NS + k * 10**8, message) for k, (topic, kind, _, message) in enumerate(sent)]
+    return [
+        (topic, kind, START_NS + k * 10**8, message)
+        for k, (topic, kind, _, message) in enumerate(sent)
+    ]
 
 
 def test_messages_out_of_order_and_doubled_are_put_right_and_said(bag):
@@ -293,23 +376,40 @@ def test_messages_out_of_order_and_doubled_are_put_right_and_said(bag):
 
 def test_two_attitudes_of_one_time_are_refused(bag):
     both = [*poses("icrs", rotations(3)), *poses("icrs", rotations(3, seed=8))]
-    with pytest.raises(InputError, match=r"time does not increase .*; the bag has two attitudes of one time"):
+    with pytest.raises(
+        InputError, match=r"time does not increase .*; the bag has two attitudes of one time"
+    ):
         open_log(bag(both))
 
 
 def test_a_clock_that_was_set_back_is_refused(bag):
-    again = [*poses("icrs", rotations(30)), *poses("icrs", rotations(3, seed=8), start_ns=START_NS + 1)]
+    again = [
+        *poses("icrs", rotations(30)),
+        *poses("icrs", rotations(3, seed=8), start_ns=START_NS + 1),
+    ]
     with pytest.raises(InputError, match=r"time does not increase .* or its clock was set back"):
         open_log(bag(recorded_in_turn(again)))
 
 
 def test_messages_without_a_stamp_take_the_recorders_clock_and_say_so(bag):
-    sent = [("/p", ros_bags.POSE_STAMPED, t, MAKE.of(ros_bags.POSE_STAMPED, 0, "icrs", "", (1, 0, 0, 0), ())) for t in (5, 9)]
+    sent = [
+        (
+            "/p",
+            ros_bags.POSE_STAMPED,
+            t,
+            MAKE.of(ros_bags.POSE_STAMPED, 0, "icrs", "", (1, 0, 0, 0), ()),
+        )
+        for t in (5, 9)
+    ]
     log = open_log(bag(sent))
     assert [sample.t_ns for sample in log.samples] == [5, 9]
-    assert "have no time of their own; when they were recorded is taken" in dict(log.told)["log-stamp"]
+    assert (
+        "have no time of their own; when they were recorded is taken" in dict(log.told)["log-stamp"]
+    )
     mixed = [*sent, *poses("icrs", rotations(2), "/p")]
-    with pytest.raises(InputError, match=r"message 3 of /p: some messages have a stamp and some have none"):
+    with pytest.raises(
+        InputError, match=r"message 3 of /p: some messages have a stamp and some have none"
+    ):
         open_log(bag(mixed))
 
 
@@ -326,10 +426,19 @@ def test_a_simulated_clock_may_begin_at_zero(bag):
 
 @pytest.mark.parametrize(
     ("q", "why"),
-    [((0, 0, 0, 0), "norm is 0;"), ((1, 1, 0, 0), "norm is 1.41421"), ((np.nan, 0, 0, 1), "not finite")],
+    [
+        ((0, 0, 0, 0), "norm is 0;"),
+        ((1, 1, 0, 0), "norm is 1.41421"),
+        ((np.nan, 0, 0, 1), "not finite"),
+    ],
 )
 def test_a_quaternion_that_is_none_is_refused_with_its_message(bag, q, why):
     stamp = START_NS + 10**9
-    bad = ("/pose", ros_bags.POSE_STAMPED, stamp, MAKE.of(ros_bags.POSE_STAMPED, stamp, "icrs", "", q, ()))
+    bad = (
+        "/pose",
+        ros_bags.POSE_STAMPED,
+        stamp,
+        MAKE.of(ros_bags.POSE_STAMPED, stamp, "icrs", "", q, ()),
+    )
     with pytest.raises(InputError, match=f"message 4 of /pose: .*{why}"):
         open_log(bag([*poses("icrs", rotations(3)), bad]))

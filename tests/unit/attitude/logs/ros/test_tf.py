@@ -38,10 +38,18 @@ def tree(dynamic, fixed=(), release="jazzy"):
     """tf messages: (parent, child, rotation for each time), and fixed ones on the static topic."""
     make = Make(release)
     for parent, child, turn in fixed:
-        yield "/tf_static", ros_bags.TF, START_NS, make.tf(make.transform_stamped(START_NS, parent, child, first(turn)))
+        yield (
+            "/tf_static",
+            ros_bags.TF,
+            START_NS,
+            make.tf(make.transform_stamped(START_NS, parent, child, first(turn))),
+        )
     for i in range(len(dynamic[0][2])):
         t_ns = START_NS + 10**8 * i
-        moved = [make.transform_stamped(t_ns, parent, child, first(turns[i])) for parent, child, turns in dynamic]
+        moved = [
+            make.transform_stamped(t_ns, parent, child, first(turns[i]))
+            for parent, child, turns in dynamic
+        ]
         yield "/tf", ros_bags.TF, t_ns, make.tf(*moved)
 
 
@@ -54,7 +62,11 @@ def test_tf_gives_a_chain_through_parts_that_do_not_move(tmp_path, write):
         [("icrs", "/stand", above), ("base", "cam", below)],
         release,
     )
-    path = write_bag1(tmp_path / "a.bag", sent) if write == "ROS 1" else write_bag2(tmp_path / "a", sent)
+    path = (
+        write_bag1(tmp_path / "a.bag", sent)
+        if write == "ROS 1"
+        else write_bag2(tmp_path / "a", sent)
+    )
     log = open_log(path, Stated(body="cam"))
     assert (attitudes(log) * above * moving * below).magnitude() == pytest.approx(0, abs=ROUNDING)
     assert "turns components of 'cam' into those of 'icrs'" in log.conventions.turns
@@ -71,7 +83,10 @@ def test_where_one_transform_moves_the_body_need_not_be_named(bag):
 def test_where_several_transforms_move_they_are_interpolated_as_tf2_does(bag):
     slow, fast = Rotation.from_rotvec([[0.1 * k, 0.02 * k**2, 0] for k in range(4)]), rotations(12)
     sent = [
-        *(("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "map", "odom", first(turn)))) for t, turn in at(slow, 300)),
+        *(
+            ("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "map", "odom", first(turn))))
+            for t, turn in at(slow, 300)
+        ),
         *(
             ("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "odom", "base", first(turn))))
             for t, turn in at(fast, 100)
@@ -102,24 +117,40 @@ def test_the_first_tfs_type_is_read(tmp_path):
         topic = writer.add_connection("/tf", kind, typestore=types)
         for t_ns, turn in at(rotations(3), 100):
             message = make.tf(make.transform_stamped(t_ns, "/icrs", "/cam", first(turn)))
-            writer.write(topic, t_ns, types.serialize_ros1(types.types[kind](transforms=message.transforms), kind))
-    assert (attitudes(open_log(tmp_path / "a.bag")) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
+            writer.write(
+                topic,
+                t_ns,
+                types.serialize_ros1(types.types[kind](transforms=message.transforms), kind),
+            )
+    assert (attitudes(open_log(tmp_path / "a.bag")) * rotations(3)).magnitude() == pytest.approx(
+        0, abs=ROUNDING
+    )
 
 
 def test_a_transform_of_a_chain_that_is_no_rotation_is_refused(bag):
-    bad = ("/tf_static", ros_bags.TF, START_NS, MAKE.tf(MAKE.transform_stamped(START_NS, "base", "cam", (2, 0, 0, 0))))
-    with pytest.raises(InputError, match="the transform base -> cam has a quaternion whose norm is off by 1"):
+    bad = (
+        "/tf_static",
+        ros_bags.TF,
+        START_NS,
+        MAKE.tf(MAKE.transform_stamped(START_NS, "base", "cam", (2, 0, 0, 0))),
+    )
+    with pytest.raises(
+        InputError, match="the transform base -> cam has a quaternion whose norm is off by 1"
+    ):
         open_log(bag([bad, *tree([("icrs", "base", rotations(3))])]), Stated(body="cam"))
 
 
 def test_what_tf_leaves_open_is_refused_by_name(bag):
     two = bag(tree([("map", "odom", rotations(3)), ("odom", "base", rotations(3, seed=7))]))
     with pytest.raises(
-        InputError, match="several transforms of tf could be meant: map -> odom, odom -> base; choose with --body"
+        InputError,
+        match="several transforms of tf could be meant: map -> odom, odom -> base; choose with --body",
     ):
         open_log(two, Stated(reference="icrs"))
     assert len(open_log(two, Stated(reference="odom=icrs", body="base")).samples) == 3
-    with pytest.raises(InputError, match="tf has no transform of 'nose'; it has map -> odom, odom -> base"):
+    with pytest.raises(
+        InputError, match="tf has no transform of 'nose'; it has map -> odom, odom -> base"
+    ):
         open_log(two, Stated(reference="icrs", body="nose"))
     with pytest.raises(InputError, match="tf has no transform from 'base' up to 'moon'"):
         open_log(two, Stated(reference="moon=icrs", body="base"))

@@ -36,7 +36,9 @@ NUTATION_RAD_S = 3e-7
 PERIOD_S = 0.1
 
 
-def attitudes(stream: bytes, spacecraft: int = 0, mounting: Mounting | None = None) -> list[AttitudeSample | Refusal]:
+def attitudes(
+    stream: bytes, spacecraft: int = 0, mounting: Mounting | None = None
+) -> list[AttitudeSample | Refusal]:
     reader = MessageReader(spacecraft, mounting or Mounting())
     return [reader.decode(each) for each in MessageSplitter().feed(stream)]
 
@@ -60,8 +62,12 @@ def test_the_recorded_attitudes_turn_42_s_vectors_of_n_into_its_own_of_b():
     assert len(samples) == 61
     for sample in samples:
         row = by_time[sample.t_ns]
-        assert rotation(sample.q_icrs_to_cam).apply(row["svn"]) == pytest.approx(row["svb"], abs=DIGITS)
-        assert np.abs(rotation(sample.q_icrs_to_cam).inv().as_quat() - row["q"]).max() < REPORT_DIGITS
+        assert rotation(sample.q_icrs_to_cam).apply(row["svn"]) == pytest.approx(
+            row["svb"], abs=DIGITS
+        )
+        assert (
+            np.abs(rotation(sample.q_icrs_to_cam).inv().as_quat() - row["q"]).max() < REPORT_DIGITS
+        )
 
 
 def test_the_recorded_rates_are_how_the_recorded_attitudes_turn():
@@ -99,20 +105,28 @@ def test_a_random_body_and_mounting_see_a_star_where_scipy_does(seed, old):
 
 
 def test_the_self_check_s_own_words_point_where_it_says():
-    mounting = Mounting(tuple(Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_quat(scalar_first=True)))
+    mounting = Mounting(
+        tuple(Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_quat(scalar_first=True))
+    )
     words = re.search(r"qn = \(([-0-9., ]+)\)", CONVENTIONS.lines(mounting)[-1])
     assert words is not None
     text = f"TIME 2024-099-00:00:00.0\nSC[0].B[0].qn = [{words[1].replace(',', ' ')}]\n[ENDMSG]\n"
     (sample,) = attitudes(text.encode(), 0, mounting)
     assert isinstance(sample, AttitudeSample)
     # Seven digits of each component: 2e-7 rad.
-    assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=np.degrees(2e-7))
+    assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(
+        CHECK_RADEC_DEG, abs=np.degrees(2e-7)
+    )
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 17_326), max_size=20), st.booleans())
 def test_however_the_bytes_are_cut_the_messages_are_the_same(cuts, old):
-    stream = (STREAM_2024 if old else STREAM_2025).read_bytes() + b"x" * (MAX_MESSAGE_BYTES + 5) + b"\n[ENDMSG]\nTIME"
+    stream = (
+        (STREAM_2024 if old else STREAM_2025).read_bytes()
+        + b"x" * (MAX_MESSAGE_BYTES + 5)
+        + b"\n[ENDMSG]\nTIME"
+    )
     whole = MessageSplitter().feed(stream)
     splitter = MessageSplitter()
     places = [0, *sorted(cuts), len(stream)]

@@ -41,7 +41,9 @@ def plain(bench):
 def shown(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
     """The frame with faults, and a table's own rows of the truth."""
     faults = [fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(tables)]
-    scenario = Scenario(folder or ".", "", 7, tuple(faults), folder) if folder else Scenario(".", "", 7)
+    scenario = (
+        Scenario(folder or ".", "", 7, tuple(faults), folder) if folder else Scenario(".", "", 7)
+    )
     view = display_view(bench, scenario)
     now = [Now(k, view.prepare(fault), since_ns, share) for k, fault in enumerate(faults, start=1)]
     frame = bench.frame(ORION_Q, faults=FaultLayer(view, tuple(now)), **more)
@@ -55,7 +57,9 @@ def light(frame):
 def test_a_false_star_lies_where_a_real_star_of_its_place_would(bench, plain):
     star = plain.truth[plain.truth["hip"] == 26727][0]
     place = plain.star[plain.truth["hip"] == 26727][0]
-    frame, rows = shown(bench, {"kind": "false-star", "icrs": bench.stars.vectors[place].tolist(), "electrons": 5e4})
+    frame, rows = shown(
+        bench, {"kind": "false-star", "icrs": bench.stars.vectors[place].tolist(), "electrons": 5e4}
+    )
     assert [(row["hip"], row["name"]) for row in rows] == [(0, "fault 0")]
     assert abs(rows["x_px"][0] - star["x_px"]) < PX and abs(rows["y_px"][0] - star["y_px"]) < PX
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
@@ -64,17 +68,29 @@ def test_a_false_star_lies_where_a_real_star_of_its_place_would(bench, plain):
 
 
 def test_magnitude_and_electrons_are_one_light(bench):
-    _, rows = shown(bench, {"kind": "false-star", "screen_px": [50, 60], "v_mag": 3.0, "bv_mag": 1.1})
+    _, rows = shown(
+        bench, {"kind": "false-star", "screen_px": [50, 60], "v_mag": 3.0, "bv_mag": 1.1}
+    )
     _, again = shown(
         bench,
-        {"kind": "false-star", "screen_px": [50, 60], "electrons_per_s": float(rows["electrons_per_s"][0]), "bv_mag": 1.1},
+        {
+            "kind": "false-star",
+            "screen_px": [50, 60],
+            "electrons_per_s": float(rows["electrons_per_s"][0]),
+            "bv_mag": 1.1,
+        },
     )
     assert again["v_mag"][0] == pytest.approx(3.0, abs=1e-9)
     assert (rows["x_px"][0], rows["y_px"][0]) == (50, 60)
 
 
 def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
-    table = {"kind": "false-star", "tracker_px": [500, 520], "rate_px_s": [40, -20], "electrons": 1e4}
+    table = {
+        "kind": "false-star",
+        "tracker_px": [500, 520],
+        "rate_px_s": [40, -20],
+        "electrons": 1e4,
+    }
     places = [shown(bench, table, since_ns=since_ns)[1][0] for since_ns in (0, 1_000_000_000)]
     # 13 um behind 70 mm against 57.65 um behind 60 mm
     scale = (60 / 0.05765) / (70 / 0.013)
@@ -124,9 +140,14 @@ def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(bench, p
 
 
 def test_a_glow_off_the_field_falls_off_with_the_angle_from_it(bench, plain):
-    frame, _ = shown(bench, {"kind": "glow", "tracker_px": [-700, 511.5], "electrons_per_s": 1000, "scale_deg": 2})
+    frame, _ = shown(
+        bench,
+        {"kind": "glow", "tracker_px": [-700, 511.5], "electrons_per_s": 1000, "scale_deg": 2},
+    )
     row = (frame.linear - plain.linear)[119]
-    angle = np.arctan((511.5 + 700) * 0.013 / 70) - np.arctan((159.5 - np.array([20, 300])) * 0.05765 / 60)
+    angle = np.arctan((511.5 + 700) * 0.013 / 70) - np.arctan(
+        (159.5 - np.array([20, 300])) * 0.05765 / 60
+    )
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
     expected = 1000 * covered / (1 + (np.degrees(angle) / 2) ** 2)
     assert row[[20, 300]] == pytest.approx(expected, rel=2e-3)
@@ -138,7 +159,9 @@ def test_a_measured_map_covers_the_detector(bench, plain, tmp_path, ending):
     image[20:40, 10:50] = 200
     path = tmp_path / f"stray.{ending}"
     write_image(path, image)
-    frame, _ = shown(bench, {"kind": "light-map", "file": path.name, "electrons_per_s": 50}, folder=tmp_path)
+    frame, _ = shown(
+        bench, {"kind": "light-map", "file": path.name, "electrons_per_s": 50}, folder=tmp_path
+    )
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
     added = frame.linear - plain.linear
     # Tracker pixel (x, y) is 16 times the map's; rows 20 to 40 of 64 are tracker rows 320 to 640.
@@ -159,7 +182,9 @@ def write_image(path, image):
 
 
 def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(bench):
-    frame, _ = shown(bench, {"kind": "blank"}, {"kind": "false-star", "screen_px": [5, 5], "electrons": 1e5})
+    frame, _ = shown(
+        bench, {"kind": "blank"}, {"kind": "false-star", "screen_px": [5, 5], "electrons": 1e5}
+    )
     assert not frame.linear.any() and not frame.levels.any() and not len(frame.truth)
     stepped, _ = shown(bench, {"kind": "attitude-step", "turn_arcsec": [0, 90, 0]})
     turned = angle_between_rad(np.array(ORION_Q), stepped.q_icrs_to_cam) * ARCSEC_PER_RAD
@@ -168,10 +193,15 @@ def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(bench):
 
 def test_dropped_frames_are_the_seed_s(bench):
     view = display_view(bench, Scenario(".", "", 3))
-    effects = FaultLayer(view, (Now(1, fault_of({"kind": "drop", "name": "loss", "share": 0.3}), 0),))
+    effects = FaultLayer(
+        view, (Now(1, fault_of({"kind": "drop", "name": "loss", "share": 0.3}), 0),)
+    )
     lost = [effects.drops(frame) for frame in range(500)]
     assert 0.22 < np.mean(lost) < 0.38  # 0.3, and 4 sigma of 500 draws
-    assert lost == [FaultLayer(display_view(bench, Scenario(".", "", 3)), effects.now).drops(frame) for frame in range(500)]
+    assert lost == [
+        FaultLayer(display_view(bench, Scenario(".", "", 3)), effects.now).drops(frame)
+        for frame in range(500)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -212,7 +242,9 @@ def test_a_map_that_is_no_image_is_refused(bench, tmp_path, content, said):
 
 def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
     path = tmp_path / "moon.toml"
-    path.write_text(bench_text({"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"moon": True}}))
+    path.write_text(
+        bench_text({"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"moon": True}})
+    )
     with hilstar.load(path) as bench:
         x, y, z = bench.seen(bench.stars, bench.view(ORION_Q, None, 0)).vectors[-1]
         q = from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0.0)
@@ -226,7 +258,11 @@ def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
 
 def test_a_false_star_over_white_is_named_with_its_loss(bench):
     view = display_view(bench)
-    fault = view.prepare(fault_of({"kind": "false-star", "name": "nova", "screen_px": [40, 50], "electrons_per_s": 1e8}))
+    fault = view.prepare(
+        fault_of(
+            {"kind": "false-star", "name": "nova", "screen_px": [40, 50], "electrons_per_s": 1e8}
+        )
+    )
     effects = FaultLayer(view, (Now(1, fault, 0),))
     frame = bench.frame(ORION_Q, faults=effects)
     losses = bench.losses_mag(frame, effects)

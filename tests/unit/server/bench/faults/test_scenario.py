@@ -16,12 +16,25 @@ STAR = {"kind": "false-star", "name": "ghost", "radec_deg": [10, 20], "electrons
 
 EACH_KIND = [
     STAR,
-    {"kind": "false-star", "name": "moving", "tracker_px": [10, 20], "rate_px_s": [3, -4], "v_mag": 2.5},
+    {
+        "kind": "false-star",
+        "name": "moving",
+        "tracker_px": [10, 20],
+        "rate_px_s": [3, -4],
+        "v_mag": 2.5,
+    },
     {"kind": "star-gone", "name": "dark", "hip": 24436, "at_s": 1.5, "for_s": 2},
     {"kind": "flash", "name": "flare", "star": "Jupiter", "electrons_per_s": 1e6, "for_s": 0.1},
     {"kind": "cosmic-rays", "name": "burst", "number": 20, "electrons": 3000, "length_px": 15},
     {"kind": "gradient", "name": "dawn", "electrons": 200, "towards_deg": 90},
-    {"kind": "glow", "name": "sun", "icrs": [0, 0, 1], "electrons_per_s": 1e4, "scale_deg": 3, "exponent": 3},
+    {
+        "kind": "glow",
+        "name": "sun",
+        "icrs": [0, 0, 1],
+        "electrons_per_s": 1e4,
+        "scale_deg": 3,
+        "exponent": 3,
+    },
     {"kind": "light-map", "name": "measured", "file": "stray.fits", "frame": "screen"},
     {"kind": "blank", "name": "cover"},
     {"kind": "freeze", "name": "stuck", "for_s": 0.5},
@@ -87,13 +100,21 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
             '[[fault]] 2 (a): another fault has name = "a"',
         ),
         ("[[fault]", "not TOML"),
-        ("\n".join(f'[[fault]]\nkind = "gradient"\nname = "{k}"\nelectrons = 1' for k in range(17)), "17 gradients and maps"),
+        (
+            "\n".join(
+                f'[[fault]]\nkind = "gradient"\nname = "{k}"\nelectrons = 1' for k in range(17)
+            ),
+            "17 gradients and maps",
+        ),
         (
             '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons = 1\nlength_px = 500',
             "write at most 20000 px together",
         ),
         ('[[fault]]\nkind = "flash"\nname = "f"\nhip = 1\nelectrons = 1', "write for_s = 0.1"),
-        ('[[fault]]\nkind = "attitude-step"\nname = "s"\nturn_deg = [0, 200, 0]', "write a turn of 180 deg at most"),
+        (
+            '[[fault]]\nkind = "attitude-step"\nname = "s"\nturn_deg = [0, 200, 0]',
+            "write a turn of 180 deg at most",
+        ),
     ],
 )
 def test_a_wrong_scenario_is_refused_with_its_file_and_table(text, said):

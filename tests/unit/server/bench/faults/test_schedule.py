@@ -16,7 +16,9 @@ def blank(name, **keys):
 
 
 def star(name, **keys):
-    return fault_of({"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys})
+    return fault_of(
+        {"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys}
+    )
 
 
 def schedule_of(*faults):
@@ -27,12 +29,23 @@ def schedule_of(*faults):
 
 def frames(schedule, count, first=0):
     """What is on in frames in a row: names and shares."""
-    return [[(now.fault.name, now.share) for now in schedule.at(k * FRAME_NS)] for k in range(first, first + count)]
+    return [
+        [(now.fault.name, now.share) for now in schedule.at(k * FRAME_NS)]
+        for k in range(first, first + count)
+    ]
 
 
 def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
     schedule, heard = schedule_of(blank("cover", at_s=0.02, for_s=0.03))
-    assert [bool(on) for on in frames(schedule, 7)] == [False, False, True, True, True, False, False]
+    assert [bool(on) for on in frames(schedule, 7)] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
     assert [(c.what, c.number, c.t_ns, c.who) for c in heard] == [
         ("start", 1, 2 * FRAME_NS, "file"),
         ("end", 1, 5 * FRAME_NS, "file"),
@@ -80,7 +93,9 @@ def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
 
 def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
     schedule, _ = schedule_of(blank("cover"))
-    with pytest.raises(InputError, match=r"no fault is called 'covre'; did you mean cover\? known are cover"):
+    with pytest.raises(
+        InputError, match=r"no fault is called 'covre'; did you mean cover\? known are cover"
+    ):
         schedule.start("covre", "console")
     with pytest.raises(InputError, match="'cover' is not on; none is"):
         schedule.stop("cover")
@@ -124,7 +139,10 @@ def test_only_some_stray_light_is_on_at_once_whoever_asks():
     for number in range(8):
         schedule.ask(fault_of({"kind": "gradient", "name": f"{number}", "electrons": 5}), "stream")
     with pytest.raises(InputError, match="8 gradients, glows and maps are on or wait"):
-        schedule.ask(fault_of({"kind": "glow", "name": "sun", "tracker_px": [0, 0], "electrons": 5}), "stream")
+        schedule.ask(
+            fault_of({"kind": "glow", "name": "sun", "tracker_px": [0, 0], "electrons": 5}),
+            "stream",
+        )
     schedule.ask(blank("cover"), "stream")
 
 

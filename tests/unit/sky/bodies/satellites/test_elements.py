@@ -56,14 +56,20 @@ def test_a_number_beyond_99999_is_one_with_a_letter():
     [
         ("", r"tles\.txt: no element set"),
         ("# nothing\n\n", r"tles\.txt: no element set"),
-        (f"{NAME}\n{FIRST[:-1]}{(int(FIRST[-1]) + 1) % 10}\n{SECOND}\n", r"tles\.txt:2: its digits add up to 7, not 8"),
+        (
+            f"{NAME}\n{FIRST[:-1]}{(int(FIRST[-1]) + 1) % 10}\n{SECOND}\n",
+            r"tles\.txt:2: its digits add up to 7, not 8",
+        ),
         (f"{FIRST}\n{SECOND[:-1]}\n", r"tles\.txt:2: 68 characters, where an element line has 69"),
         (f"{FIRST}\n{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 2 is missing after line 1"),
         (f"{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 1 is missing"),
         (f"{NAME}\n{FIRST}\n", r"tles\.txt: it ends within"),
         (f"{ONE}{NAME}\n", r"tles\.txt: it ends within"),
         ("a\nb\n" + ONE, r"tles\.txt:2: two lines in a row"),
-        (f"{FIRST}\n{ONE.splitlines()[1]}\n", r"tles\.txt:2: it is of satellite 00010, line 1 of 25544"),
+        (
+            f"{FIRST}\n{ONE.splitlines()[1]}\n",
+            r"tles\.txt:2: it is of satellite 00010, line 1 of 25544",
+        ),
         (
             f"{FIRST}\n{with_checksum(SECOND[:8] + ' nearly ' + SECOND[16:68])}\n",
             r"tles\.txt:2: columns 9 to 16, its inclin.*'nearly'",
@@ -96,8 +102,21 @@ FIELDS = {
     "MEAN_MOTION_DOT": -0.2182e-4,
     "MEAN_MOTION_DDOT": 0,
 }
-MEAN = ("EPOCH", "MEAN_MOTION", "ECCENTRICITY", "INCLINATION", "RA_OF_ASC_NODE", "ARG_OF_PERICENTER", "MEAN_ANOMALY")
-META = {"CENTER_NAME": "EARTH", "REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4"}
+MEAN = (
+    "EPOCH",
+    "MEAN_MOTION",
+    "ECCENTRICITY",
+    "INCLINATION",
+    "RA_OF_ASC_NODE",
+    "ARG_OF_PERICENTER",
+    "MEAN_ANOMALY",
+)
+META = {
+    "CENTER_NAME": "EARTH",
+    "REF_FRAME": "TEME",
+    "TIME_SYSTEM": "UTC",
+    "MEAN_ELEMENT_THEORY": "SGP4",
+}
 SAME_KM = 1e-3  # sgp4 rounds an OMM's epoch to a microsecond, in which a low orbit goes 8 mm
 
 
@@ -119,7 +138,8 @@ def as_xml(fields):
     named = {name for names in parts.values() for name in names}
     parts["tleParameters"] = [name for name in fields if name not in named]
     inner = {
-        part: "".join(f"<{name}>{fields[name]}</{name}>" for name in names if name in fields) for part, names in parts.items()
+        part: "".join(f"<{name}>{fields[name]}</{name}>" for name in names if name in fields)
+        for part, names in parts.items()
     }
     data = "".join(f"<{part}>{inner[part]}</{part}>" for part in ("meanElements", "tleParameters"))
     segment = f"<segment><metadata>{inner['metadata']}</metadata><data>{data}</data></segment>"
@@ -127,7 +147,9 @@ def as_xml(fields):
 
 
 def as_kvn(fields):
-    return "CCSDS_OMM_VERS = 2.0\n" + "".join(f"{key} = {value}\n" for key, value in (META | fields).items())
+    return "CCSDS_OMM_VERS = 2.0\n" + "".join(
+        f"{key} = {value}\n" for key, value in (META | fields).items()
+    )
 
 
 FORMS = [as_json, as_text_json, as_csv, as_xml, as_kvn]
@@ -146,7 +168,9 @@ def test_an_omm_is_the_satellite_of_its_two_lines(form):
         assert place_km == pytest.approx(wanted.satrec.sgp4(*jd)[1], abs=SAME_KM)
     orbit = TleOrbit(form(FIELDS), "omm")
     assert orbit.number == 25544
-    assert orbit.state(UTC_NS)[0] == pytest.approx(TleOrbit(STATION_TLE, "tle").state(UTC_NS)[0], abs=SAME_KM)
+    assert orbit.state(UTC_NS)[0] == pytest.approx(
+        TleOrbit(STATION_TLE, "tle").state(UTC_NS)[0], abs=SAME_KM
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -168,11 +192,14 @@ def test_an_element_that_sgp4_would_take_otherwise_is_refused_by_name(form, chan
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("REF_FRAME", "EME2000"), ("MEAN_ELEMENT_THEORY", "SGP4-XP"), ("CENTER_NAME", "MOON")]
+    ("key", "value"),
+    [("REF_FRAME", "EME2000"), ("MEAN_ELEMENT_THEORY", "SGP4-XP"), ("CENTER_NAME", "MOON")],
 )
 def test_another_theory_or_frame_is_refused_by_name(key, value):
     with pytest.raises(InputError, match=f"{key} is {value}, and only "):
-        read_satellites(as_kvn(FIELDS).replace(f"{key} = {META[key]}", f"{key} = {value}"), "omm", UTC_NS)
+        read_satellites(
+            as_kvn(FIELDS).replace(f"{key} = {META[key]}", f"{key} = {value}"), "omm", UTC_NS
+        )
 
 
 def test_what_writers_leave_out_and_numbers_of_nine_digits_are_read():
@@ -183,7 +210,16 @@ def test_what_writers_leave_out_and_numbers_of_nine_digits_are_read():
 
 
 @pytest.mark.parametrize(
-    "text", ["[", "{}", "[1]", '<omm id="x">', "<!DOCTYPE a><omm/>", "EPOCH,MEAN_MOTION\n1,2\n", "[" * 10_000]
+    "text",
+    [
+        "[",
+        "{}",
+        "[1]",
+        '<omm id="x">',
+        "<!DOCTYPE a><omm/>",
+        "EPOCH,MEAN_MOTION\n1,2\n",
+        "[" * 10_000,
+    ],
 )
 def test_what_is_no_omm_is_refused_in_one_line(text):
     with pytest.raises(InputError, match=r"^omm: (?!.*\n)"):

@@ -34,7 +34,9 @@ def ray_traced_share(place: np.ndarray) -> float:
     across = np.cross(way, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     other = np.cross(across, way / np.linalg.norm(way))
-    to_point = way + (radius * np.cos(turn))[:, None] * across + (radius * np.sin(turn))[:, None] * other
+    to_point = (
+        way + (radius * np.cos(turn))[:, None] * across + (radius * np.sin(turn))[:, None] * other
+    )
     axes = np.array([EARTH_KM, EARTH_KM, EARTH_KM * (1 - EARTH_FLATTENING)])
     begin, ray = place / axes, to_point / axes
     a, b, c = (ray * ray).sum(axis=1), 2 * ray @ begin, begin @ begin - 1
@@ -76,10 +78,13 @@ def test_the_phase_law_is_that_of_a_diffuse_sphere():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     angles = np.radians([0.0, 30.0, 60.0, 90.0, 120.0, 150.0])
     light = [
-        (np.maximum(0, normal[:, 2]) * np.maximum(0, normal @ [np.sin(a), 0.0, np.cos(a)])).mean() for a in angles.tolist()
+        (np.maximum(0, normal[:, 2]) * np.maximum(0, normal @ [np.sin(a), 0.0, np.cos(a)])).mean()
+        for a in angles.tolist()
     ]
     # 400 000 places: 0.4 % where all of it is lit, 2 % of the thinnest crescent
-    assert np.allclose(phase_factor(np.cos(angles)), np.array(light) / light[3], rtol=0.02, atol=0.005)
+    assert np.allclose(
+        phase_factor(np.cos(angles)), np.array(light) / light[3], rtol=0.02, atol=0.005
+    )
     assert phase_factor(np.array([1.0, -1.0])).tolist() == pytest.approx([np.pi, 0.0], abs=1e-12)
 
 
@@ -96,7 +101,14 @@ def test_the_standard_magnitude_is_at_1000_km_and_90_degrees_and_goes_with_the_d
 def test_the_earth_hides_what_is_behind_it():
     observer = np.array([[7000.0, 0.0, 0.0]])
     places = np.array(
-        [[-7000.0, 0, 0], [-7000.0, 31_100, 0], [9000.0, 0, 0], [0, 15_450.0, 0], [0, 0, 15_450.0], [0, 0, 15_400.0]]
+        [
+            [-7000.0, 0, 0],
+            [-7000.0, 31_100, 0],
+            [9000.0, 0, 0],
+            [0, 15_450.0, 0],
+            [0, 0, 15_450.0],
+            [0, 0, 15_400.0],
+        ]
     )
     # From 7000 km tangents to the equator are 15 477 km from the centre at a right angle, those
     # over the poles 15 425 km.
@@ -126,7 +138,9 @@ def test_the_mean_of_light_that_varies_is_its_integral(known):
         turns = (moments - known.get("flash_at_s", 0.0)) / known["period_s"]
         if "flash_s" in known:
             near = (turns - np.round(turns))[:, None] + np.arange(-2, 3)
-            gauss = np.exp(-4 * np.log(2) * (near * known["period_s"] / known["flash_s"]) ** 2).sum(axis=1)
+            gauss = np.exp(-4 * np.log(2) * (near * known["period_s"] / known["flash_s"]) ** 2).sum(
+                axis=1
+            )
             flux = 1 + (ratio - 1) * gauss
         else:
             flux = 1 + (ratio - 1) / (ratio + 1) * np.cos(2 * np.pi * turns)

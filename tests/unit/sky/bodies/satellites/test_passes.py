@@ -54,7 +54,9 @@ def test_whatever_turns_and_jumps_come_none_in_view_is_missed(rng):
         near = set() if seen is None else set(seen.index.tolist())
         everything = of_all.passing(EVERYWHERE, t_ns)
         now = np.zeros(len(everything))
-        bright = everything.rates_e_per_s(np.arange(len(everything)), now, now) > cone.faintest_e_per_s
+        bright = (
+            everything.rates_e_per_s(np.arange(len(everything)), now, now) > cone.faintest_e_per_s
+        )
         inside = everything.directions(slice(None), now) @ axis > np.cos(cone.radius_rad)
         wanted = set(everything.index[bright & inside].tolist())
         found += len(wanted)
@@ -70,7 +72,11 @@ def test_a_moment_gives_the_same_light_whatever_came_before(rng):
     def light(of):
         seen = of.passing(EVERYWHERE, t_ns)
         n = len(seen)
-        return seen.index, seen.directions(slice(None), half[:n]), seen.rates_e_per_s(np.arange(n), -half[:n], half[:n])
+        return (
+            seen.index,
+            seen.directions(slice(None), half[:n]),
+            seen.rates_e_per_s(np.arange(n), -half[:n], half[:n]),
+        )
 
     once = light(sky)
     for other in rng.integers(-(10**14), 10**14, size=5).tolist():
@@ -84,9 +90,7 @@ def test_a_moment_gives_the_same_light_whatever_came_before(rng):
 def test_the_observer_itself_is_not_drawn_and_a_line_says_so(caplog):
     """By its number; and by its place, what is docked to it."""
     first, second = STATION_TLE.splitlines()[1:]
-    docked = (
-        f"MODULE\n{with_checksum(first[:2] + '49044' + first[7:68])}\n{with_checksum(second[:2] + '49044' + second[7:68])}\n"
-    )
+    docked = f"MODULE\n{with_checksum(first[:2] + '49044' + first[7:68])}\n{with_checksum(second[:2] + '49044' + second[7:68])}\n"
     ahead = element_set(7, (51.6416, 247.4627, 130.5360, 325.0288 + 3.0), 0.0006703, 15.72125391)
     sky = satellite_sky(f"{STATION_TLE}{docked}{ahead}")
     t_ns = 55 * 60 * S_NS
@@ -100,7 +104,10 @@ def test_the_observer_itself_is_not_drawn_and_a_line_says_so(caplog):
 
 def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, caplog):
     """Ones that cannot be, a mean motion of 18 turns a day, among good ones."""
-    bad = "".join(f"LOST {k}\n" + element_set(50 + k, (51.0, 10.0 * k, 0.0, 0.0), 0.001, 18.0) for k in range(3))
+    bad = "".join(
+        f"LOST {k}\n" + element_set(50 + k, (51.0, 10.0 * k, 0.0, 0.0), 0.001, 18.0)
+        for k in range(3)
+    )
     sky = satellite_sky(bad + some_orbits(rng, 5), Geocentre())
     for t_ns in range(0, 200 * S_NS, 7 * S_NS):
         seen = sky.passing(EVERYWHERE, t_ns)
@@ -129,10 +136,14 @@ def test_twenty_thousand_are_read_and_looked_for(rng):
     sky = satellite_sky(text)
     seen = sky.passing(Cone(NORTH, 0.2, 0.01), 600 * S_NS)
     lines, few = text.splitlines(), seen.index[:: max(1, len(seen) // 20)]
-    alone = satellite_sky("\n".join(line for k in few.tolist() for line in lines[3 * k : 3 * k + 3]))
+    alone = satellite_sky(
+        "\n".join(line for k in few.tolist() for line in lines[3 * k : 3 * k + 3])
+    )
     each = alone.passing(EVERYWHERE, 600 * S_NS)
     names = [alone.satellites.names[k] for k in each.index.tolist()]
-    for name, direction in zip(names, each.directions(slice(None), np.zeros(len(each))), strict=True):
+    for name, direction in zip(
+        names, each.directions(slice(None), np.zeros(len(each))), strict=True
+    ):
         (place,) = np.flatnonzero(seen.index == sky.satellites.names.index(name))
         off = np.linalg.norm(seen.directions(np.array([place]), np.zeros(1))[0] - direction)
         assert off < 2e-6  # LOW_KM at 200 km: their steps begin at other moments
@@ -146,6 +157,8 @@ def test_an_observer_whose_state_comes_with_the_frame_sees_the_same(rng):
     theirs = satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS, velocity, place)
     assert np.array_equal(ours.index, theirs.index)
     which, middle = np.arange(len(ours)), np.zeros(len(ours))
-    assert np.array_equal(ours.rates_e_per_s(which, middle, middle), theirs.rates_e_per_s(which, middle, middle))
+    assert np.array_equal(
+        ours.rates_e_per_s(which, middle, middle), theirs.rates_e_per_s(which, middle, middle)
+    )
     # none behind the Earth
     assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)
